@@ -1,0 +1,1 @@
+"""Autopilot twins, one folder or file each: `ls` is the catalogue."""

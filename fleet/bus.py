@@ -1,0 +1,241 @@
+"""Publish, subscribe, ask and answer: on Zenoh, and in memory for tests. The only file that imports zenoh."""
+
+import json
+import secrets
+import socket
+import threading
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from typing import Any, Protocol, TypeVar
+
+import zenoh
+
+from fleet.codec import Stamp, decode, encode, encoding, pack_stamp, unpack_stamp
+from fleet.contract import PER_UAV
+
+M = TypeVar("M")
+Heard = Callable[[Any, Stamp | None], None]
+Answers = Iterable[tuple[Any, Stamp | None]]
+Answer = Callable[[int | None, dict[str, str], bytes], Answers]
+
+ROOT = "parauav"
+ROUTER = "tcp/127.0.0.1:7447"
+
+
+def key(kind: type, who: int | str) -> str:
+    """Give the key of one message class: `parauav/7/sample`, `parauav/@fleet/state/{writer}`; who may be `*`."""
+    topic: str = kind.topic  # type: ignore[attr-defined]
+    return f"{ROOT}/{who}/{topic}" if kind in PER_UAV else f"{ROOT}/{topic}/{who}"
+
+
+def uav_in(name: str) -> int | None:
+    """Read the UAV id out of a key; None where the chunk is a wildcard or no number."""
+    chunk = name.split("/")[1] if name.count("/") >= 2 else ""
+    return int(chunk) if chunk.isdecimal() and len(chunk) <= 9 else None
+
+
+class Bus(AbstractContextManager, Protocol):
+    """What every process talks through."""
+
+    writer: int  # random id of this process on the bus
+
+    def publish(self, message: Any, stamp: Stamp | None = None) -> None:
+        """Send one message to whoever listens."""
+
+    def subscribe(self, kind: type, heard: Heard) -> None:
+        """Call `heard(message, stamp)` for every message of a class; undecodable ones are counted, not raised."""
+
+    def answer(self, kind: type, reply: Answer) -> None:
+        """Declare one wildcard queryable for a class: `reply(uav or None, parameters, payload)`."""
+
+    def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
+        """Ask everyone for a class; the highest epoch per aircraft is kept."""
+
+    def close(self) -> None:
+        """Leave the bus."""
+
+
+def newest(found: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
+    """Keep the reply with the highest epoch, then the newest, per UAV; messages without a UAV all stay."""
+    best: dict[int, tuple[M, Stamp | None]] = {}
+    rest = []
+    for message, stamp in found:
+        uav = getattr(message, "uav", None)
+        if uav is None:
+            rest.append((message, stamp))
+            continue
+        rank = (stamp.epoch if stamp else 0, message.t)  # type: ignore[attr-defined]
+        held = best.get(uav)
+        if held is None or rank > (held[1].epoch if held[1] else 0, held[0].t):  # type: ignore[attr-defined]
+            best[uav] = (message, stamp)
+    return [best[uav] for uav in sorted(best)] + rest
+
+
+class MemoryBus(AbstractContextManager):
+    """The bus within one process, synchronous; every message still goes through its bytes."""
+
+    def __init__(self) -> None:
+        self.writer = secrets.randbits(63)
+        self._heard: dict[type, list[Heard]] = {}
+        self._reply: dict[type, list[Answer]] = {}
+        self.bad = 0
+
+    def publish(self, message: Any, stamp: Stamp | None = None) -> None:
+        kind, payload = type(message), encode(message)
+        for heard in self._heard.get(kind, []):
+            heard(decode(kind, payload, encoding(kind)), stamp)
+
+    def subscribe(self, kind: type, heard: Heard) -> None:
+        self._heard.setdefault(kind, []).append(heard)
+
+    def answer(self, kind: type, reply: Answer) -> None:
+        self._reply.setdefault(kind, []).append(reply)
+
+    def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
+        uav = who if isinstance(who, int) else None
+        found = [pair for reply in self._reply.get(kind, []) for pair in reply(uav, {}, b"")]
+        return newest(found)
+
+    def close(self) -> None:
+        self._heard.clear()
+        self._reply.clear()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class ZenohBus(AbstractContextManager):
+    """The bus between processes. Use it in a `with` statement: an unclosed session can hang at exit."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.writer = secrets.randbits(63)
+        self.bad = 0
+        self._session = session
+        self._declared: list[Any] = []
+        self._publishers: dict[str, Any] = {}
+        self._lock = threading.Lock()
+
+    def publish(self, message: Any, stamp: Stamp | None = None) -> None:
+        kind = type(message)
+        name = key(kind, message.uav if kind in PER_UAV else f"{self.writer:016x}")
+        publisher = self._publishers.get(name)
+        if publisher is None:
+            with self._lock:
+                publisher = self._publishers.setdefault(
+                    name, self._session.declare_publisher(name, encoding=encoding(kind))
+                )
+        publisher.put(encode(message), attachment=pack_stamp(stamp) if stamp else None)
+
+    def subscribe(self, kind: type, heard: Heard) -> None:
+        def on_sample(sample: zenoh.Sample) -> None:
+            pair = self._read(kind, sample)
+            if pair is not None:
+                heard(*pair)
+
+        self._declared.append(self._session.declare_subscriber(key(kind, "*"), on_sample))
+
+    def answer(self, kind: type, reply: Answer) -> None:
+        def on_query(query: zenoh.Query) -> None:
+            with query:
+                uav = uav_in(str(query.key_expr)) if kind in PER_UAV else None
+                payload = query.payload.to_bytes() if query.payload is not None else b""
+                try:
+                    found = list(reply(uav, dict(query.parameters), payload))
+                except ValueError as error:
+                    query.reply_err(str(error).encode(), encoding="text/plain")
+                    return
+                for message, stamp in found:
+                    who = message.uav if kind in PER_UAV else f"{self.writer:016x}"
+                    query.reply(
+                        key(kind, who),
+                        encode(message),
+                        encoding=encoding(kind),
+                        attachment=pack_stamp(stamp) if stamp else None,
+                    )
+
+        name = key(kind, "*" if kind in PER_UAV else f"{self.writer:016x}")
+        self._declared.append(self._session.declare_queryable(name, on_query, complete=False))
+
+    def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
+        replies = self._session.get(
+            key(kind, who),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+        )
+        pairs = [self._read(kind, reply.ok) for reply in replies if reply.ok is not None]
+        return newest([pair for pair in pairs if pair is not None])
+
+    def _read(self, kind: type, sample: zenoh.Sample) -> tuple[Any, Stamp | None] | None:
+        try:
+            message = decode(kind, sample.payload.to_bytes(), str(sample.encoding))
+        except ValueError:
+            self.bad += 1
+            return None
+        attachment = sample.attachment
+        return message, unpack_stamp(attachment.to_bytes() if attachment is not None else None)
+
+    def close(self) -> None:
+        self._session.close()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _config(mode: str, *, connect: list[str], listen: list[str]) -> zenoh.Config:
+    config = zenoh.Config()
+    settings: dict[str, Any] = {
+        "mode": mode,
+        "connect/endpoints": connect,
+        "listen/endpoints": listen,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+        "connect/timeout_ms": -1 if mode == "client" else 0,
+        "connect/exit_on_failure": False,
+        "transport/link/tx/lease": 1000,
+        "transport/link/tx/keep_alive": 4,
+    }
+    for path, value in settings.items():
+        config.insert_json5(path, json.dumps(value))
+    return config
+
+
+def reachable(router: str = ROUTER) -> bool:
+    """Tell whether something accepts connections at a `tcp/host:port` endpoint."""
+    host, port = endpoint(router)
+    try:
+        with socket.create_connection((host, port), timeout=0.5):
+            return True
+    except OSError:
+        return False
+
+
+def endpoint(router: str) -> tuple[str, int]:
+    """Split `tcp/127.0.0.1:7447` into host and port.
+
+    Raises:
+        ValueError: when it is no tcp or tls endpoint.
+    """
+    kind, _, rest = router.partition("/")
+    host, _, port = rest.rpartition(":")
+    if kind not in ("tcp", "tls") or not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ValueError(f"--router: found {router!r}, expected e.g. {ROUTER}; name protocol, host and port")
+    return host.strip("[]"), int(port)
+
+
+def connect(router: str = ROUTER) -> ZenohBus:
+    """Join the bus through a router.
+
+    Raises:
+        ConnectionError: when nobody answers there; start `zenohd` or `fleet up`.
+    """
+    if not reachable(router):
+        raise ConnectionError(f"router {router}: nobody answers; start `zenohd` or `fleet up`, or name another --router")
+    return ZenohBus(zenoh.open(_config("client", connect=[router], listen=[])))
+
+
+def open_router(router: str = ROUTER) -> zenoh.Session:
+    """Be the router: a Zenoh session in router mode that listens at `router`; close it when done."""
+    endpoint(router)
+    return zenoh.open(_config("router", connect=[], listen=[router]))

@@ -1,0 +1,82 @@
+"""The `fleet` command: one verb a file in `fleet/commands/`; and the frame every console command shares."""
+
+import argparse
+import importlib
+import pkgutil
+import signal
+import sys
+import threading
+from collections.abc import Callable
+
+from fleet import __version__, commands
+
+Run = Callable[[argparse.Namespace], int]
+
+
+def parser_for(prog: str, summary: str, examples: str) -> argparse.ArgumentParser:
+    """Make a parser whose help ends in examples."""
+    parser = argparse.ArgumentParser(
+        prog=prog,
+        description=summary,
+        epilog="examples:\n" + examples.strip("\n"),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"parauav {__version__}")
+    return parser
+
+
+def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
+    """Run a command; an expected failure becomes one sentence and exit code 2, Ctrl-C a clean 0."""
+    try:
+        return run(args)
+    except (ValueError, OSError) as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 0
+
+
+def stop_on_signal() -> threading.Event:
+    """Give an event that Ctrl-C and SIGTERM set, so that every process ends through its own door."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def id_range(text: str) -> range:
+    """Read `0-49` or `7` as UAV ids.
+
+    Raises:
+        ValueError: when it is no range of ids below 1,000,000; argparse shows the sentence.
+    """
+    low, _, high = text.partition("-")
+    if not low.isdecimal() or (high and not high.isdecimal()) or int(high or low) < int(low) or len(high or low) > 6:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a range of ids such as 0-49; write the lower one first")
+    return range(int(low), int(high or low) + 1)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run `fleet <verb>`."""
+    parser = parser_for(
+        "fleet", "Digital twins for UAV swarms.", "  fleet up --uavs 8\n  fleet status --json\n  fleet schema prediction\n"
+    )
+    verbs = parser.add_subparsers(title="verbs", dest="verb", metavar="VERB", required=True)
+    for found in sorted(pkgutil.iter_modules(commands.__path__), key=lambda module: module.name):
+        module = importlib.import_module(f"fleet.commands.{found.name}")
+        summary = (module.__doc__ or "").strip().splitlines()[0]
+        verb = verbs.add_parser(
+            found.name,
+            help=summary,
+            description=summary,
+            epilog="examples:\n" + module.EXAMPLES.strip("\n"),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        module.arguments(verb)
+        verb.set_defaults(run=module.run)
+    args = parser.parse_args(argv)
+    return guarded(f"fleet {args.verb}", args.run, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,61 @@
+"""Messages to bytes and back: msgpack maps, a version in the encoding, an attachment of epoch and writer."""
+
+import struct
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+
+from fleet.contract import TOPICS
+
+M = TypeVar("M")
+_STAMP = struct.Struct("<QQ")
+_PACK = msgspec.msgpack.Encoder()
+_UNPACK = {topic: msgspec.msgpack.Decoder(kind) for topic, kind in TOPICS.items()}
+
+
+class Stamp(NamedTuple):
+    """Who wrote a worker result, and under which claim; the highest epoch per UAV wins."""
+
+    epoch: int
+    writer: int
+
+
+def encode(message: Any) -> bytes:
+    """Pack one message as a msgpack map."""
+    return _PACK.encode(message)
+
+
+def encoding(kind: type) -> str:
+    """Name the Zenoh encoding of a message class, e.g. `application/msgpack;parauav.sample.1`."""
+    return f"application/msgpack;parauav.{kind.topic.lstrip('@').replace('/', '.')}.{kind.version}"  # type: ignore[attr-defined]
+
+
+def decode(kind: type[M], payload: bytes, named: str = "") -> M:
+    """Unpack one message of class `kind`.
+
+    Args:
+        kind: class from `fleet.contract`
+        payload: msgpack bytes
+        named: the Zenoh encoding it came with; empty skips the version check
+    Raises:
+        ValueError: when the version is another or the bytes do not fit; upgrade the older of the two sides.
+    """
+    expected = encoding(kind)
+    if named and named != expected:
+        raise ValueError(f"{kind.__name__}: found encoding {named!r}, expected {expected!r}; upgrade the older side")
+    try:
+        return _UNPACK[kind.topic].decode(payload)  # type: ignore[attr-defined]
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{kind.__name__}: found {len(payload)} bytes that do not fit ({error}); resend") from None
+
+
+def pack_stamp(stamp: Stamp) -> bytes:
+    """Pack the attachment: epoch u64, writer u64, little endian."""
+    return _STAMP.pack(*stamp)
+
+
+def unpack_stamp(attachment: bytes | None) -> Stamp | None:
+    """Unpack the attachment; None where there is none or it is not 16 bytes."""
+    if attachment is None or len(attachment) != _STAMP.size:
+        return None
+    return Stamp(*_STAMP.unpack(attachment))

@@ -1,0 +1,1 @@
+"""The verbs of the `fleet` command, one a file."""

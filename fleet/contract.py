@@ -1,0 +1,348 @@
+"""THE TABLE: one frozen struct per message on the bus. This file is the public interface of ParaUAV.
+
+    key                                  class        from     what
+    parauav/{uav}/sample                 Sample       gateway  telemetry rows on the fleet clock, about every 100 ms
+    parauav/{uav}/status                 Status       gateway  link, mode, rates, losses (1 Hz and on change)
+    parauav/{uav}/mission                Mission      gateway  the route on board and the item in force
+    parauav/{uav}/params                 Params       gateway  autopilot parameters
+    parauav/{uav}/model                  Model        worker   identified model with its verdict
+    parauav/{uav}/prediction             Prediction   worker   mean path, tube, horizon; also answers queries
+    parauav/{uav}/mismatch               Mismatch     worker   where, what physics, fit before and after
+    parauav/{uav}/alert                  Alert        worker   predicted conflict, horizon too short, link lost
+    parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; answers queries
+    parauav/@gateway/{writer}            Account      gateway  counters of one gateway; answers queries
+
+`*` and `**` never match a chunk that starts with `@`, so `parauav/*/prediction` is aircraft only.
+
+Wire: a msgpack map; any msgpack library reads it. Arrays are maps `{dtype, shape, data}`. The Zenoh encoding
+carries the version: `application/msgpack;parauav.prediction.1`. Fields may be added (with a default); a reader
+refuses another major version. Worker results carry an attachment of 16 bytes, little endian: epoch u64, writer u64;
+readers keep the highest epoch per UAV.
+
+Time `t` is seconds since 1970 on the fleet clock. Angles in rad, SI throughout, NED and FRD frames.
+"""
+
+from enum import StrEnum
+from typing import Annotated, Any, ClassVar
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from fleet.frames import Origin
+
+DTYPES = ("<f4", "<f8", "<i4", "<i8", "|u1")
+MAX_ITEMS = 1_000  # mission items accepted from outside
+
+
+class Array(msgspec.Struct, frozen=True):
+    """A numpy array on the wire: `numpy.frombuffer(data, dtype).reshape(shape)`."""
+
+    dtype: Annotated[str, Meta(description="numpy dtype string, little endian: " + " ".join(DTYPES))]
+    shape: tuple[int, ...]
+    data: bytes
+
+    @classmethod
+    def of(cls, values: Any, dtype: str = "<f4") -> "Array":
+        """Wrap anything array-like as `dtype`."""
+        a = np.ascontiguousarray(values, dtype=dtype)
+        return cls(dtype, a.shape, a.tobytes())
+
+    def numpy(self) -> np.ndarray:
+        """Unwrap; read-only.
+
+        Raises:
+            ValueError: when dtype, shape and byte count disagree; the sender must repair it.
+        """
+        if self.dtype not in DTYPES or any(n < 0 for n in self.shape):
+            raise ValueError(f"array: found dtype {self.dtype!r} shape {self.shape}, expected one of {DTYPES}; resend")
+        want = int(np.prod(self.shape, dtype=np.int64)) * np.dtype(self.dtype).itemsize
+        if want != len(self.data):
+            raise ValueError(f"array: found {len(self.data)} bytes, shape {self.shape} needs {want}; resend")
+        return np.frombuffer(self.data, self.dtype).reshape(self.shape)
+
+
+class Rows(msgspec.Struct, frozen=True):
+    """Measurements of one kind, each row with its own time."""
+
+    t: Annotated[Array, Meta(description="fleet time of each row, (n,) <f8 [s since 1970]")]
+    x: Annotated[Array, Meta(description="values, (n, k); columns as in COLUMNS")]
+
+
+COLUMNS: dict[str, tuple[tuple[str, str], ...]] = {
+    "attitude": (("phi", "rad"), ("theta", "rad"), ("psi", "rad"), ("p", "rad/s"), ("q", "rad/s"), ("r", "rad/s")),
+    "imu": (("a_x", "m/s2"), ("a_y", "m/s2"), ("a_z", "m/s2"), ("p", "rad/s"), ("q", "rad/s"), ("r", "rad/s")),
+    "position": (("lat", "1e-7 deg"), ("lon", "1e-7 deg"), ("alt", "mm above mean sea level")),
+    "velocity": (("v_n", "m/s"), ("v_e", "m/s"), ("v_d", "m/s")),
+    "air": (("Va", "m/s, as the autopilot reports it"), ("delta_t", "0..1"), ("climb", "m/s")),
+    "servo": tuple((f"servo{i}", "us pulse width") for i in range(1, 9)),
+    "command": (("phi_c", "rad"), ("theta_c", "rad"), ("xtrack_error", "m"), ("alt_error", "m"), ("Va_error", "m/s")),
+    "leg": (("seq", "mission item in force"),),
+}
+"""Columns of each `Rows` field of a `Sample`: name and unit, in wire order. Specific force and rates are FRD."""
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True):
+    """What every message has: the aircraft and the time."""
+
+    topic: ClassVar[str] = ""
+    version: ClassVar[int] = 1
+
+    uav: Annotated[int, Meta(description="UAV id: MAVLink system id + the link's offset")]
+    t: Annotated[float, Meta(description="fleet time of the newest content [s since 1970]")]
+
+
+class Sample(Message, frozen=True, kw_only=True):
+    """Telemetry rows of one aircraft since the message before; a kind without news is absent."""
+
+    topic: ClassVar[str] = "sample"
+
+    attitude: Rows | None = None
+    imu: Rows | None = None
+    position: Rows | None = None
+    velocity: Rows | None = None
+    air: Rows | None = None
+    servo: Rows | None = None
+    command: Rows | None = None
+    leg: Rows | None = None
+
+
+class Link(StrEnum):
+    """State of the radio link to one aircraft."""
+
+    LIVE = "live"
+    LOST = "lost"
+
+
+class Status(Message, frozen=True, kw_only=True):
+    """How the link and the aircraft are."""
+
+    topic: ClassVar[str] = "status"
+
+    link: Link = Link.LIVE
+    mode: Annotated[str, Meta(description="flight mode as the autopilot names it, e.g. AUTO")] = ""
+    armed: bool = False
+    autopilot: Annotated[str, Meta(description="ardupilot, px4 or generic")] = "generic"
+    vehicle: Annotated[str, Meta(description="fixed_wing, quadplane, multirotor, helicopter or unknown")] = "unknown"
+    rates_hz: Annotated[dict[str, float], Meta(description="received rate of each message [Hz]")] = {}
+    received: Annotated[int, Meta(description="messages received")] = 0
+    missed: Annotated[int, Meta(description="messages missed, from gaps in the sequence number")] = 0
+    rejected: Annotated[int, Meta(description="messages or fields refused (not finite, out of range, stale)")] = 0
+    clock_offset_s: Annotated[float, Meta(description="fleet time minus the aircraft's boot time [s]")] = 0.0
+    clock_jumps: Annotated[int, Meta(description="times the aircraft's clock jumped")] = 0
+    sentence: Annotated[str, Meta(description="what an operator should know, or empty")] = ""
+
+
+class Item(msgspec.Struct, frozen=True, kw_only=True):
+    """One mission item as MAVLink knows it (MISSION_ITEM_INT)."""
+
+    seq: int
+    command: Annotated[int, Meta(description="MAV_CMD")]
+    frame: Annotated[int, Meta(description="MAV_FRAME")] = 3
+    param1: float = 0.0
+    param2: float = 0.0
+    param3: float = 0.0
+    param4: float = 0.0
+    lat_e7: Annotated[int, Meta(description="[1e-7 deg]")] = 0
+    lon_e7: Annotated[int, Meta(description="[1e-7 deg]")] = 0
+    alt_m: Annotated[float, Meta(description="altitude in the item's frame [m]")] = 0.0
+
+
+class Mission(Message, frozen=True, kw_only=True):
+    """The route on board; item 0 of an ArduPilot mission is home."""
+
+    topic: ClassVar[str] = "mission"
+
+    items: tuple[Item, ...] = ()
+    seq: Annotated[int, Meta(description="item in force when this was sent; -1 unknown")] = -1
+    complete: Annotated[bool, Meta(description="every item arrived")] = False
+    sentence: Annotated[str, Meta(description="what is wrong with it, or empty")] = ""
+
+
+class Params(Message, frozen=True, kw_only=True):
+    """Autopilot parameters, named and scaled as the autopilot does; never non-finite."""
+
+    topic: ClassVar[str] = "params"
+
+    values: dict[str, float] = {}
+    complete: bool = False
+    sentence: str = ""
+
+
+class Outcome(StrEnum):
+    """Verdict on an identification; not an error, an answer."""
+
+    VERIFIED = "verified"
+    STARVED = "starved"
+    NOT_IDENTIFIABLE = "not_identifiable"
+    BELOW_THRESHOLD = "below_threshold"
+    WORSE_THAN_LAST = "worse_than_last"
+    DIVERGED = "diverged"
+
+
+class Verdict(msgspec.Struct, frozen=True, kw_only=True):
+    """Whether a model deserves belief, out of sample."""
+
+    outcome: Outcome
+    sentence: str
+    fit: Annotated[dict[str, float], Meta(description="100 (1 - nrmse) per state at `horizon_s` [%]")] = {}
+    fit_hold: Annotated[dict[str, float], Meta(description="the same for holding the last value [%]")] = {}
+    horizon_s: Annotated[float, Meta(description="free-run length the fit is over [s]")] = 0.0
+    threshold: Annotated[float, Meta(description="omega: least mean fit [%]")] = 0.0
+    tries: Annotated[int, Meta(description="identifications tried for this verdict")] = 0
+
+
+class Linear(msgspec.Struct, frozen=True, kw_only=True):
+    """Discrete linear model about a trim point: x' = A x + B u + c, y = x (C = I, D = 0). Source: Huang 2021 eq. 2-4."""
+
+    states: Annotated[tuple[str, ...], Meta(description="state names: u w q theta | phi psi p r v")]
+    inputs: Annotated[tuple[str, ...], Meta(description="input names: delta_e delta_t | delta_a delta_r")]
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    x_trim: Annotated[Array, Meta(description="state at trim, (n,) [m/s, rad, rad/s]")]
+    u_trim: Annotated[Array, Meta(description="input at trim, (m,) [-]")]
+    dt_s: Annotated[float, Meta(description="sample time [s]")]
+
+
+class Model(Message, frozen=True, kw_only=True):
+    """The identified model of one aircraft, the window it came from, and its verdict."""
+
+    topic: ClassVar[str] = "model"
+
+    method: Annotated[str, Meta(description="paper")]
+    verdict: Verdict
+    longitudinal: Linear | None = None
+    lateral: Linear | None = None
+    window_t0: Annotated[float, Meta(description="first instant of the identification window [s since 1970]")] = 0.0
+    window_s: Annotated[float, Meta(description="length of the identification window [s]")] = 0.0
+    interpolated: Annotated[float, Meta(description="share of the window that was interpolated, 0..1")] = 0.0
+    wind_n: Annotated[float, Meta(description="estimated wind, north, the direction it blows to [m/s]")] = 0.0
+    wind_e: Annotated[float, Meta(description="estimated wind, east [m/s]")] = 0.0
+
+
+class State(StrEnum):
+    """Where one aircraft's twin stands; the worst news wins."""
+
+    UNCLAIMED = "unclaimed"
+    WAITING = "waiting"
+    IDENTIFYING = "identifying"
+    VERIFIED = "verified"
+    PREDICTING = "predicting"
+    LINK_LOST = "link_lost"
+
+
+class Prediction(Message, frozen=True, kw_only=True):
+    """Where one aircraft will be, and how far to trust that."""
+
+    topic: ClassVar[str] = "prediction"
+
+    state: State
+    method: Annotated[str, Meta(description="paper (closed loop on the mission) or imm (no route: turn rate only)")]
+    law: Annotated[str, Meta(description="controller twin in force, e.g. arduplane: L1 + TECS")] = ""
+    origin: Annotated[tuple[int, int, int], Meta(description="NED origin: lat, lon [1e-7 deg], alt [mm AMSL]")]
+    ahead: Annotated[Array, Meta(description="look-ahead from `t`, (n,) <f4 [s]")]
+    path: Annotated[Array, Meta(description="mean position, NED from origin, (n, 3) <f4 [m]")]
+    tube: Annotated[Array, Meta(description="half-axes of the band, along, cross, vertical, (n, 3) <f4 [m]")]
+    quantile: Annotated[float, Meta(description="share of flights the tube is meant to hold, 0..1")] = 0.9
+    horizon_s: Annotated[float, Meta(description="confidence horizon: `quantile` error reaches 10 % [s]")] = 0.0
+    horizon_open: Annotated[bool, Meta(description="true: still below 10 % at the end of `ahead`")] = False
+    held: Annotated[float, Meta(description="measured share inside the tube so far, 0..1; nan before any")] = float("nan")
+    held_n: Annotated[int, Meta(description="past predictions behind `held`")] = 0
+    coast_s: Annotated[float, Meta(description="time flown by the twin alone since the last sample [s]")] = 0.0
+    seq: Annotated[int, Meta(description="mission item the prediction starts on; -1 none")] = -1
+    sentence: Annotated[str, Meta(description="what limits this prediction, or empty")] = ""
+
+    def ned_origin(self) -> Origin:
+        """Give the origin as a named tuple."""
+        return Origin(*self.origin)
+
+
+class Mismatch(Message, frozen=True, kw_only=True):
+    """Where flight and twin part ways, and what physics explains it."""
+
+    topic: ClassVar[str] = "mismatch"
+
+    name: Annotated[str, Meta(description="effect named, or unknown")]
+    rivals: tuple[str, ...] = ()
+    segments: Annotated[tuple[tuple[float, float], ...], Meta(description="located, [s since 1970]")] = ()
+    parameters: dict[str, float] = {}
+    sigma: dict[str, float] = {}
+    fit_before: Annotated[float, Meta(description="[%]")] = 0.0
+    fit_after: Annotated[float, Meta(description="[%]")] = 0.0
+    sentence: str = ""
+
+
+class AlertKind(StrEnum):
+    """What an alert warns of."""
+
+    LINK_LOST = "link_lost"
+    SHORT_HORIZON = "short_horizon"
+    CONFLICT = "conflict"
+    GEOFENCE = "geofence"
+    GROUND = "ground"
+
+
+class Alert(Message, frozen=True, kw_only=True):
+    """A warning for the operator; `active` false withdraws it."""
+
+    topic: ClassVar[str] = "alert"
+
+    kind: AlertKind
+    active: bool = True
+    sentence: str = ""
+
+
+class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One line of the fleet table."""
+
+    uav: int
+    state: State
+    verdict: Annotated[str, Meta(description="sentence of the last verdict")]
+    fit: Annotated[dict[str, float], Meta(description="per state [%]")] = {}
+    horizon_s: float = 0.0
+    worker: Annotated[str, Meta(description="writer of the accepted results, 16 hex digits")] = ""
+    sample_age_s: Annotated[float | None, Meta(description="since the newest sample arrived [s]")] = None
+    prediction_age_s: Annotated[float | None, Meta(description="since the newest prediction was made [s]")] = None
+    t10_s: Annotated[
+        float | None, Meta(description="median time past predictions stayed within 10 % (M1) [s]; null before any")
+    ] = None
+    t10_censored: Annotated[float | None, Meta(description="share of them still within 10 % at their end, 0..1")] = None
+    t10_n: Annotated[int, Meta(description="past predictions behind `t10_s`")] = 0
+    epoch: Annotated[int, Meta(description="claim epoch of the writer")] = 0
+
+
+class FleetState(msgspec.Struct, frozen=True, kw_only=True):
+    """The rows of one worker."""
+
+    topic: ClassVar[str] = "@fleet/state"
+    version: ClassVar[int] = 1
+
+    t: float
+    rows: tuple[FleetRow, ...] = ()
+    sentence: Annotated[str, Meta(description="e.g. compiling the twin's physics, once")] = ""
+
+
+class Account(msgspec.Struct, frozen=True, kw_only=True):
+    """Counters of one gateway."""
+
+    topic: ClassVar[str] = "@gateway"
+    version: ClassVar[int] = 1
+
+    t: float
+    links: tuple[str, ...] = ()
+    uavs: tuple[int, ...] = ()
+    datagrams: int = 0
+    bytes_in: int = 0
+    messages: int = 0
+    bad_bytes: Annotated[int, Meta(description="bytes that were no MAVLink frame")] = 0
+    bad_frames: Annotated[int, Meta(description="frames with a wrong checksum or an unknown message id")] = 0
+    refused: Annotated[dict[str, int], Meta(description="good frames refused, by reason")] = {}
+    published: int = 0
+    sentence: str = ""
+
+
+PER_UAV: tuple[type[Message], ...] = (Sample, Status, Mission, Params, Model, Prediction, Mismatch, Alert)
+CONTROL: tuple[type, ...] = (FleetState, Account)
+TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}

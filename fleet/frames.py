@@ -1,0 +1,124 @@
+"""Frames and letters: NED, FRD, geodetic, quaternions, the wind triangle.
+
+The letters of Beard & McLain, "Small Unmanned Aircraft" (2012), used everywhere in this house:
+
+    p_n p_e p_d      position, north-east-down from a named origin (NED)        [m]
+    v_n v_e v_d      velocity over ground (NED)                                 [m/s]
+    u v w            velocity in the body, forward-right-down (FRD)             [m/s]
+    quat             attitude, body -> NED, scalar first                        [-]
+    phi theta psi    roll, pitch, yaw (3-2-1)                                   [rad]
+    p q r            body rates (FRD)                                           [rad/s]
+    Va alpha beta    airspeed, angle of attack, sideslip                        [m/s, rad]
+    chi gamma        course over ground, flight-path angle                      [rad]
+    delta_a delta_e delta_r   aileron, elevator, rudder, -1..1 of full throw    [-]
+    delta_t          throttle, 0..1                                             [-]
+    w_n w_e          wind, the direction it blows to (NED)                      [m/s]
+
+Positive aileron rolls right, positive elevator pitches up, positive rudder yaws right.
+"""
+
+from math import atan2, cos, hypot, pi, radians, sin, sqrt
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+
+G = 9.80665  # standard gravity [m/s2]
+_A = 6378137.0  # WGS-84 equatorial radius [m]
+_E2 = 6.69437999014e-3  # WGS-84 first eccentricity squared [-]
+
+
+class Origin(NamedTuple):
+    """Where a local NED frame touches the earth; integers as on the MAVLink wire, so nothing is rounded twice."""
+
+    lat_e7: int  # geodetic latitude [1e-7 deg]
+    lon_e7: int  # longitude [1e-7 deg]
+    alt_mm: int  # height above mean sea level [mm]
+
+
+def _radii(origin: Origin) -> tuple[float, float]:
+    lat = radians(origin.lat_e7 * 1e-7)
+    s = sin(lat)
+    meridian = _A * (1 - _E2) / (1 - _E2 * s * s) ** 1.5
+    normal = _A / sqrt(1 - _E2 * s * s)
+    h = origin.alt_mm * 1e-3
+    return meridian + h, (normal + h) * cos(lat)
+
+
+def to_ned(origin: Origin, lat_e7: np.ndarray, lon_e7: np.ndarray, alt_mm: np.ndarray) -> np.ndarray:
+    """Map geodetic positions to local NED of `origin` (tangent plane, good within 100 km).
+
+    Args:
+        lat_e7, lon_e7: geodetic position, (n,) [1e-7 deg]
+        alt_mm: height above mean sea level, (n,) [mm]
+    Returns:
+        position, NED, (n, 3) [m]
+    """
+    m, n = _radii(origin)
+    d_lon = (np.asarray(lon_e7, float) - origin.lon_e7 + 1.8e9) % 3.6e9 - 1.8e9  # shortest way round the date line
+    north = np.radians((np.asarray(lat_e7, float) - origin.lat_e7) * 1e-7) * m
+    east = np.radians(d_lon * 1e-7) * n
+    down = (origin.alt_mm - np.asarray(alt_mm, float)) * 1e-3
+    return np.stack([north, east, down], axis=-1)
+
+
+def to_geodetic(origin: Origin, ned: np.ndarray) -> np.ndarray:
+    """Map local NED positions back: (n, 3) [m] -> (n, 3) integers [1e-7 deg, 1e-7 deg, mm]."""
+    m, n = _radii(origin)
+    ned = np.asarray(ned, float)
+    lat = origin.lat_e7 + np.degrees(ned[..., 0] / m) * 1e7
+    lon = origin.lon_e7 + np.degrees(ned[..., 1] / n) * 1e7
+    lon = (lon + 1.8e9) % 3.6e9 - 1.8e9
+    alt = origin.alt_mm - ned[..., 2] * 1e3
+    return np.rint(np.stack([lat, lon, alt], axis=-1)).astype(np.int64)
+
+
+def quaternion(phi: float, theta: float, psi: float) -> np.ndarray:
+    """Turn 3-2-1 Euler angles [rad] into `quat` (4,), body -> NED, scalar first. Source: Beard & McLain, App. B."""
+    c1, s1 = cos(psi / 2), sin(psi / 2)
+    c2, s2 = cos(theta / 2), sin(theta / 2)
+    c3, s3 = cos(phi / 2), sin(phi / 2)
+    return np.array(
+        [
+            c1 * c2 * c3 + s1 * s2 * s3,
+            c1 * c2 * s3 - s1 * s2 * c3,
+            c1 * s2 * c3 + s1 * c2 * s3,
+            s1 * c2 * c3 - c1 * s2 * s3,
+        ]
+    )
+
+
+def body_to_ned(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """Rotate body vectors to NED. Angles (n,) [rad], body FRD (n, 3). Source: Beard & McLain eq. 2.5."""
+    return np.einsum("nij,nj->ni", _rotation(phi, theta, psi), body)
+
+
+def ned_to_body(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, ned: np.ndarray) -> np.ndarray:
+    """Rotate NED vectors to the body. Angles (n,) [rad], NED (n, 3)."""
+    return np.einsum("nji,nj->ni", _rotation(phi, theta, psi), ned)
+
+
+def _rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
+    cf, sf, ct, st, cp, sp = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta), np.cos(psi), np.sin(psi)
+    rows = [
+        [ct * cp, sf * st * cp - cf * sp, cf * st * cp + sf * sp],
+        [ct * sp, sf * st * sp + cf * cp, cf * st * sp - sf * cp],
+        [-st, sf * ct, cf * ct],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def bearing(north: float, east: float) -> float:
+    """Give the bearing of a horizontal vector, from north clockwise [rad]."""
+    return atan2(east, north)
+
+
+def ground_speed(v_n: float, v_e: float) -> float:
+    """Give the speed over ground [m/s]."""
+    return hypot(v_n, v_e)
+
+
+@nb.njit(cache=True)
+def wrap(angle: float) -> float:
+    """Wrap an angle to (-pi, pi] [rad]; a non-finite angle stays non-finite."""
+    return (angle + pi) % (2 * pi) - pi

@@ -1,0 +1,1 @@
+"""The pretend aircraft: JSBSim physics that speaks real MAVLink."""

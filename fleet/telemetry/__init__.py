@@ -1,0 +1,1 @@
+"""Bytes to Samples, the same for a live link and a recording."""

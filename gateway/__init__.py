@@ -1,0 +1,1 @@
+"""Links to bus: MAVLink in, Samples out."""

@@ -1,0 +1,1 @@
+"""Samples to judgement: identify, verify and predict each aircraft online."""

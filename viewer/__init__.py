@@ -1,0 +1,1 @@
+"""Judgement to picture: the operator's page."""
