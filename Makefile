@@ -1,0 +1,55 @@
+# Two commands: `make run` and `make test`. Each sets up by itself; `make` alone explains.
+
+PYTHON ?= python3
+UP ?=
+TESTS ?=
+BIN := .venv/bin
+LOCK := requirements.lock
+STAMP := .venv/setup-done
+export PARAUAV_RECORDINGS ?= $(abspath ../shared/recordings)
+
+# The stamp names the folder and the interpreter it was made for: a moved checkout sets up again.
+ifneq ($(shell cat $(STAMP) 2>/dev/null && $(BIN)/python -c '' 2>&1),$(CURDIR))
+STALE := stale
+endif
+
+.PHONY: help setup run test lint browser lock clean stale
+
+help:
+	@echo "make run [UP='--uavs 8']    set up, then fly a fleet, twin it and show it; Ctrl-C ends it"
+	@echo "make test [TESTS='…']       set up, then run every test, the browser's included"
+	@echo "make setup                  only set up: packages into .venv, by version and hash"
+	@echo "make lint                   ruff and mypy"
+	@echo "make lock                   renew $(LOCK) after an edit of the dependencies"
+	@echo "make clean                  remove .venv and everything else that was made"
+
+setup: $(STAMP)
+
+$(STAMP): $(LOCK) pyproject.toml $(STALE)
+	@PYTHON="$(PYTHON)" sh deploy/setup.sh
+
+run: setup
+	@exec $(BIN)/fleet up $(UP)
+
+test: setup browser
+	@$(BIN)/python -m pytest $(TESTS)
+
+lint: setup
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+
+browser:
+	@sh deploy/browser.sh
+
+lock:
+	@rm -rf .venv-lock && $(PYTHON) -m venv .venv-lock && .venv-lock/bin/pip install -q pip-tools
+	@.venv-lock/bin/pip-compile pyproject.toml --extra dev --all-build-deps --allow-unsafe --generate-hashes \
+	  --no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-header --no-annotate --strip-extras \
+	  --quiet --output-file $(LOCK)
+	@sed -i -e '/^#/d' -e '1i # Every package by version and hash, build backend included. Made from pyproject.toml by `make lock`; not by hand.' $(LOCK)
+	@rm -rf .venv-lock
+
+clean:
+	@rm -rf .venv .venv-lock build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,46 @@
+#!/bin/sh
+# Set up .venv: every package of requirements.lock by version and hash, then the project itself. Called by `make setup`.
+set -eu
+cd "$(dirname "$0")/.."
+python=${PYTHON:-python3}
+log=.venv/setup.log
+
+say() { printf 'setup: %s\n' "$*"; }
+fail() { printf 'setup: %s\n' "$*" >&2; exit 1; }
+
+command -v "$python" >/dev/null || fail "found no '$python', expected Python 3.11 or newer; install it or run: make setup PYTHON=/path/to/python3"
+found=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+"$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
+    fail "found Python $found, expected 3.11 or newer; name a newer one: make setup PYTHON=python3.12"
+"$python" -c 'import ensurepip, venv' 2>/dev/null ||
+    fail "found Python $found without venv; install it, e.g. on Debian or Ubuntu: apt-get install python3-venv"
+
+rm -f .venv/setup-done
+say "1/3 a virtual environment in .venv (Python $found)"
+"$python" -m venv --clear .venv
+
+total=$(grep -c '==' requirements.lock)
+say "2/3 $total packages, about 300 MB; a few minutes the first time"
+{ .venv/bin/python -m pip install --disable-pip-version-check --progress-bar off --require-hashes -r requirements.lock 2>&1 ||
+    echo 'SETUP-FAILED'; } | {
+    count=0
+    : >"$log"
+    while IFS= read -r line; do
+        printf '%s\n' "$line" >>"$log"
+        case $line in
+        Collecting*)
+            count=$((count + 1))
+            if [ $((count % 5)) = 0 ]; then say "    $count/$total"; fi ;;
+        Installing*) say "    unpacking" ;;
+        esac
+    done
+}
+if grep -q '^SETUP-FAILED$' "$log"; then
+    tail -n 20 "$log" >&2
+    fail "pip could not install requirements.lock; the whole story is in $log"
+fi
+
+say "3/3 ParaUAV itself"
+.venv/bin/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation -e .
+pwd >.venv/setup-done
+say "done"

@@ -1,0 +1,42 @@
+"""What every test shares: the recordings, a browser, a free port, the option that renews the golden bytes."""
+
+import os
+import shutil
+import socket
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--golden", action="store_true", help="write tests/golden/ anew instead of comparing with it")
+
+
+@pytest.fixture(scope="session")
+def recordings() -> Path:
+    """Folder of recorded flights; a test that needs it is skipped where it is absent."""
+    folder = Path(os.environ.get("PARAUAV_RECORDINGS") or ROOT.parent / "shared" / "recordings")
+    if not folder.is_dir():
+        pytest.skip(f"no recordings at {folder}; name their folder in PARAUAV_RECORDINGS")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def chromium() -> str:
+    """Path of a browser; without one the test is skipped, or fails under CI=1."""
+    found = os.environ.get("PARAUAV_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
+    if found is None:
+        reason = "no chromium; install it (apt-get install chromium) or name one in PARAUAV_CHROMIUM"
+        (pytest.fail if os.environ.get("CI") else pytest.skip)(reason)
+    return found
+
+
+@pytest.fixture
+def free_port() -> int:
+    """Number of a loopback TCP port that nobody holds."""
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
