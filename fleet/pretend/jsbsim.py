@@ -1,0 +1,187 @@
+"""The physics of the pretend aircraft: JSBSim, flown in SI, NED and FRD.
+
+Nothing of the twin's own physics is used here, so that the twin is judged on physics it does not share.
+"""
+
+from math import atan2, cos, degrees, hypot, sin
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jsbsim
+import numpy as np
+
+from fleet.frames import Origin, to_ned
+from fleet.pretend.weather import FT, wind_at_20ft
+
+DT = 0.01  # physics step [s]
+MODEL = "aerosonde"
+CRUISE = 23.0  # [m/s]
+SPREAD = {  # standard deviation of each factor vary/* between aircraft of one type [-]
+    "C_L_alpha": 0.04,
+    "C_D_p": 0.08,
+    "C_Y_beta": 0.08,
+    "C_l_beta": 0.08,
+    "C_l_p": 0.07,
+    "C_l_delta_a": 0.07,
+    "C_m_alpha": 0.08,
+    "C_m_q": 0.08,
+    "C_m_delta_e": 0.07,
+    "C_n_beta": 0.08,
+    "C_n_r": 0.10,
+    "C_n_delta_r": 0.07,
+    "thrust": 0.05,
+}
+OFFSETS = {"C_l_0": 0.001, "C_m_0": 0.004, "C_n_0": 0.0004}  # what building by hand leaves askew [-]
+PAYLOAD_KG = (0.5, 2.5)  # on 9.5 kg empty
+_KG_TO_LB = 2.2046226218
+_READ = (
+    "position/lat-geod-rad position/long-gc-rad position/geod-alt-ft "
+    "velocities/v-north-fps velocities/v-east-fps velocities/v-down-fps "
+    "attitude/phi-rad attitude/theta-rad attitude/psi-rad "
+    "velocities/p-rad_sec velocities/q-rad_sec velocities/r-rad_sec "
+    "accelerations/a-pilot-x-ft_sec2 accelerations/a-pilot-y-ft_sec2 accelerations/a-pilot-z-ft_sec2 "
+    "velocities/vt-fps aero/alpha-rad aero/beta-rad"
+).split()
+_SURFACES = ("fcs/aileron-cmd-norm", "fcs/elevator-cmd-norm", "fcs/rudder-cmd-norm", "fcs/motor-cmd-norm")
+
+
+class Truth(NamedTuple):
+    """What the physics says, before any sensor."""
+
+    p: np.ndarray  # position, NED from the origin, (3,) [m]
+    v: np.ndarray  # velocity over ground, NED, (3,) [m/s]
+    euler: np.ndarray  # phi theta psi, (3,) [rad]
+    rates: np.ndarray  # p q r, FRD, (3,) [rad/s]
+    force: np.ndarray  # specific force at the centre of gravity, FRD, (3,) [m/s2]
+    Va: float  # true airspeed [m/s]
+    alpha: float  # [rad]
+    beta: float  # [rad]
+
+
+class Aircraft:
+    """One JSBSim aircraft, with the small differences that every built aircraft has."""
+
+    def __init__(self, origin: Origin, seed: int, turbulence: int = 0):
+        """Load the model and draw what makes this aircraft its own.
+
+        Args:
+            origin: where the NED frame touches the earth
+            seed: draws mass, coefficients and turbulence
+            turbulence: MIL-F-8785C severity, 0..7
+        Raises:
+            RuntimeError: when JSBSim refuses its aircraft file; reinstall the package.
+        """
+        self._fdm = _executive()
+        self._nodes = {name: self._fdm.get_property_manager().get_node(name) for name in (*_READ, *_SURFACES)}
+        self._read = [self._nodes[name].get_double_value for name in _READ]
+        self._origin = origin
+        north = to_ned(origin, origin.lat_e7 + 10_000, origin.lon_e7, origin.alt_mm)[0]
+        east = to_ned(origin, origin.lat_e7, origin.lon_e7 + 10_000, origin.alt_mm)[1]
+        self._per_rad = north / np.radians(1e-3), east / np.radians(1e-3)  # [m/rad]
+        self._vary(np.random.default_rng((seed, 1)))
+        self._turbulence = turbulence
+        self._seed = seed
+
+    def _vary(self, rng: np.random.Generator) -> None:
+        self.payload_kg = rng.uniform(*PAYLOAD_KG)
+        self._fdm["inertia/pointmass-weight-lbs"] = self.payload_kg * _KG_TO_LB
+        for name, spread in SPREAD.items():
+            self._fdm[f"vary/{name}"] = 1 + spread * float(np.clip(rng.standard_normal(), -2, 2))
+        for name, spread in OFFSETS.items():
+            self._fdm[f"vary/{name}"] = spread * float(np.clip(rng.standard_normal(), -2, 2))
+
+    def start(self, p: np.ndarray, psi: float, Va: float, wind: tuple[float, float]) -> tuple[float, float, float]:
+        """Put the aircraft in the air, trimmed in level flight through a moving air mass.
+
+        Args:
+            p: position, NED from the origin, (3,) [m]
+            psi: heading [rad]
+            Va: airspeed [m/s]
+            wind: north, east, the direction it blows to [m/s]
+        Returns:
+            theta [rad], delta_e, delta_t at trim
+        """
+        fdm = self._fdm
+        fdm["simulation/randomseed"] = self._seed % 2**31
+        fdm["ic/terrain-elevation-ft"] = self._origin.alt_mm * 1e-3 / FT
+        fdm["ic/lat-geod-deg"] = self._origin.lat_e7 * 1e-7 + degrees(p[0] / self._per_rad[0])
+        fdm["ic/long-gc-deg"] = self._origin.lon_e7 * 1e-7 + degrees(p[1] / self._per_rad[1])
+        fdm["ic/h-sl-ft"] = (self._origin.alt_mm * 1e-3 - p[2]) / FT
+        fdm["ic/psi-true-rad"] = psi
+        fdm["ic/phi-rad"] = 0.0
+        trim = self._trim(Va)
+        fdm["ic/vw-mag-fps"] = hypot(*wind) / FT
+        fdm["ic/vw-dir-deg"] = degrees(atan2(wind[1], wind[0])) % 360
+        fdm["ic/vn-fps"] = (Va * cos(psi) + wind[0]) / FT
+        fdm["ic/ve-fps"] = (Va * sin(psi) + wind[1]) / FT
+        fdm["ic/vd-fps"] = 0.0
+        fdm["atmosphere/turb-type"] = 3 if self._turbulence else 0
+        fdm["atmosphere/turbulence/milspec/windspeed_at_20ft_AGL-fps"] = wind_at_20ft(self._turbulence)
+        fdm["atmosphere/turbulence/milspec/severity"] = float(self._turbulence)
+        fdm.run_ic()
+        fdm.set_trim_status(False)
+        self.blow(*wind)
+        return trim
+
+    def _trim(self, Va: float) -> tuple[float, float, float]:
+        """Solve udot = wdot = qdot = 0 for alpha, delta_e, delta_t by Newton's method; servo lags pass through."""
+        self._fdm.set_trim_status(True)
+        z = np.array([0.06, 0.1, 0.4])
+        for _ in range(12):
+            f0 = self._accelerations(Va, z)
+            if np.abs(f0).max() < 1e-6:
+                break
+            jacobian = np.stack([(self._accelerations(Va, z + dz) - f0) / 1e-4 for dz in 1e-4 * np.eye(3)], axis=1)
+            z = np.clip(z - np.linalg.solve(jacobian, f0), [-0.1, -1.0, 0.0], [0.25, 1.0, 1.0])
+        return float(z[0]), float(z[1]), float(z[2])
+
+    def _accelerations(self, Va: float, z: np.ndarray) -> np.ndarray:
+        fdm = self._fdm
+        fdm["ic/vt-fps"] = Va / FT
+        fdm["ic/alpha-rad"] = fdm["ic/theta-rad"] = float(z[0])
+        self.drive(0.0, float(z[1]), 0.0, float(z[2]))
+        fdm.run_ic()
+        names = ("accelerations/udot-ft_sec2", "accelerations/wdot-ft_sec2", "accelerations/qdot-rad_sec2")
+        return np.array([fdm[name] for name in names])
+
+    def drive(self, delta_a: float, delta_e: float, delta_r: float, delta_t: float) -> None:
+        """Command the servos, -1..1 (+ rolls right, pitches up, yaws right), and the motor, 0..1."""
+        for name, value in zip(_SURFACES, (delta_a, -delta_e, -delta_r, delta_t), strict=True):
+            self._nodes[name].set_double_value(value)
+
+    def blow(self, w_n: float, w_e: float) -> None:
+        """Set the mean wind, NED, the direction it blows to [m/s]; turbulence comes on top."""
+        self._fdm["atmosphere/wind-north-fps"] = w_n / FT
+        self._fdm["atmosphere/wind-east-fps"] = w_e / FT
+
+    def step(self) -> None:
+        """Advance by DT."""
+        self._fdm.run()
+
+    def truth(self) -> Truth:
+        """Read the state in SI, NED and FRD."""
+        x = np.array([read() for read in self._read])
+        origin = self._origin
+        p = np.array(
+            [
+                (x[0] - np.radians(origin.lat_e7 * 1e-7)) * self._per_rad[0],
+                (x[1] - np.radians(origin.lon_e7 * 1e-7)) * self._per_rad[1],
+                origin.alt_mm * 1e-3 - x[2] * FT,
+            ]
+        )
+        return Truth(p, x[3:6] * FT, x[6:9], x[9:12], x[12:15] * FT, float(x[15] * FT), float(x[16]), float(x[17]))
+
+    def __getitem__(self, name: str) -> float:
+        """Read any JSBSim property by its own name, in its own unit."""
+        return float(self._fdm[name])
+
+
+def _executive() -> Any:
+    """Make a silent JSBSim executive with our aircraft loaded."""
+    jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.ERROR))
+    fdm = jsbsim.FGFDMExec(str(Path(__file__).parent))
+    fdm.set_debug_level(0)
+    if not fdm.load_model(MODEL):
+        raise RuntimeError(f"jsbsim: found no loadable {MODEL!r}, expected it beside this file; reinstall the package")
+    fdm.set_dt(DT)
+    return fdm

@@ -1,0 +1,81 @@
+"""Weather round a pretend aircraft: mean wind with a height profile and a slow drift, turbulence intensity."""
+
+from math import cos, pi, sin
+
+import numpy as np
+
+FT = 0.3048  # [m]
+_W20_FPS = (0.0, 8.0, 16.0, 25.0, 50.0, 62.0, 75.0, 88.0)
+REFERENCE_M = 100.0  # height the mean wind is given at
+
+
+class GaussMarkov:
+    """A vector of independent first-order Gauss-Markov processes: x' = -x / tau + noise, with std sigma."""
+
+    def __init__(self, rng: np.random.Generator, sigma: np.ndarray, tau: np.ndarray, dt: float):
+        """Start in the stationary distribution.
+
+        Args:
+            rng: source of chance
+            sigma: standard deviation, (n,) [any]
+            tau: correlation time, (n,) [s]; 0 makes white noise
+            dt: step [s]
+        """
+        self._rng = rng
+        decay = np.where(tau > 0, np.exp(-dt / np.where(tau > 0, tau, 1.0)), 0.0)
+        self._decay, self._kick = decay, sigma * np.sqrt(1 - decay**2)
+        self.x = sigma * rng.standard_normal(len(sigma))
+
+    def step(self) -> np.ndarray:
+        """Advance by dt; give the new values (n,)."""
+        self.x = self._decay * self.x + self._kick * self._rng.standard_normal(len(self._kick))
+        return self.x
+
+
+class Wind:
+    """Mean wind over height plus a slow horizontal drift.
+
+    w(h) = w_100 (h / 100)^0.143, drift std 0.12 w_100 + 0.1 m/s with a correlation time of 90 s.
+    Source: power law 1/7 (Hellmann exponent over open ground).
+    """
+
+    def __init__(self, mean: float, rng: np.random.Generator, dt: float, towards: float | None = None):
+        """Choose a direction.
+
+        Args:
+            mean: wind speed at 100 m [m/s]
+            rng: source of chance
+            dt: step of `step` [s]
+            towards: direction it blows to, from north clockwise [rad]; None draws one
+        """
+        self._mean = mean
+        self._towards = rng.uniform(-pi, pi) if towards is None else towards
+        sigma = 0.12 * mean + 0.1 if mean > 0 else 0.0
+        self._drift = GaussMarkov(rng, np.full(2, sigma), np.full(2, 90.0), dt)
+
+    def step(self, height: float) -> tuple[float, float]:
+        """Advance by dt and give the wind, NED north and east, at `height` above ground [m/s]."""
+        speed = self._mean * (max(height, 5.0) / REFERENCE_M) ** 0.143
+        d_n, d_e = self._drift.step()
+        return speed * cos(self._towards) + d_n, speed * sin(self._towards) + d_e
+
+
+def turbulence_level(text: str) -> int:
+    """Read `--turbulence`: 0..7, or none, light (3), moderate (4), severe (6).
+
+    Raises:
+        ValueError: when it is none of these.
+    """
+    words = {"none": 0, "light": 3, "moderate": 4, "severe": 6}
+    level = words.get(text, int(text) if text.isdecimal() else -1)
+    if not 0 <= level <= 7:
+        raise ValueError(f"turbulence: found {text!r}, expected 0..7, none, light, moderate or severe; write one of them")
+    return level
+
+
+def wind_at_20ft(level: int) -> float:
+    """Give the MIL-F-8785C wind at 20 ft for a severity [ft/s]: light 15 kt, moderate 30 kt, severe 45 kt.
+
+    Below 1000 ft it alone sets the intensity, sigma_w = 0.1 w_20. Source: MIL-F-8785C sec. 3.7.3.4.
+    """
+    return _W20_FPS[level]
