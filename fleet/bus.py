@@ -71,6 +71,11 @@ def newest(found: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
     return [best[uav] for uav in sorted(best)] + rest
 
 
+def asked_for(uav: int | None, answers: Answers) -> list[tuple[Any, Stamp | None]]:
+    """Keep the answers about the aircraft asked for; None keeps all."""
+    return [(m, stamp) for m, stamp in answers if uav is None or getattr(m, "uav", uav) == uav]
+
+
 class MemoryBus(AbstractContextManager):
     """The bus within one process, synchronous; every message still goes through its bytes."""
 
@@ -81,22 +86,41 @@ class MemoryBus(AbstractContextManager):
         self.bad = 0
 
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
-        kind, payload = type(message), encode(message)
+        """Send one message to whoever listens."""
+        self.deliver(type(message), encode(message), encoding(type(message)), stamp)
+
+    def deliver(self, kind: type, payload: bytes, named: str, stamp: Stamp | None = None) -> None:
+        """Hand bytes to the listeners as if they had come over a wire; count what does not decode."""
         for heard in self._heard.get(kind, []):
-            heard(decode(kind, payload, encoding(kind)), stamp)
+            try:
+                message: Any = decode(kind, payload, named)
+            except ValueError:
+                self.bad += 1
+                continue
+            heard(message, stamp)
 
     def subscribe(self, kind: type, heard: Heard) -> None:
+        """Call `heard(message, stamp)` for every message of a class."""
         self._heard.setdefault(kind, []).append(heard)
 
     def answer(self, kind: type, reply: Answer) -> None:
+        """Declare one wildcard queryable for a class."""
         self._reply.setdefault(kind, []).append(reply)
 
     def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
+        """Ask everyone for a class; the highest epoch per aircraft is kept."""
         uav = who if isinstance(who, int) else None
-        found = [pair for reply in self._reply.get(kind, []) for pair in reply(uav, {}, b"")]
+        found: list[tuple[M, Stamp | None]] = []
+        for reply in self._reply.get(kind, []):
+            try:
+                answers = asked_for(uav, reply(uav, {}, b""))
+            except ValueError:
+                continue  # a refusal; on Zenoh it travels as an error reply, which `ask` leaves out
+            found += [(decode(kind, encode(message), encoding(kind)), stamp) for message, stamp in answers]
         return newest(found)
 
     def close(self) -> None:
+        """Forget everyone."""
         self._heard.clear()
         self._reply.clear()
 
@@ -116,6 +140,7 @@ class ZenohBus(AbstractContextManager):
         self._lock = threading.Lock()
 
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
+        """Send one message to whoever listens."""
         kind = type(message)
         name = key(kind, message.uav if kind in PER_UAV else f"{self.writer:016x}")
         publisher = self._publishers.get(name)
@@ -127,6 +152,8 @@ class ZenohBus(AbstractContextManager):
         publisher.put(encode(message), attachment=pack_stamp(stamp) if stamp else None)
 
     def subscribe(self, kind: type, heard: Heard) -> None:
+        """Call `heard(message, stamp)` for every message of a class, on a thread of the session."""
+
         def on_sample(sample: zenoh.Sample) -> None:
             pair = self._read(kind, sample)
             if pair is not None:
@@ -135,12 +162,14 @@ class ZenohBus(AbstractContextManager):
         self._declared.append(self._session.declare_subscriber(key(kind, "*"), on_sample))
 
     def answer(self, kind: type, reply: Answer) -> None:
+        """Declare one wildcard queryable for a class; it replies on a thread of the session."""
+
         def on_query(query: zenoh.Query) -> None:
             with query:
                 uav = uav_in(str(query.key_expr)) if kind in PER_UAV else None
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
-                    found = list(reply(uav, dict(query.parameters), payload))
+                    found = asked_for(uav, reply(uav, _parameters(query), payload))
                 except ValueError as error:
                     query.reply_err(str(error).encode(), encoding="text/plain")
                     return
@@ -157,6 +186,7 @@ class ZenohBus(AbstractContextManager):
         self._declared.append(self._session.declare_queryable(name, on_query, complete=False))
 
     def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
+        """Ask everyone for a class; the highest epoch per aircraft is kept."""
         replies = self._session.get(
             key(kind, who),
             target=zenoh.QueryTarget.ALL,
@@ -168,7 +198,7 @@ class ZenohBus(AbstractContextManager):
 
     def _read(self, kind: type, sample: zenoh.Sample) -> tuple[Any, Stamp | None] | None:
         try:
-            message = decode(kind, sample.payload.to_bytes(), str(sample.encoding))
+            message: Any = decode(kind, sample.payload.to_bytes(), str(sample.encoding))
         except ValueError:
             self.bad += 1
             return None
@@ -176,10 +206,17 @@ class ZenohBus(AbstractContextManager):
         return message, unpack_stamp(attachment.to_bytes() if attachment is not None else None)
 
     def close(self) -> None:
+        """Close the session."""
         self._session.close()
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _parameters(query: zenoh.Query) -> dict[str, str]:
+    """Read `?horizon=30;step=0.5`."""
+    pairs = (part.partition("=") for part in str(query.parameters).split(";") if part)
+    return {name: value for name, _, value in pairs}
 
 
 def _config(mode: str, *, connect: list[str], listen: list[str]) -> zenoh.Config:
@@ -231,7 +268,9 @@ def connect(router: str = ROUTER) -> ZenohBus:
         ConnectionError: when nobody answers there; start `zenohd` or `fleet up`.
     """
     if not reachable(router):
-        raise ConnectionError(f"router {router}: nobody answers; start `zenohd` or `fleet up`, or name another --router")
+        raise ConnectionError(
+            f"router {router}: nobody answers; start `zenohd` or `fleet up`, or name another --router"
+        )
     return ZenohBus(zenoh.open(_config("client", connect=[router], listen=[])))
 
 

@@ -52,14 +52,18 @@ def id_range(text: str) -> range:
     """
     low, _, high = text.partition("-")
     if not low.isdecimal() or (high and not high.isdecimal()) or int(high or low) < int(low) or len(high or low) > 6:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a range of ids such as 0-49; write the lower one first")
+        raise argparse.ArgumentTypeError(
+            f"found {text!r}, expected a range of ids such as 0-49; write the lower one first"
+        )
     return range(int(low), int(high or low) + 1)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run `fleet <verb>`."""
     parser = parser_for(
-        "fleet", "Digital twins for UAV swarms.", "  fleet up --uavs 8\n  fleet status --json\n  fleet schema prediction\n"
+        "fleet",
+        "Digital twins for UAV swarms.",
+        "  fleet up --uavs 8\n  fleet status --json\n  fleet schema prediction\n",
     )
     verbs = parser.add_subparsers(title="verbs", dest="verb", metavar="VERB", required=True)
     for found in sorted(pkgutil.iter_modules(commands.__path__), key=lambda module: module.name):

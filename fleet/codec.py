@@ -10,7 +10,7 @@ from fleet.contract import TOPICS
 M = TypeVar("M")
 _STAMP = struct.Struct("<QQ")
 _PACK = msgspec.msgpack.Encoder()
-_UNPACK = {topic: msgspec.msgpack.Decoder(kind) for topic, kind in TOPICS.items()}
+_UNPACK: dict[str, Any] = {topic: msgspec.msgpack.Decoder(kind) for topic, kind in TOPICS.items()}
 
 
 class Stamp(NamedTuple):
@@ -45,7 +45,7 @@ def decode(kind: type[M], payload: bytes, named: str = "") -> M:
         raise ValueError(f"{kind.__name__}: found encoding {named!r}, expected {expected!r}; upgrade the older side")
     try:
         return _UNPACK[kind.topic].decode(payload)  # type: ignore[attr-defined]
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{kind.__name__}: found {len(payload)} bytes that do not fit ({error}); resend") from None
 
 

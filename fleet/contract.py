@@ -23,6 +23,7 @@ Time `t` is seconds since 1970 on the fleet clock. Angles in rad, SI throughout,
 """
 
 from enum import StrEnum
+from math import prod
 from typing import Annotated, Any, ClassVar
 
 import msgspec
@@ -56,7 +57,7 @@ class Array(msgspec.Struct, frozen=True):
         """
         if self.dtype not in DTYPES or any(n < 0 for n in self.shape):
             raise ValueError(f"array: found dtype {self.dtype!r} shape {self.shape}, expected one of {DTYPES}; resend")
-        want = int(np.prod(self.shape, dtype=np.int64)) * np.dtype(self.dtype).itemsize
+        want = prod(self.shape) * np.dtype(self.dtype).itemsize
         if want != len(self.data):
             raise ValueError(f"array: found {len(self.data)} bytes, shape {self.shape} needs {want}; resend")
         return np.frombuffer(self.data, self.dtype).reshape(self.shape)
@@ -193,7 +194,10 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Linear(msgspec.Struct, frozen=True, kw_only=True):
-    """Discrete linear model about a trim point: x' = A x + B u + c, y = x (C = I, D = 0). Source: Huang 2021 eq. 2-4."""
+    """Discrete linear model about a trim point: x' = A x + B u + c, y = x (C = I, D = 0).
+
+    Source: Huang 2021 eq. 2-4.
+    """
 
     states: Annotated[tuple[str, ...], Meta(description="state names: u w q theta | phi psi p r v")]
     inputs: Annotated[tuple[str, ...], Meta(description="input names: delta_e delta_t | delta_a delta_r")]
@@ -248,7 +252,9 @@ class Prediction(Message, frozen=True, kw_only=True):
     quantile: Annotated[float, Meta(description="share of flights the tube is meant to hold, 0..1")] = 0.9
     horizon_s: Annotated[float, Meta(description="confidence horizon: `quantile` error reaches 10 % [s]")] = 0.0
     horizon_open: Annotated[bool, Meta(description="true: still below 10 % at the end of `ahead`")] = False
-    held: Annotated[float, Meta(description="measured share inside the tube so far, 0..1; nan before any")] = float("nan")
+    held: Annotated[float, Meta(description="measured share inside the tube so far, 0..1; nan before any")] = float(
+        "nan"
+    )
     held_n: Annotated[int, Meta(description="past predictions behind `held`")] = 0
     coast_s: Annotated[float, Meta(description="time flown by the twin alone since the last sample [s]")] = 0.0
     seq: Annotated[int, Meta(description="mission item the prediction starts on; -1 none")] = -1
@@ -301,7 +307,7 @@ class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     state: State
     verdict: Annotated[str, Meta(description="sentence of the last verdict")]
     fit: Annotated[dict[str, float], Meta(description="per state [%]")] = {}
-    horizon_s: float = 0.0
+    horizon_s: Annotated[float, Meta(description="confidence horizon of the newest prediction [s]")] = 0.0
     worker: Annotated[str, Meta(description="writer of the accepted results, 16 hex digits")] = ""
     sample_age_s: Annotated[float | None, Meta(description="since the newest sample arrived [s]")] = None
     prediction_age_s: Annotated[float | None, Meta(description="since the newest prediction was made [s]")] = None
@@ -319,7 +325,7 @@ class FleetState(msgspec.Struct, frozen=True, kw_only=True):
     topic: ClassVar[str] = "@fleet/state"
     version: ClassVar[int] = 1
 
-    t: float
+    t: Annotated[float, Meta(description="fleet time of the rows [s since 1970]")]
     rows: tuple[FleetRow, ...] = ()
     sentence: Annotated[str, Meta(description="e.g. compiling the twin's physics, once")] = ""
 
@@ -330,7 +336,7 @@ class Account(msgspec.Struct, frozen=True, kw_only=True):
     topic: ClassVar[str] = "@gateway"
     version: ClassVar[int] = 1
 
-    t: float
+    t: Annotated[float, Meta(description="fleet time of the count [s since 1970]")]
     links: tuple[str, ...] = ()
     uavs: tuple[int, ...] = ()
     datagrams: int = 0
@@ -345,4 +351,4 @@ class Account(msgspec.Struct, frozen=True, kw_only=True):
 
 PER_UAV: tuple[type[Message], ...] = (Sample, Status, Mission, Params, Model, Prediction, Mismatch, Alert)
 CONTROL: tuple[type, ...] = (FleetState, Account)
-TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}
+TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}  # type: ignore[attr-defined]
