@@ -1,0 +1,38 @@
+"""The radio of a pretend aircraft: loses frames, delays the others a little, keeps their order."""
+
+from collections import deque
+
+import numpy as np
+
+DELAY_S = 0.015  # shortest way down [s]
+JITTER_S = 0.004  # mean of what comes on top [s]
+
+
+class Link:
+    """One direction of one radio link."""
+
+    def __init__(self, rng: np.random.Generator, loss: float):
+        """Draw losses from `rng`.
+
+        Raises:
+            ValueError: when `loss` is no share.
+        """
+        if not 0 <= loss < 1:
+            raise ValueError(f"loss: found {loss}, expected a share from 0 to below 1; write e.g. 0.02")
+        self._rng, self._loss = rng, loss
+        self._queue: deque[tuple[float, bytes]] = deque()
+        self._last = 0.0
+
+    def send(self, t: float, frames: list[bytes]) -> None:
+        """Hand over frames at time `t` [s]."""
+        for frame in frames:
+            if self._rng.random() >= self._loss:
+                self._last = max(self._last, t + DELAY_S + float(self._rng.exponential(JITTER_S)))
+                self._queue.append((self._last, frame))
+
+    def receive(self, t: float) -> list[tuple[float, bytes]]:
+        """Give what has arrived by time `t`: arrival time [s] and frame, in order."""
+        arrived = []
+        while self._queue and self._queue[0][0] <= t:
+            arrived.append(self._queue.popleft())
+        return arrived

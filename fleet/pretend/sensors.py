@@ -1,0 +1,91 @@
+"""What the autopilot of a pretend aircraft believes: truth with the errors of a small UAV's estimator.
+
+Position wanders by 0.5 m, velocity by 0.07 m/s, attitude by 0.25 deg; gyros and accelerometers have noise and a small
+bias; airspeed has a scale error of 2 % and 0.25 m/s of noise. The autopilot flies on these values and reports them.
+
+Source: orders of magnitude of EKF innovations in ArduPlane flight logs; Beard & McLain (2012) ch. 7 for the sensors.
+"""
+
+from math import radians
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet.pretend.jsbsim import Truth
+from fleet.pretend.weather import GaussMarkov
+
+# name: standard deviation, correlation time [s] (0 = white), components
+_ERRORS = (
+    ("p", 0.5, 60.0, 3),  # [m]
+    ("v", 0.07, 15.0, 3),  # [m/s]
+    ("v_white", 0.02, 0.0, 3),  # [m/s]
+    ("euler", radians(0.25), 30.0, 3),  # [rad]
+    ("euler_white", radians(0.02), 0.0, 3),  # [rad]
+    ("gyro", 0.003, 0.0, 3),  # [rad/s]
+    ("gyro_bias", 0.001, 300.0, 3),  # [rad/s], what the estimator has not yet learnt
+    ("accel", 0.06, 0.0, 3),  # [m/s2]
+    ("accel_bias", 0.04, 300.0, 3),  # [m/s2]
+    ("airspeed", 0.25, 0.3, 1),  # [m/s]
+)
+AIRSPEED_SCALE = 0.02
+
+
+class Estimate(NamedTuple):
+    """What the autopilot believes; same frames and units as `Truth`."""
+
+    p: np.ndarray
+    v: np.ndarray
+    euler: np.ndarray
+    rates: np.ndarray
+    force: np.ndarray
+    Va: float
+
+
+class Sensors:
+    """The sensors and the estimator of one aircraft."""
+
+    def __init__(self, rng: np.random.Generator, dt: float):
+        """Draw biases and the airspeed scale; `dt` is the time between two calls of `measure` [s]."""
+        sigma = np.concatenate([np.full(n, s) for _, s, _, n in _ERRORS])
+        tau = np.concatenate([np.full(n, t) for _, _, t, n in _ERRORS])
+        self._noise = GaussMarkov(rng, sigma, tau, dt)
+        self.airspeed_scale = 1 + AIRSPEED_SCALE * float(np.clip(rng.standard_normal(), -2, 2))
+
+    def measure(self, truth: Truth) -> Estimate:
+        """Add this instant's errors."""
+        e = self._noise.step()
+        return Estimate(
+            truth.p + e[0:3],
+            truth.v + e[3:6] + e[6:9],
+            truth.euler + e[9:12] + e[12:15],
+            truth.rates + e[15:18] + e[18:21],
+            truth.force + e[21:24] + e[24:27],
+            float(truth.Va * self.airspeed_scale + e[27]),
+        )
+
+
+class Servos:
+    """The pulse widths between autopilot and servos: what is sent is what is flown, in whole microseconds."""
+
+    LOW, TRIM, HIGH = 1100, 1500, 1900  # SERVOn_MIN, _TRIM, _MAX of surfaces [us]
+    IDLE = 1000  # SERVO3_MIN [us]
+    FULL = 2000  # SERVO3_MAX [us]
+
+    @classmethod
+    def pulses(cls, delta_a: float, delta_e: float, delta_r: float, delta_t: float) -> tuple[int, int, int, int]:
+        """Turn commands into pulses in output order: aileron, elevator, throttle, rudder [us]."""
+        half = cls.HIGH - cls.TRIM
+        a, e, r = (cls.TRIM + round(half * min(max(x, -1.0), 1.0)) for x in (delta_a, delta_e, delta_r))
+        return a, e, cls.IDLE + round((cls.FULL - cls.IDLE) * min(max(delta_t, 0.0), 1.0)), r
+
+    @classmethod
+    def commands(cls, pulses: tuple[int, int, int, int]) -> tuple[float, float, float, float]:
+        """Turn pulses back: delta_a, delta_e, delta_r, delta_t as the servos and the motor understand them."""
+        a, e, t, r = pulses
+        half = cls.HIGH - cls.TRIM
+        return (
+            (a - cls.TRIM) / half,
+            (e - cls.TRIM) / half,
+            (r - cls.TRIM) / half,
+            (t - cls.IDLE) / (cls.FULL - cls.IDLE),
+        )
