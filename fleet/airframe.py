@@ -1,0 +1,67 @@
+"""What the autopilot's parameters say of the aircraft: which servo moves which surface."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+_FUNCTION = {4: "delta_a", 19: "delta_e", 21: "delta_r", 70: "delta_t", 77: "delta_e+a", 78: "delta_e-a"}
+_MIXES = {  # share of each servo's deflection that goes into each input
+    "delta_a": {"delta_a": 1.0},
+    "delta_e": {"delta_e": 1.0},
+    "delta_r": {"delta_r": 1.0},
+    "delta_t": {"delta_t": 1.0},
+    "delta_e+a": {"delta_e": 1.0, "delta_a": -1.0},  # left elevon
+    "delta_e-a": {"delta_e": 1.0, "delta_a": 1.0},  # right elevon
+}
+_INPUTS = ("delta_a", "delta_e", "delta_r", "delta_t")
+_SERVOS = 8
+
+
+@dataclass(frozen=True)
+class ServoMap:
+    """Pulse widths to inputs: `u = (pulse - trim) @ gain`.
+
+    Attributes:
+        trim: pulse width at zero deflection, (8,) [us]
+        gain: inputs per pulse, upper and lower side of the throw, each (8, 4) [1/us]
+        sentence: what was assumed, or empty
+    """
+
+    trim: np.ndarray
+    gain_up: np.ndarray
+    gain_down: np.ndarray
+    sentence: str
+
+    def inputs(self, pulses: np.ndarray) -> np.ndarray:
+        """Turn pulse widths (n, 8) [us] into inputs (n, 4) in the order of `fleet.window.INPUTS` [-]."""
+        off = np.asarray(pulses, float) - self.trim
+        u = np.clip(off, 0, None) @ self.gain_up + np.clip(off, None, 0) @ self.gain_down
+        return np.clip(u, [-1.2, -1.2, -1.2, 0.0], 1.2)
+
+
+def servo_map(params: Mapping[str, float]) -> ServoMap:
+    """Read SERVOn_FUNCTION, _MIN, _MAX, _TRIM, _REVERSED; without them assume aileron, elevator, throttle, rudder.
+
+    Source: ArduPilot, "Servo functions" (4 aileron, 19 elevator, 21 rudder, 70 throttle, 77 and 78 elevons).
+    """
+    functions = {n: _FUNCTION.get(int(params.get(f"SERVO{n}_FUNCTION", -1))) for n in range(1, _SERVOS + 1)}
+    known = {n: name for n, name in functions.items() if name}
+    sentence = ""
+    if not known:
+        known = {1: "delta_a", 2: "delta_e", 3: "delta_t", 4: "delta_r"}
+        sentence = "servo map assumed (no SERVOn_FUNCTION): 1 aileron, 2 elevator, 3 throttle, 4 rudder"
+    share = {name: sum(name in _MIXES[other] for other in known.values()) for name in _INPUTS}
+    trim, up, down = np.full(_SERVOS, 1500.0), np.zeros((_SERVOS, 4)), np.zeros((_SERVOS, 4))
+    for n, name in known.items():
+        low, high = params.get(f"SERVO{n}_MIN", 1100.0), params.get(f"SERVO{n}_MAX", 1900.0)
+        middle = low if name == "delta_t" else params.get(f"SERVO{n}_TRIM", 0.5 * (low + high))
+        sign = -1.0 if params.get(f"SERVO{n}_REVERSED", 0.0) else 1.0
+        if name == "delta_t" and sign < 0:
+            middle = high
+        trim[n - 1] = middle
+        for to, weight in _MIXES[name].items():
+            column = _INPUTS.index(to)
+            up[n - 1, column] = sign * weight / share[to] / max(high - middle, 1.0)
+            down[n - 1, column] = sign * weight / share[to] / max(middle - low, 1.0)
+    return ServoMap(trim, up, down, sentence)

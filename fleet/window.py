@@ -1,0 +1,59 @@
+"""`Window`: an equally sampled stretch of one flight, with a mask of what was really measured."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+STATES = ("u", "v", "w", "p", "q", "r", "phi", "theta", "psi")
+INPUTS = ("delta_a", "delta_e", "delta_r", "delta_t")
+
+
+@dataclass(frozen=True)
+class Window:
+    """States and inputs of one aircraft on one grid.
+
+    Attributes:
+        t: fleet time, (n,) [s since 1970]
+        x: states in the order of `STATES`, velocities air-relative in FRD, angles unwrapped, (n, 9) [m/s, rad/s, rad]
+        u: inputs in the order of `INPUTS`, (n, 4) [-]
+        p: position, NED from the twin's origin, (n, 3) [m]
+        v: velocity over ground, NED, (n, 3) [m/s]
+        ok: measured or interpolated across a short gap, (n,) bool; where False the row means nothing
+        filled: interpolated across lost samples, (n,) bool
+    """
+
+    t: np.ndarray
+    x: np.ndarray
+    u: np.ndarray
+    p: np.ndarray
+    v: np.ndarray
+    ok: np.ndarray
+    filled: np.ndarray
+
+    @property
+    def dt(self) -> float:
+        """Give the sample time [s]."""
+        return float(self.t[1] - self.t[0])
+
+    @property
+    def seconds(self) -> float:
+        """Give the length [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __str__(self) -> str:
+        return f"{self.seconds:.1f} s at {1 / self.dt:.0f} Hz, {self.ok.mean():.0%} good, {self.filled.mean():.1%} filled"
+
+    def columns(self, names: tuple[str, ...]) -> np.ndarray:
+        """Pick states or inputs by name, (n, k)."""
+        phi = np.clip(self.x[:, STATES.index("phi")], -1.3, 1.3)
+        bank = np.tan(phi) * np.sin(phi)  # what a turn asks of pitch rate and lift: q = g / V tan(phi) sin(phi)
+        both, rows = (*STATES, *INPUTS, "bank"), np.column_stack([self.x, self.u, bank])
+        return rows[:, [both.index(name) for name in names]]
+
+    def part(self, start: int, stop: int) -> "Window":
+        """Cut rows `start` to `stop`."""
+        s = slice(start, stop)
+        return Window(self.t[s], self.x[s], self.u[s], self.p[s], self.v[s], self.ok[s], self.filled[s])

@@ -1,0 +1,59 @@
+"""The last minutes of one aircraft's telemetry, as it came."""
+
+from collections import deque
+
+import numpy as np
+
+from fleet.contract import COLUMNS, Rows, Sample
+
+
+class History:
+    """Rows of every kind over the last `keep_s` seconds; out-of-order and repeated rows are sorted out on reading."""
+
+    def __init__(self, keep_s: float = 150.0) -> None:
+        self.keep_s = keep_s
+        self.newest = -np.inf
+        self._chunks: dict[str, deque[tuple[np.ndarray, np.ndarray]]] = {name: deque() for name in COLUMNS}
+
+    def add(self, sample: Sample) -> int:
+        """Take one message; give how many of its kinds did not fit the contract."""
+        bad = 0
+        for name in COLUMNS:
+            rows: Rows | None = getattr(sample, name)
+            if rows is None:
+                continue
+            try:
+                t, x = rows.t.numpy(), rows.x.numpy()
+            except ValueError:
+                bad += 1
+                continue
+            if x.ndim != 2 or t.shape != x.shape[:1] or x.shape[1] != len(COLUMNS[name]) or not len(t):
+                bad += 1
+                continue
+            self._chunks[name].append((t, x))
+            self.newest = max(self.newest, float(t[-1]))
+        self._forget()
+        return bad
+
+    def _forget(self) -> None:
+        oldest = self.newest - self.keep_s
+        for chunks in self._chunks.values():
+            while chunks and chunks[0][0][-1] < oldest:
+                chunks.popleft()
+
+    def rows(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
+        """Give times (n,) and values (n, k) of one kind from `since` on, rising in time, finite, without repeats."""
+        found = [chunk for chunk in self._chunks[name] if chunk[0][-1] >= since]
+        if not found:
+            return np.empty(0), np.empty((0, len(COLUMNS[name])))
+        t = np.concatenate([chunk[0] for chunk in found])
+        x = np.concatenate([chunk[1] for chunk in found]).astype(float)
+        good = (t >= since) & np.isfinite(t) & np.isfinite(x).all(axis=1)
+        t, first = np.unique(t[good], return_index=True)
+        return t, x[good][first]
+
+    def clear(self) -> None:
+        """Forget everything, as after a jump of the clock."""
+        for chunks in self._chunks.values():
+            chunks.clear()
+        self.newest = -np.inf

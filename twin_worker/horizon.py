@@ -1,0 +1,165 @@
+"""How far a prediction may be trusted: a tube and a horizon from this aircraft's own past predictions.
+
+Scores of past predictions, |error| over an expected spread, give by their conformal quantile the factor that
+would have held the wanted share. Before there are any, a wide prior stands in for them.
+
+Source: Angelopoulos & Bates 2023, "Conformal prediction: a gentle introduction", section 2 (split conformal,
+locally scaled scores). M1, the relative error: |p_hat - p| / max(path flown, 2 s of ground speed).
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+AHEAD = np.arange(0.0, 61.0)  # look-ahead grid of every prediction [s]
+LIMIT = 0.10  # relative error at which trust ends [-]
+QUANTILE = 0.9
+_FLOOR_S = 2.0  # least path length, as seconds of ground speed [s]
+_PRIOR = {  # expected spread of along, cross, vertical, and of the distance, at one second and per second [m]
+    "paper": (np.array([2.0, 2.0, 1.0, 2.5]), np.array([0.9, 0.5, 0.25, 1.1])),
+    "imm": (np.array([3.0, 3.0, 1.5, 4.0]), np.array([6.0, 6.0, 1.0, 9.0])),
+}
+_PRIOR_WEIGHT = 6.0  # past predictions the prior counts as [-]
+_PRIOR_SCORE = 2.0  # its 90 % factor [-]
+_KEEP = 60  # past predictions remembered per method [-]
+EVERY_S = 5.0  # a prediction is kept for scoring this often [s]
+
+
+@dataclass
+class Made:
+    """A prediction waiting for the flight to answer it."""
+
+    t: float
+    method: str
+    path: np.ndarray  # NED, (61, 3) [m]
+    tube: np.ndarray  # half-axes, (61, 3) [m]
+    speed: float  # ground speed at t [m/s]
+
+
+def track_frame(path: np.ndarray) -> np.ndarray:
+    """Give the horizontal unit vector along the path at each point, (n, 2); the last good one where it stands still."""
+    step = np.gradient(path[:, :2], axis=0)
+    length = np.linalg.norm(step, axis=1, keepdims=True)
+    return np.divide(step, length, out=np.tile([1.0, 0.0], (len(path), 1)), where=length > 1e-6)
+
+
+def axes_error(path: np.ndarray, flown: np.ndarray) -> np.ndarray:
+    """Split errors into along, cross, vertical and distance, (n, 4) [m]."""
+    e = flown - path
+    along = track_frame(path)
+    cross = np.column_stack([-along[:, 1], along[:, 0]])
+    parts = [np.sum(e[:, :2] * along, axis=1), np.sum(e[:, :2] * cross, axis=1), e[:, 2], np.linalg.norm(e, axis=1)]
+    return np.abs(np.column_stack(parts))
+
+
+def path_length(path: np.ndarray, speed: float) -> np.ndarray:
+    """Give the path length so far, at least two seconds of ground speed, (n,) [m]."""
+    flown = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    return np.maximum(flown, max(_FLOOR_S * speed, 1.0))
+
+
+def first_passage(relative: np.ndarray, ahead: np.ndarray = AHEAD) -> tuple[float, bool]:
+    """Give the time the relative error first passes 10 % [s], and whether it never did (censored at the end)."""
+    over = np.flatnonzero(relative > LIMIT)
+    if not len(over):
+        return float(ahead[-1]), True
+    k = int(over[0])
+    if k == 0:
+        return 0.0, False
+    share = (LIMIT - relative[k - 1]) / (relative[k] - relative[k - 1])
+    return float(ahead[k - 1] + share * (ahead[k] - ahead[k - 1])), False
+
+
+@dataclass
+class Record:
+    """Past predictions of one aircraft and what came of them."""
+
+    waiting: list[Made] = field(default_factory=list)
+    squares: dict[str, deque[np.ndarray]] = field(default_factory=dict)
+    scores: dict[str, deque[np.ndarray]] = field(default_factory=dict)
+    passages: deque[tuple[float, bool]] = field(default_factory=lambda: deque(maxlen=200))
+    inside: deque[float] = field(default_factory=lambda: deque(maxlen=_KEEP))
+
+    def keep(self, made: Made) -> None:
+        """Remember a prediction for scoring, at most one every few seconds."""
+        if not self.waiting or made.t - self.waiting[-1].t >= EVERY_S:
+            self.waiting.append(made)
+
+    def forget(self) -> None:
+        """Drop predictions that an event (mode, mission, clock) has made meaningless."""
+        self.waiting.clear()
+
+    def answer(self, t: np.ndarray, flown: np.ndarray) -> int:
+        """Score every waiting prediction whose 60 s have been flown.
+
+        Args:
+            t: times of the flown path, rising, (n,) [s since 1970]
+            flown: positions in the twin's NED frame, (n, 3) [m]
+        Returns:
+            how many were scored
+        """
+        ready = [made for made in self.waiting if len(t) and made.t + AHEAD[-1] <= t[-1]]
+        self.waiting = [made for made in self.waiting if made not in ready]
+        for made in ready:
+            at = made.t + AHEAD
+            near = np.abs(t[np.clip(np.searchsorted(t, at), 0, len(t) - 1)] - at)
+            if made.t < t[0] or near.max() > 2.0:
+                continue  # the flight has a hole there: no answer rather than an invented one
+            self._score(made, np.column_stack([np.interp(at, t, column) for column in flown.T]))
+        return len(ready)
+
+    def _score(self, made: Made, flown: np.ndarray) -> None:
+        error = axes_error(made.path, flown)
+        self.inside.append(float((error[1:, :3] <= made.tube[1:]).all(axis=1).mean()))
+        self.passages.append(first_passage(error[:, 3] / path_length(flown, made.speed)))
+        spread = self.spread(made.method)
+        self.scores.setdefault(made.method, deque(maxlen=_KEEP)).append(error / spread)
+        self.squares.setdefault(made.method, deque(maxlen=_KEEP)).append(error**2)
+
+    def spread(self, method: str, ahead: np.ndarray = AHEAD) -> np.ndarray:
+        """Give the expected error by look-ahead: the prior, outweighed by what was measured, (n, 4) [m]."""
+        base, growth = _PRIOR[method]
+        prior = np.hypot(base, growth * ahead[:, None])
+        found = self.squares.get(method)
+        if not found:
+            return prior
+        measured = np.mean(found, axis=0)
+        total = (_PRIOR_WEIGHT * prior[: len(measured)] ** 2 + len(found) * measured) / (_PRIOR_WEIGHT + len(found))
+        spread = np.sqrt(total)
+        if len(ahead) > len(spread):  # beyond what was ever scored: go on growing as the prior does
+            spread = np.vstack([spread, prior[len(spread) :] * spread[-1] / prior[len(measured) - 1]])
+        return spread
+
+    def factor(self, method: str) -> np.ndarray:
+        """Give the factors on the spread that hold 90 %: jointly for the three axes, and for the distance, (2,)."""
+        found = list(self.scores.get(method, ()))
+        joint = [float(np.quantile(score[1:, :3].max(axis=1), QUANTILE)) for score in found]
+        distance = [float(np.quantile(score[1:, 3], QUANTILE)) for score in found]
+        doubt = [_PRIOR_SCORE] * max(1, round(_PRIOR_WEIGHT / 2))
+        return np.array([_conformal(joint + doubt), _conformal(distance + doubt)])
+
+    def tube(self, method: str, ahead: np.ndarray = AHEAD) -> tuple[np.ndarray, np.ndarray]:
+        """Give the half-axes (n, 3) [m] and the 90 % distance (n,) [m] by look-ahead."""
+        spread, factor = self.spread(method, ahead), self.factor(method)
+        tube = factor[0] * spread[:, :3]
+        return np.maximum.accumulate(tube), np.maximum.accumulate(factor[1] * spread[:, 3])
+
+    @property
+    def held(self) -> tuple[float, int]:
+        """Give the measured share inside the tube so far (nan before any) and the predictions behind it."""
+        return (float(np.mean(self.inside)) if self.inside else float("nan")), len(self.inside)
+
+    @property
+    def t10(self) -> tuple[float | None, float | None, int]:
+        """Give the median first passage of 10 % [s], the share censored, and how many predictions that is."""
+        if not self.passages:
+            return None, None, 0
+        times = [passage[0] for passage in self.passages]
+        return float(np.median(times)), float(np.mean([p[1] for p in self.passages])), len(times)
+
+
+def _conformal(scores: list[float]) -> float:
+    """Give the conformal 90 % quantile, rank ceil((n + 1) 0.9); the largest where n is too small for that rank."""
+    ranked = sorted(scores)
+    return ranked[min(int(np.ceil((len(ranked) + 1) * QUANTILE)), len(ranked)) - 1]

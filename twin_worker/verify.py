@@ -1,0 +1,109 @@
+"""Does a model deserve belief? Free runs over data it has not seen, against a threshold and against holding still.
+
+fit = 100 (1 - ||y - y_hat|| / ||y - mean(y)||).  Source: Huang 2021, eq. 22.
+"""
+
+import numpy as np
+
+from fleet.contract import Outcome, Verdict
+from fleet.window import Window
+from twin_worker.identify import Axis
+from twin_worker.refine import free_run
+
+HORIZONS_S = (16.0, 8.0, 4.0)  # longest first: a model is verified at the longest its data allow
+OMEGA = 20.0  # least mean fit over the nine states [%]; the paper accepts above 0
+_MARGIN = 5.0  # a kept model must be this much better to stay [%]
+
+
+def free_runs(D: np.ndarray, y: np.ndarray, u: np.ndarray, ok: np.ndarray, length: int) -> np.ndarray:
+    """Predict y from a fresh start every `length` samples; nan where a run crosses unmeasured rows.
+
+    Args:
+        D: [A B c], scaled units, (n, n + m + 1)
+        y, u, ok: held-out outputs (N, n), inputs (N, m), measured rows (N,)
+        length: free-run length [samples]
+    Returns:
+        predictions, (N, n)
+    """
+    out = np.full_like(y, np.nan)
+    for start in range(0, len(y), length):
+        stop = min(start + length, len(y))
+        if ok[start:stop].all() and stop - start > 1:
+            free_run(D, y[start], np.ascontiguousarray(u[start:stop]), out[start:stop])
+    return out
+
+
+def hold(y: np.ndarray, ok: np.ndarray, length: int) -> np.ndarray:
+    """Predict by holding the value at each fresh start: the least any model must beat."""
+    starts = (np.arange(len(y)) // length) * length
+    return np.where(ok[:, None] & ok[starts][:, None], y[starts], np.nan)
+
+
+def fit_percent(y: np.ndarray, y_hat: np.ndarray) -> np.ndarray:
+    """Give the fit of each column over the rows both have, (n,) [%]; -100 where nothing is left or it diverged."""
+    good = np.isfinite(y_hat).all(axis=1)
+    if good.sum() < 2:
+        return np.full(y.shape[1], -100.0)
+    spread = np.linalg.norm(y[good] - y[good].mean(axis=0), axis=0)
+    nrmse = np.linalg.norm(y[good] - y_hat[good], axis=0) / np.maximum(spread, 1e-9)
+    return np.clip(100.0 * (1.0 - nrmse), -100.0, 100.0)
+
+
+def fits_at(axes: tuple[Axis, Axis], held: Window, horizon_s: float) -> tuple[dict[str, float], dict[str, float]]:
+    """Give the fit of both axes' free runs, and of holding the last value, per state [%].
+
+    Args:
+        axes: longitudinal and lateral model
+        held: data neither has seen
+        horizon_s: free-run length [s]
+    """
+    length = int(horizon_s / held.dt)
+    whole = held.part(0, max(len(held) // length, 1) * length)
+    fit, still = {}, {}
+    for axis in axes:
+        y, u = axis.scaled(whole)
+        fit |= dict(zip(axis.states, fit_percent(y, free_runs(axis.D, y, u, whole.ok, length)).tolist(), strict=True))
+        still |= dict(zip(axis.states, fit_percent(y, hold(y, whole.ok, length)).tolist(), strict=True))
+    return fit, still
+
+
+def mean(fit: dict[str, float]) -> float:
+    """Give the mean fit over the states, the paper's Fit_value [%]."""
+    return float(np.mean(list(fit.values())))
+
+
+def verify(
+    whose: str, axes: tuple[Axis, Axis], held: Window, last: tuple[Axis, Axis] | None, *, tries: int, omega: float = OMEGA
+) -> Verdict:
+    """Judge a model on held-out data: above the threshold, better than holding still, no worse than the last one.
+
+    Args:
+        whose: name for sentences, e.g. uav-7
+        axes: longitudinal and lateral model
+        held: data neither has seen
+        last: the last verified model, or None
+        tries: identifications tried so far
+        omega: threshold on the mean fit [%]
+    """
+    allowed = [h for h in HORIZONS_S if h <= held.seconds + held.dt]
+    for horizon in allowed:
+        fit, still = fits_at(axes, held, horizon)
+        if mean(fit) >= omega and mean(fit) > mean(still):
+            break
+    facts = {"fit": fit, "fit_hold": still, "horizon_s": horizon, "threshold": omega, "tries": tries}
+    found = f"{whose}: mean fit {mean(fit):.0f} % over {horizon:.0f} s"
+    if not all(np.isfinite(list(fit.values()))) or mean(fit) <= -99.0:
+        return Verdict(outcome=Outcome.DIVERGED, sentence=f"{found}, the free run diverges; trying again", **facts)
+    if mean(fit) < omega or mean(fit) <= mean(still):
+        need = max(omega, mean(still))
+        quiet = held.columns(("phi",)).std() < 0.04 and held.columns(("q",)).std() < 0.02
+        outcome = Outcome.NOT_IDENTIFIABLE if quiet else Outcome.BELOW_THRESHOLD
+        why = "steady flight excites nothing; wait for a turn or a climb" if quiet else "trying another window"
+        return Verdict(outcome=outcome, sentence=f"{found}, needs {need:.0f} %; {why}", **facts)
+    if last is not None:
+        before, _ = fits_at(last, held, horizon)
+        if mean(before) > mean(fit) + _MARGIN:
+            sentence = f"{found}, the last verified model has {mean(before):.0f} %; that one stays in force"
+            return Verdict(outcome=Outcome.WORSE_THAN_LAST, sentence=sentence, **facts)
+    sentence = f"{found} ahead, unseen data (holding still {mean(still):.0f} %, threshold {omega:.0f} %)"
+    return Verdict(outcome=Outcome.VERIFIED, sentence=sentence, **facts)
