@@ -1,0 +1,58 @@
+"""What a HEARTBEAT tells: aircraft or not, which autopilot, which kind of vehicle, which mode."""
+
+from typing import Any
+
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+FIXED_WING, MULTIROTOR, HELICOPTER, QUADPLANE, UNKNOWN = (
+    "fixed_wing",
+    "multirotor",
+    "helicopter",
+    "quadplane",
+    "unknown",
+)
+_AUTOPILOT = {dialect.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot", dialect.MAV_AUTOPILOT_PX4: "px4"}
+_VEHICLE = {
+    dialect.MAV_TYPE_FIXED_WING: FIXED_WING,
+    dialect.MAV_TYPE_FLAPPING_WING: FIXED_WING,
+    dialect.MAV_TYPE_QUADROTOR: MULTIROTOR,
+    dialect.MAV_TYPE_COAXIAL: MULTIROTOR,
+    dialect.MAV_TYPE_HEXAROTOR: MULTIROTOR,
+    dialect.MAV_TYPE_OCTOROTOR: MULTIROTOR,
+    dialect.MAV_TYPE_TRICOPTER: MULTIROTOR,
+    dialect.MAV_TYPE_DODECAROTOR: MULTIROTOR,
+    dialect.MAV_TYPE_DECAROTOR: MULTIROTOR,
+    dialect.MAV_TYPE_HELICOPTER: HELICOPTER,
+    **dict.fromkeys(range(dialect.MAV_TYPE_VTOL_DUOROTOR, dialect.MAV_TYPE_VTOL_RESERVED5 + 1), QUADPLANE),
+    dialect.MAV_TYPE_GENERIC: UNKNOWN,
+    dialect.MAV_TYPE_AIRSHIP: UNKNOWN,
+    dialect.MAV_TYPE_KITE: UNKNOWN,
+    dialect.MAV_TYPE_PARAFOIL: UNKNOWN,
+}
+"""MAV_TYPE of everything that flies; any other type (ground station, gimbal, camera, ADS-B, rover) is no UAV."""
+
+
+def is_aircraft(heartbeat: Any) -> bool:
+    """Tell whether this heartbeat comes from the autopilot of an aircraft."""
+    return heartbeat.type in _VEHICLE and heartbeat.autopilot != dialect.MAV_AUTOPILOT_INVALID
+
+
+def vehicle(heartbeat: Any) -> str:
+    """Name the kind of vehicle as `Status.vehicle` does."""
+    return _VEHICLE.get(heartbeat.type, UNKNOWN)
+
+
+def autopilot(heartbeat: Any) -> str:
+    """Name the autopilot as `Status.autopilot` does."""
+    return _AUTOPILOT.get(heartbeat.autopilot, "generic")
+
+
+def mode(heartbeat: Any) -> str:
+    """Name the flight mode as the autopilot does, e.g. AUTO (ArduPilot) or MISSION (PX4)."""
+    return str(mavutil.mode_string_v10(heartbeat))
+
+
+def armed(heartbeat: Any) -> bool:
+    """Tell whether the motors may turn."""
+    return bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)

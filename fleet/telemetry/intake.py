@@ -1,0 +1,124 @@
+"""Everything between the bytes of one link and contract messages: no sockets, no wall clock."""
+
+from collections import Counter, OrderedDict
+from collections.abc import Hashable
+from typing import Any
+
+from fleet.contract import Mission, Params, Sample, Status
+from fleet.telemetry.craft import LOST_S, Craft
+from fleet.telemetry.decode import Decoder
+from fleet.telemetry.heartbeat import is_aircraft
+from fleet.telemetry.route import MESSAGES
+
+MOST_UAVS = 250
+MOST_SENDERS = 512  # addresses with a decoder of their own on one link
+
+News = Sample | Status | Mission | Params
+Claims = dict[int, Craft]
+"""Which aircraft holds a UAV id, over all links of a gateway."""
+
+
+class Intake:
+    """Turn what one link heard into messages of the contract.
+
+    Args:
+        offset: UAV id = MAVLink system id + offset
+        claims: shared by the links of one gateway, so that an id heard on two of them is noticed
+    """
+
+    def __init__(self, offset: int = 0, claims: Claims | None = None) -> None:
+        self.offset = offset
+        self.refused: Counter[str] = Counter()  # good frames refused, by reason
+        self.crafts: dict[int, Craft] = {}  # by MAVLink system id
+        self._claims: Claims = {} if claims is None else claims
+        self._decoders: OrderedDict[Hashable, Decoder] = OrderedDict()
+        self._gone: Counter[str] = Counter()  # counters of decoders no longer kept
+
+    def hear(self, arrival: float, data: bytes, source: Hashable = None) -> None:
+        """Take bytes that arrived together.
+
+        Args:
+            arrival: fleet time of arrival [s since 1970]
+            data: any bytes
+            source: who sent them, e.g. the UDP address; None on a stream with a single far end
+        """
+        for message in self._decoder(source).feed(data):
+            self._route(arrival, message, source)
+
+    def flush(self, now: float) -> list[News]:
+        """Hand over what is new; `now` is fleet time [s since 1970]."""
+        return [news for craft in self.crafts.values() for news in craft.take(now)]
+
+    def counters(self) -> Counter[str]:
+        """Give messages, bad_bytes and bad_frames over all senders."""
+        total = Counter(self._gone)
+        for decoder in self._decoders.values():
+            total.update(_counters(decoder))
+        return total
+
+    def _decoder(self, source: Hashable) -> Decoder:
+        decoder = self._decoders.get(source)
+        if decoder is None:
+            if len(self._decoders) >= MOST_SENDERS:
+                self._gone.update(_counters(self._decoders.popitem(last=False)[1]))
+            decoder = self._decoders[source] = Decoder()
+        self._decoders.move_to_end(source)
+        return decoder
+
+    def _route(self, arrival: float, message: Any, source: Hashable) -> None:
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        craft = self.crafts.get(system)
+        if craft is not None and craft.component == component:
+            if craft.source != source and not self._move(craft, source, arrival):
+                return
+            craft.hear(arrival, message)
+        elif craft is None and message.get_type() == "HEARTBEAT" and is_aircraft(message):
+            self._meet(arrival, message, source)
+        else:
+            self._overhear(arrival, message)
+
+    def _meet(self, arrival: float, message: Any, source: Hashable) -> None:
+        system = message.get_srcSystem()
+        uav = system + self.offset
+        holder = self._claims.get(uav)
+        if system == 0 or uav < 0:
+            self.refused["id out of range"] += 1
+        elif len(self.crafts) >= MOST_UAVS:
+            self.refused[f"more than {MOST_UAVS} aircraft on one link"] += 1
+        elif holder is not None and arrival - holder.heard < LOST_S:
+            self._alarm(holder, arrival)
+        else:
+            craft = Craft(uav, system, message.get_srcComponent(), source)
+            self.crafts[system] = self._claims[uav] = craft
+            craft.hear(arrival, message)
+
+    def _move(self, craft: Craft, source: Hashable, arrival: float) -> bool:
+        """Follow an aircraft to a new address once the old one is silent; before that it is an alarm."""
+        if arrival - craft.heard < LOST_S:
+            self._alarm(craft, arrival)
+            return False
+        craft.source = source
+        return True
+
+    def _alarm(self, craft: Craft, arrival: float) -> None:
+        self.refused["second sender for a live id"] += 1
+        craft.say(
+            "a second sender uses this id and was refused; give every aircraft its own MAVLink system id", arrival
+        )
+
+    def _overhear(self, arrival: float, message: Any) -> None:
+        name = message.get_type()
+        target = self.crafts.get(getattr(message, "target_system", 0))
+        if name in MESSAGES and target is not None:
+            target.route.hear(message, up=True, now=arrival)
+        elif name == "HEARTBEAT":
+            reason = "a second autopilot on one system id" if is_aircraft(message) else "not an aircraft"
+            self.refused[reason] += 1
+        elif message.get_srcSystem() in self.crafts:
+            self.refused["not an autopilot"] += 1
+        else:
+            self.refused["no aircraft heartbeat yet"] += 1
+
+
+def _counters(decoder: Decoder) -> dict[str, int]:
+    return {"messages": decoder.messages, "bad_bytes": decoder.bad_bytes, "bad_frames": decoder.bad_frames}

@@ -1,0 +1,82 @@
+"""Autopilot parameters, collected from PARAM_VALUE whoever asked for them."""
+
+import struct
+from math import isfinite
+from typing import Any
+
+from fleet.contract import Params
+
+UNSOLICITED = 65535  # index of a value nobody asked for
+MOST = 5_000  # parameters accepted from one aircraft
+PAUSE_S = 1.0  # least time between two publications
+_AS_INTEGER = {1: "<Bxxx", 2: "<bxxx", 3: "<Hxx", 4: "<hxx", 5: "<I", 6: "<i"}  # MAV_PARAM_TYPE
+
+
+class ParamBook:
+    """The parameters of one aircraft: values by name, and which indices are still missing."""
+
+    def __init__(self, uav: int) -> None:
+        self.uav = uav
+        self.values: dict[str, float] = {}
+        self.rejected = 0
+        self.heard = float("-inf")  # when the last one came
+        self._count = 0
+        self._indices: set[int] = set()
+        self._refused: dict[str, None] = {}
+        self._changed = False
+        self._said = float("-inf")
+
+    def hear(self, message: Any, autopilot: str, now: float) -> None:
+        """Take one PARAM_VALUE."""
+        name, value = message.param_id, as_number(message, autopilot)
+        self.heard = now
+        if message.param_index != UNSOLICITED and message.param_count <= MOST:
+            if message.param_count != self._count:
+                self._count = message.param_count
+                self._changed = True
+            if message.param_index < self._count:
+                self._indices.add(message.param_index)
+        if not name or not name.isprintable() or (len(self.values) >= MOST and name not in self.values):
+            self.rejected += 1
+        elif not isfinite(value):
+            self.rejected += 1
+            self._changed = self._changed or name not in self._refused
+            self._refused[name] = None
+            self.values.pop(name, None)
+        elif self.values.get(name) != value:
+            self.values[name] = value
+            self._refused.pop(name, None)
+            self._changed = True
+
+    @property
+    def complete(self) -> bool:
+        """Tell whether every index was heard."""
+        return self._count > 0 and len(self._indices) >= self._count
+
+    def missing(self) -> list[int] | None:
+        """Give the indices not heard yet; None when not even their number is known."""
+        if not self._count:
+            return None
+        return [index for index in range(self._count) if index not in self._indices]
+
+    def take(self, now: float) -> Params | None:
+        """Give the parameters when there is news, at most once a second."""
+        if not self._changed or now - self._said < PAUSE_S:
+            return None
+        self._changed, self._said = False, now
+        return Params(uav=self.uav, t=now, values=dict(self.values), complete=self.complete, sentence=self.sentence())
+
+    def sentence(self) -> str:
+        """Say which parameters were refused."""
+        if not self._refused:
+            return ""
+        names = ", ".join(list(self._refused)[:5])
+        return f"uav-{self.uav}: parameter {names} is not a number and was left out; set it on the autopilot"
+
+
+def as_number(message: Any, autopilot: str) -> float:
+    """Read the value: PX4 sends the bytes of an integer in the place of the float, the others convert it."""
+    layout = _AS_INTEGER.get(message.param_type)
+    if autopilot != "px4" or layout is None:
+        return float(message.param_value)
+    return float(struct.unpack(layout, struct.pack("<f", message.param_value))[0])

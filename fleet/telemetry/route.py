@@ -1,0 +1,196 @@
+"""The mission on board, put together from what is overheard: a download or an upload, ours or another station's."""
+
+from math import isfinite
+from typing import Any
+
+from fleet.contract import MAX_ITEMS, Item, Mission
+
+NOTHING = 0  # no MAV_CMD; stands for an item that cannot be flown
+NAV_LAST = 95  # MAV_CMD_NAV_LAST: commands above it are no place to fly to
+DO_JUMP = 177
+WAYPOINT = 16
+ACCEPT_S = 3.0  # an upload without an acknowledgement is believed after this silence
+SETTLE_S = 2.0  # an incomplete list is shown after this silence
+
+_NAMES = ("MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_ACK", "MISSION_CLEAR_ALL", "MISSION_CURRENT")
+MESSAGES = frozenset(_NAMES)
+
+
+class _Draft:
+    """A list on its way, in one direction."""
+
+    def __init__(self, count: int | None, now: float) -> None:
+        self.count = count
+        self.items: dict[int, Item] = {}
+        self.notes: dict[int, str] = {}
+        self.heard = now
+
+    def whole(self) -> bool:
+        return self.count is not None and all(seq in self.items for seq in range(self.count))
+
+
+class RouteBook:
+    """The route of one aircraft: drafts of both directions, the accepted list, the item in force."""
+
+    def __init__(self, uav: int) -> None:
+        self.uav = uav
+        self.items: tuple[Item, ...] = ()
+        self.complete = False
+        self.stale = True  # somebody should ask for it again
+        self.seq = -1
+        self.count: int | None = None  # of the download on its way
+        self.rejected = 0
+        self._sentence = ""
+        self._drafts: dict[bool, _Draft | None] = {False: None, True: None}
+        self._changed = False
+
+    def hear(self, message: Any, *, up: bool, now: float) -> None:
+        """Take one message of the mission protocol; `up` when a ground station sent it to the aircraft."""
+        name = message.get_type()
+        if name == "MISSION_CURRENT":
+            self._in_force(message.seq)
+        elif getattr(message, "mission_type", 0) != 0:
+            return  # geofence or rally points
+        elif name == "MISSION_COUNT":
+            self._open(message.count, up, now)
+        elif name in ("MISSION_ITEM", "MISSION_ITEM_INT"):
+            self._write(message, up, now)
+        elif name == "MISSION_ACK" and not up:
+            self._settle(accepted=message.type == 0)
+        elif name == "MISSION_CLEAR_ALL" and up:
+            self.stale = True
+
+    def missing(self) -> list[int] | None:
+        """Give the sequence numbers a download on its way still lacks; None when no count was heard."""
+        draft = self._drafts[False]
+        if draft is None or draft.count is None:
+            return None
+        return [seq for seq in range(draft.count) if seq not in draft.items]
+
+    def take(self, now: float) -> Mission | None:
+        """Give the mission when there is news."""
+        up, down = self._drafts[True], self._drafts[False]
+        if up is not None and up.whole() and now - up.heard > ACCEPT_S:
+            self._settle(accepted=True)
+        if down is not None and not self.complete and down.items and now - down.heard > SETTLE_S:
+            self._show_part(down)
+        if not self._changed:
+            return None
+        self._changed = False
+        sentence = f"uav-{self.uav}: {self._sentence}" if self._sentence else ""
+        return Mission(uav=self.uav, t=now, items=self.items, seq=self.seq, complete=self.complete, sentence=sentence)
+
+    def _in_force(self, seq: int) -> None:
+        seq = -1 if seq == 65535 else seq
+        if seq != self.seq:
+            self.seq = seq
+            self._changed = self._changed or self.complete or bool(self.items)
+
+    def _open(self, count: int, up: bool, now: float) -> None:
+        if count > MAX_ITEMS:
+            self.rejected += 1
+            self._say(f"found a mission of {count} items, at most {MAX_ITEMS} are accepted; shorten it")
+            return
+        draft = self._drafts[up]
+        if draft is None or draft.count != count:
+            draft = self._drafts[up] = _Draft(count, now)
+        if count == 0 and not up:
+            self._adopt(draft)
+
+    def _write(self, message: Any, up: bool, now: float) -> None:
+        draft = self._drafts[up]
+        if draft is None:
+            draft = self._drafts[up] = _Draft(None, now)
+        limit = MAX_ITEMS if draft.count is None else draft.count
+        if message.seq >= limit:
+            self.rejected += 1
+            return
+        item, note = read_item(message)
+        self.rejected += bool(note)
+        draft.items[item.seq], draft.heard = item, now
+        draft.notes.pop(item.seq, None)
+        if note:
+            draft.notes[item.seq] = note
+        if not up and draft.whole():
+            self._adopt(draft)
+
+    def _settle(self, accepted: bool) -> None:
+        draft, self._drafts[True] = self._drafts[True], None
+        if accepted:
+            if draft is not None and draft.whole():
+                self._adopt(draft)
+            self.stale = True  # the autopilot may have changed it, home for one; ask it
+
+    def _adopt(self, draft: _Draft) -> None:
+        items = tuple(draft.items[seq] for seq in range(draft.count or 0))
+        sentence = "; ".join([*draft.notes.values(), *review(items)][:4])
+        if items != self.items or not self.complete or sentence != self._sentence:
+            self.items, self.complete, self._sentence = items, True, sentence
+            self._changed = True
+        self._drafts[False] = self._drafts[True] = None
+        self.stale = False
+
+    def _show_part(self, draft: _Draft) -> None:
+        items = tuple(draft.items[seq] for seq in sorted(draft.items))
+        if items != self.items:
+            self.items = items
+            of = "an unknown number of" if draft.count is None else draft.count
+            self._say(f"{len(items)} of {of} mission items arrived; ask for the mission again")
+
+    def _say(self, sentence: str) -> None:
+        self._changed = self._changed or sentence != self._sentence
+        self._sentence = sentence
+
+
+def read_item(message: Any) -> tuple[Item, str]:
+    """Read MISSION_ITEM or MISSION_ITEM_INT; an item with a coordinate that is no number becomes command 0."""
+    scale = 1.0 if message.get_type() == "MISSION_ITEM_INT" else 1e7
+    params = [message.param1, message.param2, message.param3, message.param4]
+    place = [message.x * scale, message.y * scale, float(message.z)]
+    note = ""
+    command = message.command
+    if not all(map(isfinite, place)) or abs(place[0]) > 2**31 or abs(place[1]) > 2**31:
+        note = f"mission item {message.seq} has a coordinate that is no number, passed on as command {NOTHING}; upload it again"
+        command, place = NOTHING, [0.0, 0.0, 0.0]
+    elif not all(map(isfinite, params[:3])):
+        note = f"mission item {message.seq} has a parameter that is no number, taken as 0; upload it again"
+    p1, p2, p3, p4 = (p if isfinite(p) else 0.0 for p in params)  # param4 = nan is legal: keep the yaw
+    item = Item(
+        seq=message.seq,
+        command=command,
+        frame=message.frame,
+        param1=p1,
+        param2=p2,
+        param3=p3,
+        param4=p4,
+        lat_e7=round(place[0]),
+        lon_e7=round(place[1]),
+        alt_m=place[2],
+    )
+    return item, note
+
+
+def review(items: tuple[Item, ...]) -> list[str]:
+    """List what an operator should know of a mission: empty, jumps that lead nowhere, legs without length."""
+    if not items:
+        return ["the mission has no items; upload one"]
+    found = [f"jump of item {item.seq} never reaches a waypoint; upload another target" for item in _endless(items)]
+    places = [item for item in items[1:] if item.command == WAYPOINT and (item.lat_e7 or item.lon_e7)]
+    for a, b in zip(places, places[1:], strict=False):
+        if (a.lat_e7, a.lon_e7, a.alt_m) == (b.lat_e7, b.lon_e7, b.alt_m):
+            found.append(f"the leg from item {a.seq} to {b.seq} has no length")
+    return found
+
+
+def _endless(items: tuple[Item, ...]) -> list[Item]:
+    """Find jumps from which following the list meets no item to fly to: a loop, or a target that does not exist."""
+    by_seq = {item.seq: item for item in items}
+    lost = []
+    for jump in (item for item in items if item.command == DO_JUMP):
+        seq, seen = int(jump.param1), {jump.seq}
+        while (item := by_seq.get(seq)) is not None and seq not in seen and item.command > NAV_LAST:
+            seen.add(seq)
+            seq = int(item.param1) if item.command == DO_JUMP else seq + 1
+        if item is None or seq in seen:
+            lost.append(jump)
+    return lost
