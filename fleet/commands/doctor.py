@@ -46,11 +46,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def python() -> Finding:
-    """Check the interpreter."""
-    version = ".".join(map(str, sys.version_info[:3]))
-    if sys.version_info < (3, 11):
-        return Finding("BAD", "python", f"found {version}, expected 3.11 or newer; make setup PYTHON=python3.12")
-    return Finding("ok", "python", version)
+    """Name the interpreter; one older than 3.11 does not get as far as this line."""
+    return Finding("ok", "python", ".".join(map(str, sys.version_info[:3])))
 
 
 def packages() -> Iterator[Finding]:
