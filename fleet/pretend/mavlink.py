@@ -159,9 +159,12 @@ class Voice:
         due = [make for rate, phase, make in TELEMETRY if (tick - phase) % (TICK_HZ // rate) == 0]
         now = flight() if due else None
         frames = [self._frame(make(now)) for make in due if now is not None]
-        for _ in range(min(_ANSWERS_PER_TICK, len(self._waiting))):
-            frames.append(self._frame(self._param(self._waiting.popleft())))
-        return frames
+        return frames + self.stream(_ANSWERS_PER_TICK)
+
+    def stream(self, most: int) -> list[bytes]:
+        """Give up to `most` of the parameters that were asked for."""
+        count = min(most, len(self._waiting))
+        return [self._frame(self._param(self._waiting.popleft())) for _ in range(count)]
 
     def hear(self, data: bytes, t: float) -> list[bytes]:
         """Listen to bytes from the ground at `t` since boot [s] and give the answers; noise is passed over."""

@@ -1,0 +1,93 @@
+"""Fly pretend aircraft: fixed-wing UAVs on JSBSim that speak MAVLink 2 over UDP, or into a recording."""
+
+import argparse
+from pathlib import Path
+
+from fleet.cli import id_range, stop_on_signal
+
+EXAMPLES = """
+  fleet fly --uavs 0-7
+  fleet fly --uavs 0-49 --to 127.0.0.1:14550 --wind 6 --turbulence 4 --loss 0.05
+  fleet fly --uavs 0 --seed 3 --for 300 --tlog flight.tlog     as fast as possible, no network
+"""
+_RECORDED_S = 300.0  # length of a recording when --for is not given [s]
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the options."""
+    parser.add_argument("--uavs", type=id_range, default=range(8), metavar="A-B", help="aircraft ids (0-7)")
+    parser.add_argument("--to", default="127.0.0.1:14550", metavar="HOST:PORT", help="where the frames go")
+    parser.add_argument("--seed", type=int, default=1, help="draws aircraft, missions, weather and noise (1)")
+    parser.add_argument("--wind", type=float, default=4.0, metavar="M/S", help="mean wind at 100 m (4)")
+    parser.add_argument(
+        "--turbulence", default="light", metavar="LEVEL", help="none, light, moderate, severe or 0..7 (light = 3)"
+    )
+    parser.add_argument("--loss", type=float, default=0.02, metavar="SHARE", help="share of frames lost (0.02)")
+    parser.add_argument("--for", dest="seconds", type=float, metavar="S", help="how long (for ever; 300 with --tlog)")
+    parser.add_argument("--tlog", type=Path, metavar="FILE", help="fly as fast as possible into this .tlog instead")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly until told to stop, or for the given time.
+
+    Raises:
+        ValueError: when an option makes no sense; the sentence says which.
+    """
+    from fleet.pretend import drive  # loads JSBSim and compiles: not for --help
+    from fleet.pretend.uav import PretendUav
+    from fleet.pretend.weather import turbulence_level
+
+    _check(args)
+    stop = stop_on_signal()
+    level = turbulence_level(args.turbulence)
+    host, port = _address(args.to)
+    uavs = [PretendUav(i, args.seed, wind=args.wind, turbulence=level) for i in args.uavs]
+    if args.tlog is not None:
+        _record(drive, uavs, args, stop)
+        return 0
+    print(f"fly: {len(uavs)} aircraft in the air, talking to {host}:{port}", flush=True)
+    worst = drive.to_udp(uavs, (host, port), seconds=args.seconds, loss=args.loss, seed=args.seed, stop=stop)
+    print(f"fly: landed nowhere, stopped; at worst {worst * 1e3:.0f} ms behind real time", flush=True)
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    if not 0 <= args.wind <= 15:
+        raise ValueError(f"wind: found {args.wind} m/s, expected 0..15 (cruise is 23 m/s); lower --wind")
+    if not 0 <= args.loss < 1:
+        raise ValueError(f"loss: found {args.loss}, expected a share from 0 to below 1; write e.g. 0.02")
+    if args.seed < 0:
+        raise ValueError(f"seed: found {args.seed}, expected a whole number from 0; change --seed")
+    if args.seconds is not None and not args.seconds > 0:
+        raise ValueError(f"for: found {args.seconds} s, expected more than 0; change --for")
+
+
+def _address(text: str) -> tuple[str, int]:
+    """Read HOST:PORT.
+
+    Raises:
+        ValueError: when it is not one.
+    """
+    host, colon, port = text.rpartition(":")
+    if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65_536:
+        raise ValueError(f"to: found {text!r}, expected HOST:PORT such as 127.0.0.1:14550; correct --to")
+    return host, int(port)
+
+
+def _record(drive, uavs, args, stop) -> None:  # type: ignore[no-untyped-def]
+    """Write the recording under a progress bar."""
+    from rich.progress import Progress
+
+    seconds = args.seconds or _RECORDED_S
+    with Progress(transient=True) as bar:
+        task = bar.add_task(f"flying into {args.tlog.name}", total=seconds)
+        frames = drive.to_tlog(
+            args.tlog,
+            uavs,
+            seconds=seconds,
+            loss=args.loss,
+            seed=args.seed,
+            progress=lambda t: bar.update(task, completed=t),
+            stop=stop,
+        )
+    print(f"fly: {frames} frames of {len(uavs)} aircraft in {args.tlog}", flush=True)

@@ -1,0 +1,159 @@
+"""One pretend aircraft: physics, sensors, autopilot and voice, stepped by whoever drives it."""
+
+from math import pi, sin
+
+import numpy as np
+
+from fleet import mission as legs_of
+from fleet.autopilots import arduplane
+from fleet.frames import G, Origin, to_geodetic
+from fleet.pretend.jsbsim import CRUISE, Aircraft
+from fleet.pretend.mavlink import MOST_AIRCRAFT, TICK_HZ, Flight, Ground, Voice
+from fleet.pretend.missions import HOME, mission
+from fleet.pretend.sensors import Estimate, Sensors, Servos
+from fleet.pretend.tuning import tuned
+from fleet.pretend.weather import Wind
+
+DT = 1 / TICK_HZ
+_INNER, _OUTER = 2, 10  # attitude loop at 50 Hz, guidance at 10 Hz [ticks]
+_LEGS_AHEAD = 200
+_GROUND_M = 3.0  # below this height above home the flight is over
+
+
+class PretendUav:
+    """An aircraft in AUTO on its own mission; `step` makes it fly and talk, `hear` makes it answer."""
+
+    def __init__(self, uav_id: int, seed: int, *, wind: float = 4.0, turbulence: int = 3, origin: Origin = HOME):
+        """Put one aircraft in the air.
+
+        Args:
+            uav_id: from 0; the MAVLink system id is one more
+            seed: with `uav_id` draws everything; aircraft of one seed share the mean wind
+            wind: mean wind at 100 m [m/s]
+            turbulence: MIL-F-8785C severity, 0..7
+            origin: home, where the NED frame touches the earth
+        Raises:
+            ValueError: when MAVLink has no system id for it.
+        """
+        if not 0 <= uav_id < MOST_AIRCRAFT:
+            raise ValueError(
+                f"uav-{uav_id}: found id {uav_id}, expected 0..{MOST_AIRCRAFT - 1} (MAVLink system ids); fly fewer aircraft"
+            )
+        own = int(np.random.SeedSequence((seed, uav_id)).generate_state(1)[0])
+        rng = np.random.default_rng((own, 4))
+        self.uav_id, self.origin = uav_id, origin
+        self.items, start = mission(own, CRUISE, origin)
+        self.params = tuned(own)
+        self.boot_s = float(rng.uniform(60, 600))  # on the ground before the world began [s]
+        self.tick = 0
+        self.down = False  # it hit the ground
+        self._wind = Wind(wind, rng, DT * _OUTER, np.random.default_rng((seed, 5)).uniform(-pi, pi))
+        self._sensors = Sensors(rng, DT * _INNER)
+        self._voice = Voice(uav_id + 1, self.items, self.params)
+        self.aircraft = Aircraft(origin, own, turbulence)
+        blowing = self._wind.step(-start.p[2])
+        self._phi_c = 0.0
+        self._theta_c, delta_e, self._delta_t = self.aircraft.start(start.p, start.psi, CRUISE, blowing)
+        self.pulses = Servos.pulses(0.0, delta_e, 0.0, self._delta_t)
+        self.now: Estimate = self._sensors.measure(self.aircraft.truth())
+        self._engage(start.seq)
+
+    def _engage(self, seq: int) -> None:
+        """Start the autopilot on item `seq`."""
+        self._par, _ = arduplane.parameters(self.params, self.origin.alt_mm * 1e-3 - self.now.p[2])
+        route = legs_of.route(self.items, seq=seq, origin=self.origin, params=self.params, limit=_LEGS_AHEAD)
+        self._legs = route.legs
+        e = self.now
+        self._ctl = arduplane.init(
+            self._par, self._legs, 0, route.start, e.p, e.v, e.euler, e.Va, self._theta_c, self._delta_t
+        )
+
+    def step(self, t: float) -> list[bytes]:
+        """Fly on to `t` [s] since the start and give the frames sent on the way."""
+        frames: list[bytes] = []
+        while self.tick < round(t * TICK_HZ) and not self.down:
+            frames += self._tick()
+        return frames
+
+    def hear(self, data: bytes) -> list[bytes]:
+        """Listen to bytes from the ground; give the answers."""
+        return self._voice.hear(data, self.boot_s + self.tick * DT)
+
+    def introduce(self) -> list[bytes]:
+        """Give every frame a recording should begin with: version, mission, parameters."""
+        questions = Ground(self.uav_id + 1).questions(len(self.items))
+        answers = [frame for question in questions for frame in self.hear(question)]
+        return answers + self._voice.stream(len(self.params))
+
+    @property
+    def leg(self) -> np.ndarray:
+        """The leg in force, columns as in `fleet.mission`."""
+        return self._legs[int(self._ctl[arduplane.LEG])]
+
+    def _tick(self) -> list[bytes]:
+        if self.tick % _OUTER == 0:
+            self.aircraft.blow(*self._wind.step(-self.now.p[2]))
+        if self.tick % _INNER == 0:
+            self._control()
+        frames = self._voice.telemetry(self.tick, self._flight)
+        self.aircraft.step()
+        self.tick += 1
+        return frames
+
+    def _control(self) -> None:
+        """Measure, let the autopilot decide, move the servos."""
+        e = self.now = self._sensors.measure(self.aircraft.truth())
+        self.down = not -e.p[2] > _GROUND_M
+        if self.tick % _OUTER == 0:
+            Va_dot = float(e.force[0]) - G * sin(e.euler[1])
+            self._phi_c, self._theta_c, self._delta_t = arduplane.guide(
+                self._ctl, self._par, self._legs, e.p, e.v, e.euler, e.Va, Va_dot, DT * _OUTER
+            )
+            if self._ctl[arduplane.LEG] >= len(self._legs) - 2:
+                self._renew()
+        surfaces = arduplane.stabilise(
+            self._ctl, self._par, self._phi_c, self._theta_c, e.euler, e.rates, e.Va, DT * _INNER
+        )
+        self.pulses = Servos.pulses(*surfaces, self._delta_t)
+        self.aircraft.drive(*Servos.commands(self.pulses))
+
+    def _renew(self) -> None:
+        """Unroll the endless mission further, without disturbing the autopilot's memory."""
+        seq = int(self.leg[legs_of.SEQ])
+        self._legs = legs_of.route(
+            self.items, seq=seq, origin=self.origin, params=self.params, limit=_LEGS_AHEAD
+        ).legs
+        self._ctl[arduplane.LEG] = 0
+
+    def _flight(self) -> Flight:
+        e, leg = self.now, self.leg
+        target = leg[legs_of.P_N : legs_of.P_D + 1] - e.p
+        commanded = leg[legs_of.VA_C] if leg[legs_of.VA_C] > 0 else self.params["AIRSPEED_CRUISE"]
+        place = to_geodetic(self.origin, e.p)
+        return Flight(
+            t=self.boot_s + self.tick * DT,
+            now=e,
+            place=(int(place[0]), int(place[1]), int(place[2])),
+            height=float(-e.p[2]),
+            pulses=self.pulses,
+            delta_t=self._delta_t,
+            phi_c=self._phi_c,
+            theta_c=self._theta_c,
+            target=(float(target[0]), float(target[1])),
+            alt_error=float(-target[2]),
+            Va_error=float(commanded - e.Va),
+            xtrack_error=self._xtrack(),
+            seq=int(leg[legs_of.SEQ]),
+            total=len(self.items),
+        )
+
+    def _xtrack(self) -> float:
+        """Give the distance right of the leg's line, or outside the circle [m]."""
+        e, leg, ctl = self.now, self.leg, self._ctl
+        centre = leg[legs_of.P_N : legs_of.P_D]
+        if leg[legs_of.KIND] != legs_of.WAYPOINT:
+            radius = abs(leg[legs_of.RADIUS]) or self.params["WP_LOITER_RAD"]
+            return float(np.hypot(*(e.p[:2] - centre)) - radius)
+        a = ctl[[arduplane.PREV_N, arduplane.PREV_E]]
+        line, way = centre - a, e.p[:2] - a
+        return float((line[0] * way[1] - line[1] * way[0]) / max(np.hypot(*line), 1e-3))
