@@ -105,9 +105,7 @@ class Clocks:
     @property
     def jumps(self) -> int:
         """Count the jumps noticed."""
-        if self.boot.newest_s is not None:
-            return self.boot.jumps
-        return max(clock.jumps for clock in self._usec.values())
+        return max(clock.jumps for clock in (self.boot, *self._usec.values()))
 
     def fleet(self, tick: Tick, raw_s: float, arrival: float) -> float | None:
         """Give the fleet time of a message [s since 1970]; None while a jump is suspected."""

@@ -13,7 +13,7 @@ from fleet.telemetry.route import MESSAGES, RouteBook
 from fleet.telemetry.shelf import Shelf
 
 LOST_S = 3.0  # silence after which the link is called lost
-STATUS_S = 1.0
+STATUS_S = 0.95  # a little under the second, for it is asked every 0.1 s
 REMEMBER_S = 30.0  # how long a sentence stands
 SMOOTH = 0.4  # weight of the newest second in a rate
 

@@ -11,6 +11,7 @@ from typing import IO
 
 from fleet.telemetry.decode import frame_length
 from fleet.telemetry.intake import Intake, News
+from fleet.telemetry.restamp import Record, backlog_offset, restamped
 
 SUFFIXES = (".tlog", ".tlog.xz")
 CHUNK = 1 << 16
@@ -18,7 +19,6 @@ FLUSH_S = 0.1  # recorded time between two publications
 EARLIEST, LATEST = 3e8, 4e9  # believable stamps [s since 1970]
 LONGEST_GAP_S = 86_400.0
 
-Record = tuple[float, bytes]
 _log = logging.getLogger("parauav.recordings")
 
 
@@ -44,6 +44,16 @@ def records(path: Path | str) -> Iterator[Record]:
         raise ValueError(f"{path.name}: found no MAVLink frame, expected a telemetry log; check the file")
     if reader.skipped:
         _log.warning("%s: %d damaged bytes skipped, %d frames read", path.name, reader.skipped, reader.count)
+
+
+def timed(path: Path | str) -> Iterator[Record]:
+    """Read a recording in the time the flight took, even where a backlog arrived in a rush.
+
+    Raises:
+        ValueError: when it is no recording.
+    """
+    offset_s = backlog_offset(records(path))
+    return records(path) if offset_s is None else restamped(records(path), offset_s)
 
 
 def _chunks(path: Path) -> Iterator[bytes]:
@@ -118,7 +128,7 @@ def replay_messages(path: Path | str, offset: int = 0, intake: Intake | None = N
     intake = Intake(offset) if intake is None else intake
     due: float | None = None
     t = 0.0
-    for t, frame in records(path):
+    for t, frame in timed(path):
         due = t + FLUSH_S if due is None else due
         while t >= due:
             yield from intake.flush(due)

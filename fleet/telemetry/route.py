@@ -1,5 +1,6 @@
 """The mission on board, put together from what is overheard: a download or an upload, ours or another station's."""
 
+from itertools import pairwise
 from math import isfinite
 from typing import Any
 
@@ -150,7 +151,7 @@ def read_item(message: Any) -> tuple[Item, str]:
     note = ""
     command = message.command
     if not all(map(isfinite, place)) or abs(place[0]) > 2**31 or abs(place[1]) > 2**31:
-        note = f"mission item {message.seq} has a coordinate that is no number, passed on as command {NOTHING}; upload it again"
+        note = f"mission item {message.seq} has a coordinate that is no number and stands for nothing; upload it again"
         command, place = NOTHING, [0.0, 0.0, 0.0]
     elif not all(map(isfinite, params[:3])):
         note = f"mission item {message.seq} has a parameter that is no number, taken as 0; upload it again"
@@ -176,7 +177,7 @@ def review(items: tuple[Item, ...]) -> list[str]:
         return ["the mission has no items; upload one"]
     found = [f"jump of item {item.seq} never reaches a waypoint; upload another target" for item in _endless(items)]
     places = [item for item in items[1:] if item.command == WAYPOINT and (item.lat_e7 or item.lon_e7)]
-    for a, b in zip(places, places[1:], strict=False):
+    for a, b in pairwise(places):
         if (a.lat_e7, a.lon_e7, a.alt_m) == (b.lat_e7, b.lon_e7, b.alt_m):
             found.append(f"the leg from item {a.seq} to {b.seq} has no length")
     return found
