@@ -51,6 +51,9 @@ class Bus(AbstractContextManager, Protocol):
     def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
         """Ask everyone for a class; the highest epoch per aircraft is kept."""
 
+    def present(self, name: str) -> None:
+        """Say that this process lives, until it does not: a liveliness token at `parauav/@live/{name}`."""
+
     def close(self) -> None:
         """Leave the bus."""
 
@@ -118,6 +121,9 @@ class MemoryBus(AbstractContextManager):
                 continue  # a refusal; on Zenoh it travels as an error reply, which `ask` leaves out
             found += [(decode(kind, encode(message), encoding(kind)), stamp) for message, stamp in answers]
         return newest(found)
+
+    def present(self, name: str) -> None:
+        """Need nothing: a process knows that it lives."""
 
     def close(self) -> None:
         """Forget everyone."""
@@ -204,6 +210,10 @@ class ZenohBus(AbstractContextManager):
             return None
         attachment = sample.attachment
         return message, unpack_stamp(attachment.to_bytes() if attachment is not None else None)
+
+    def present(self, name: str) -> None:
+        """Declare the liveliness token `parauav/@live/{name}`; it goes with the session."""
+        self._declared.append(self._session.liveliness().declare_token(f"{ROOT}/@live/{name}"))
 
     def close(self) -> None:
         """Close the session."""

@@ -16,9 +16,9 @@ AHEAD = np.arange(0.0, 61.0)  # look-ahead grid of every prediction [s]
 LIMIT = 0.10  # relative error at which trust ends [-]
 QUANTILE = 0.9
 _FLOOR_S = 2.0  # least path length, as seconds of ground speed [s]
-_PRIOR = {  # expected spread of along, cross, vertical, and of the distance, at one second and per second [m]
-    "paper": (np.array([2.0, 2.0, 1.0, 2.5]), np.array([0.9, 0.5, 0.25, 1.1])),
-    "imm": (np.array([3.0, 3.0, 1.5, 4.0]), np.array([6.0, 6.0, 1.0, 9.0])),
+_PRIOR = {  # expected spread of along, cross, vertical and distance: base [m], growth [m/s^power], power
+    "paper": (np.array([1.0, 0.8, 0.6, 1.2]), np.array([0.45, 0.2, 0.1, 0.5]), 1.3),  # Huang 2021: 10 % at 16 s
+    "imm": (np.array([2.0, 2.0, 1.0, 2.5]), np.array([1.6, 1.6, 0.5, 2.2]), 1.4),
 }
 _PRIOR_WEIGHT = 6.0  # past predictions the prior counts as [-]
 _PRIOR_SCORE = 2.0  # its 90 % factor [-]
@@ -119,8 +119,8 @@ class Record:
 
     def spread(self, method: str, ahead: np.ndarray = AHEAD) -> np.ndarray:
         """Give the expected error by look-ahead: the prior, outweighed by what was measured, (n, 4) [m]."""
-        base, growth = _PRIOR[method]
-        prior = np.hypot(base, growth * ahead[:, None])
+        base, growth, power = _PRIOR[method]
+        prior = np.hypot(base, growth * ahead[:, None] ** power)
         found = self.squares.get(method)
         if not found:
             return prior

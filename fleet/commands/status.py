@@ -1,0 +1,69 @@
+"""Show every UAV of a running fleet: state, verdict, fit, horizon, worker, ages."""
+
+import argparse
+import json
+import sys
+
+import msgspec
+from rich.console import Console
+from rich.table import Table
+
+from fleet.bus import ROUTER, Bus, connect
+from fleet.contract import FleetRow, FleetState, State, Status
+
+EXAMPLES = """
+  fleet status
+  fleet status --json
+  fleet status --router tcp/192.168.1.10:7447
+"""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--router", default=ROUTER, help=f"Zenoh router ({ROUTER})")
+    parser.add_argument("--json", action="store_true", help="a list of objects instead of a table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Ask the fleet once and print it; exit code 1 where no UAV is known."""
+    with connect(args.router) as bus:
+        rows = fleet_rows(bus)
+    if args.json:
+        json.dump(as_objects(rows), sys.stdout, indent=1)
+        print()
+    else:
+        Console().print(table(rows) if rows else "no UAV known yet: is a gateway running and an aircraft connected?")
+    return 0 if rows else 1
+
+
+def fleet_rows(bus: Bus) -> list[FleetRow]:
+    """Ask every worker for its rows and add what no worker holds as unclaimed."""
+    best: dict[int, FleetRow] = {}
+    for state, _ in bus.ask(FleetState):
+        for row in state.rows:
+            if row.uav not in best or row.epoch > best[row.uav].epoch:
+                best[row.uav] = row
+    for status, _ in bus.ask(Status):
+        sentence = "no worker holds this id: start `twin_worker` with a wider --uavs"
+        best.setdefault(status.uav, FleetRow(uav=status.uav, state=State.UNCLAIMED, verdict=sentence))
+    return [best[uav] for uav in sorted(best)]
+
+
+def as_objects(rows: list[FleetRow]) -> list[dict[str, object]]:
+    """Give the rows as plain objects for JSON."""
+    return [msgspec.to_builtins(row) for row in rows]
+
+
+def table(rows: list[FleetRow]) -> Table:
+    """Lay the rows out as a table for people."""
+    out = Table(box=None, pad_edge=False)
+    for heading, justify in (("UAV", "right"), ("state", "left"), ("fit %", "right"), ("horizon s", "right")):
+        out.add_column(heading, justify=justify)  # type: ignore[arg-type]
+    out.add_column("sample age s", justify="right")
+    out.add_column("verdict", overflow="fold")
+    for row in rows:
+        fit = f"{sum(row.fit.values()) / len(row.fit):.0f}" if row.fit else "-"
+        horizon = f"{row.horizon_s:.0f}" if row.horizon_s else "-"
+        age = "-" if row.sample_age_s is None else f"{row.sample_age_s:.1f}"
+        out.add_row(str(row.uav), row.state.value, fit, horizon, age, row.verdict)
+    return out

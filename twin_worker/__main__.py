@@ -1,0 +1,47 @@
+"""`twin_worker --uavs 0-49`: hold the twins of a range of UAVs."""
+
+import argparse
+import sys
+
+from fleet.bus import ROUTER, connect
+from fleet.cli import guarded, id_range, parser_for, stop_on_signal
+from fleet.contract import FleetState
+
+EXAMPLES = """
+  twin_worker --uavs 0-49
+  twin_worker --uavs 50-99 --router tcp/192.168.1.10:7447
+"""
+
+
+def _run(args: argparse.Namespace) -> int:
+    stop = stop_on_signal()
+    with connect(args.router) as bus:
+        bus.present(f"worker/{bus.writer:016x}/{args.uavs.start}-{args.uavs.stop - 1}")
+        bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
+        from twin_worker.warm import warm_up  # numba is slow to import: say what happens first
+        from twin_worker.worker import Worker
+
+        worker = Worker(bus, args.uavs, omega=args.omega)
+        worker.listen()
+        worker.sentence = "compiling the twin's physics, once"
+        bus.publish(worker.state())
+        warm_up()
+        worker.sentence = ""
+        print(f"twin_worker: holding UAVs {args.uavs.start}-{args.uavs.stop - 1}", flush=True)
+        worker.run(stop)
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the worker until it is told to stop."""
+    parser = parser_for("twin_worker", "Identify, verify and predict each UAV of a range.", EXAMPLES)
+    parser.add_argument("--uavs", type=id_range, default=range(0, 50), metavar="LO-HI", help="ids to hold (0-49)")
+    parser.add_argument("--router", default=ROUTER, help=f"Zenoh router ({ROUTER})")
+    parser.add_argument("--method", choices=("paper",), default="paper", help="prediction method (paper)")
+    parser.add_argument("--omega", type=float, default=20.0, help="least mean fit of a verified model, %% (20)")
+    args = parser.parse_args(argv)
+    return guarded("twin_worker", _run, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,161 @@
+"""The live driver: messages from the bus to the twins this worker holds, results back, one line per UAV."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+
+from fleet.bus import Bus
+from fleet.codec import Stamp
+from fleet.contract import Array, FleetState, Message, Mission, Params, Prediction, Sample, Status
+from twin_worker.twin import Twin, advance, fleet_row
+
+_INBOX = 4096  # messages waiting per UAV; the oldest go first and are counted
+_SILENT_S = 1.0  # wall time without news after which data time runs on by the wall clock [s]
+_STATE_S = 1.0  # between fleet tables [s]
+
+
+@dataclass
+class Held:
+    """One UAV this worker holds: its twin, its inbox and its claim."""
+
+    twin: Twin
+    epoch: int
+    inbox: deque[Message] = field(default_factory=lambda: deque(maxlen=_INBOX))
+    arrived: float = float("nan")  # wall time of the newest sample [s, monotonic]
+    shed: int = 0
+
+
+class Worker:
+    """Twins of the UAVs in one range of ids."""
+
+    def __init__(self, bus: Bus, uavs: range, *, omega: float) -> None:
+        self.bus = bus
+        self.uavs = uavs
+        self.omega = omega
+        self.sentence = ""
+        self._held: dict[int, Held] = {}
+        self._lock = threading.Lock()
+        self._news = threading.Event()
+
+    def listen(self) -> None:
+        """Subscribe, answer queries, and ask for what was said before this worker came."""
+        for kind in (Sample, Status, Mission, Params):
+            self.bus.subscribe(kind, lambda message, _: self._hear(message))
+        self.bus.answer(Prediction, self._predictions)
+        self.bus.answer(FleetState, lambda *_: [(self.state(), None)])
+        for kind in (Status, Mission, Params):
+            for message, _ in self.bus.ask(kind):
+                self._hear(message)
+
+    def _hear(self, message: Message) -> None:
+        if message.uav not in self.uavs:
+            return
+        with self._lock:
+            held = self._held.get(message.uav)
+            if held is None:
+                epoch = int(time.time() * 1000)
+                held = self._held[message.uav] = Held(Twin(message.uav, omega=self.omega), epoch)
+        if isinstance(message, Sample):
+            held.arrived = time.monotonic()
+        held.shed += len(held.inbox) == _INBOX
+        held.inbox.append(message)
+        self._news.set()
+
+    def holding(self) -> list[Held]:
+        """Give what this worker holds, by UAV id."""
+        with self._lock:
+            return [self._held[uav] for uav in sorted(self._held)]
+
+    def turn(self) -> int:
+        """Advance every twin once; give how many messages were taken in."""
+        taken = 0
+        for held in self.holding():
+            messages = [held.inbox.popleft() for _ in range(len(held.inbox))]
+            taken += len(messages)
+            for result in _advance_all(held, messages):
+                self.bus.publish(result, Stamp(held.epoch, self.bus.writer))
+        return taken
+
+    def state(self) -> FleetState:
+        """Give the fleet table of this worker."""
+        writer = f"{self.bus.writer:016x}"
+        rows = [fleet_row(h.twin, data_time(h), worker=writer, epoch=h.epoch) for h in self.holding()]
+        shed = sum(held.shed for held in self.holding())
+        sentence = self.sentence or (f"{shed} messages shed: too many UAVs for this worker" if shed else "")
+        return FleetState(t=time.time(), rows=tuple(rows), sentence=sentence)
+
+    def run(self, stop: threading.Event) -> None:
+        """Turn until told to stop, publishing the fleet table once a second."""
+        due = 0.0
+        while not stop.is_set():
+            self._news.wait(timeout=0.1)
+            self._news.clear()
+            self.turn()
+            if time.monotonic() >= due:
+                due = time.monotonic() + _STATE_S
+                self.bus.publish(self.state())
+
+    def _predictions(self, uav: int | None, asked: dict[str, str], _: bytes) -> Iterator[tuple[Prediction, Stamp]]:
+        grid = wanted(asked)
+        for held in self.holding():
+            prediction = held.twin.prediction
+            if prediction is not None and uav in (None, held.twin.uav):
+                yield resample(prediction, grid), Stamp(held.epoch, self.bus.writer)
+
+
+def data_time(held: Held) -> float:
+    """Give the UAV's data time now: its newest sample, and the wall time since where it has fallen silent [s]."""
+    silent = time.monotonic() - held.arrived
+    newest = held.twin.history.newest
+    return newest + silent if silent > _SILENT_S else newest
+
+
+def _advance_all(held: Held, messages: list[Message]) -> Iterator[Message]:
+    """Turn the loop once per half second of data, so that a burst meets the same deadlines as a live stream."""
+    batch: list[Message] = []
+    start = held.twin.history.newest
+    for message in messages:
+        batch.append(message)
+        if isinstance(message, Sample) and message.t - start >= 0.5:
+            yield from advance(held.twin, batch, message.t)
+            batch, start = [], message.t
+    now = data_time(held)
+    if batch or np.isfinite(now):
+        newest = max([m.t for m in batch if isinstance(m, Sample)], default=-np.inf)
+        yield from advance(held.twin, batch, max(now, newest))
+
+
+def wanted(asked: dict[str, str]) -> np.ndarray | None:
+    """Read `?horizon=30;step=0.5` into look-ahead times [s]; None where nothing was asked.
+
+    Raises:
+        ValueError: when they are no numbers or ask for more than 1,000 points.
+    """
+    if not asked.keys() & {"horizon", "step"}:
+        return None
+    try:
+        horizon, step = float(asked.get("horizon", 60.0)), float(asked.get("step", 1.0))
+    except ValueError:
+        raise ValueError(f"query: found {asked}, expected numbers, e.g. ?horizon=30;step=0.5; correct them") from None
+    if not (0 < horizon <= 60 and step > 0 and horizon / step <= 1000):
+        raise ValueError(f"query: found horizon {horizon}, step {step}; ask for at most 60 s and 1,000 points")
+    return np.arange(0.0, horizon + 1e-9, step)
+
+
+def resample(prediction: Prediction, grid: np.ndarray | None) -> Prediction:
+    """Give the prediction on other look-ahead times, (n,) [s]; the whole of it for None."""
+    if grid is None:
+        return prediction
+    ahead = prediction.ahead.numpy()
+    path, tube = (
+        Array.of(np.column_stack([np.interp(grid, ahead, column) for column in rows.numpy().T]))
+        for rows in (prediction.path, prediction.tube)
+    )
+    return msgspec.structs.replace(prediction, ahead=Array.of(grid), path=path, tube=tube)
+
+
