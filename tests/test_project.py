@@ -1,0 +1,109 @@
+"""The project around the house: tracked files, dependencies and their lock, console commands."""
+
+import ast
+import importlib
+import importlib.metadata
+import pkgutil
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+from test_house import PACKAGES, imported, sources
+
+from fleet import cli, commands
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+TOOLS = {"ruff", "mypy", "pytest"}  # development dependencies that are run rather than imported
+
+
+# --- tracked files ---------------------------------------------------------------------------------------------------
+
+
+def tracked() -> list[Path]:
+    listing = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listing.returncode:
+        pytest.skip("not a git checkout, so nothing says which files are the project's")
+    return [ROOT / name for name in listing.stdout.split("\0") if name and (ROOT / name).is_file()]
+
+
+MACHINE = re.compile(rb"(?<![\w.}])/(?:work|home|root|Users)/\w|https?://[^\s\"']*(?:pypi|pythonhosted|npmjs|conda)")
+
+
+def test_no_machine_path_and_no_registry_is_tracked() -> None:
+    assert MACHINE.search(b"see /" + b"home/someone") and MACHINE.search(b"https://" + b"pypi.org/simple")
+    found = [(str(path.relative_to(ROOT)), hit[0]) for path in tracked() if (hit := MACHINE.search(path.read_bytes()))]
+    assert not found
+
+
+# --- dependencies ----------------------------------------------------------------------------------------------------
+
+
+def bare(requirement: str) -> str:
+    return re.split(r"[^A-Za-z0-9._-]", requirement)[0].lower().replace("_", "-")
+
+
+def third_party(*folders: str) -> set[str]:
+    """Distributions that the sources of some folders import."""
+    offered = importlib.metadata.packages_distributions()
+    found: set[str] = set()
+    local = {*PACKAGES, "tests", *(path.stem for path in (ROOT / "tests").rglob("*.py"))}
+    for path in sources():
+        if path.startswith(folders):
+            tops = {name.split(".")[0] for _, name in imported(path, ast.parse((ROOT / path).read_text()))}
+            for top in tops - set(sys.stdlib_module_names) - local:
+                assert top in offered, f"{path} imports {top}, which is not installed"
+                found |= {bare(offer) for offer in offered[top]}
+    return found
+
+
+def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None:
+    run_time = {bare(line) for line in PROJECT["dependencies"]}
+    development = {bare(line) for line in PROJECT["optional-dependencies"]["dev"]}
+    assert third_party(*PACKAGES) == run_time
+    assert third_party("tests") <= run_time | development
+    assert development <= third_party("tests") | TOOLS
+
+
+def test_the_lock_holds_every_dependency_by_version_and_hash_and_no_address() -> None:
+    text = (ROOT / "requirements.lock").read_text()
+    assert "http" not in text and "--index" not in text and "--find-links" not in text
+    entries = re.split(r"\n(?=[a-z0-9])", text.replace("\\\n", " "))[1:]
+    assert all(re.match(r"[a-z0-9._-]+==[^ ]+ +--hash=sha256:[0-9a-f]{64}", entry) for entry in entries), entries
+    locked = {entry.split("==")[0] for entry in entries}
+    wanted = {*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["dev"], "setuptools"}
+    assert {bare(line) for line in wanted} <= locked
+
+
+# --- commands --------------------------------------------------------------------------------------------------------
+
+VERBS = sorted(found.name for found in pkgutil.iter_modules(commands.__path__))
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_is_whole_and_its_help_shows_examples(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    module = importlib.import_module(f"fleet.commands.{verb}")
+    assert f"fleet {verb}" in module.EXAMPLES
+    assert callable(module.arguments) and callable(module.run)
+    with pytest.raises(SystemExit) as left:
+        cli.main([verb, "--help"])
+    shown = capsys.readouterr().out
+    assert left.value.code == 0
+    assert "examples:" in shown and module.EXAMPLES.strip() in shown
+
+
+@pytest.mark.parametrize("command", sorted(PROJECT["scripts"]))
+def test_every_console_command_helps_with_examples_and_refuses_nonsense(command: str) -> None:
+    module, _, function = PROJECT["scripts"][command].partition(":")
+    code = f"import sys; from {module} import {function} as main; sys.exit(main())"
+
+    def call(argument: str) -> subprocess.CompletedProcess[str]:
+        line = [sys.executable, "-W", "error", "-c", code, argument]
+        return subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+
+    helped, refused = call("--help"), call("--no-such-flag")
+    assert helped.returncode == 0 and "examples:" in helped.stdout, helped.stderr
+    assert refused.returncode == 2 and "Traceback" not in refused.stderr, refused.stderr
