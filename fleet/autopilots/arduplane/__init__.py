@@ -1,0 +1,43 @@
+"""ArduPlane's control law, from its equations: L1 guides, TECS shares energy, PIDs hold attitude.
+
+    route --legs--> line or circle --l1--> phi_c ----------------+
+      +--legs--> height and speed --tecs--> theta_c, delta_t ------+--attitude--> delta_a, delta_e, delta_r
+          every 0.1 s                                                  every 0.02 s
+
+    par, absent = parameters(values, altitude_m)              autopilot parameters -> one vector, SI
+    ctl = init(par, legs, k, start, p, v, euler, Va, theta_c, delta_t)
+    phi_c, theta_c, delta_t = guide(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    delta_a, delta_e, delta_r = stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
+    ctl, rms_phi_c = shadow(par, legs, start, t, p, v, euler, rates, Va, phi_c, theta_c, delta, seq)
+
+All but `parameters` are compiled and change `ctl` in place; ctl[LEG] is the index of the current leg. Airspeeds are
+equivalent, as the sensor reports them; true airspeed is made inside. Not modelled: terrain following, flaps, reverse
+thrust, the yaw damper (off by default) and the gain reduction of oscillating loops.
+
+Source: Park, Deyst & How (2004) for L1; Lambregts (1983) for TECS; ArduPlane 4.x for the law as flown.
+"""
+
+from fleet.autopilots.arduplane.attitude import stabilise
+from fleet.autopilots.arduplane.guide import guide, init
+from fleet.autopilots.arduplane.legs import set_leg
+from fleet.autopilots.arduplane.params import DEFAULTS, N_PAR, NAMES, eas2tas, parameters
+from fleet.autopilots.arduplane.shadow import shadow
+from fleet.autopilots.arduplane.state import LEG, N_CTL
+
+LAW = "arduplane: L1 + TECS"
+
+__all__ = [
+    "DEFAULTS",
+    "LAW",
+    "LEG",
+    "NAMES",
+    "N_CTL",
+    "N_PAR",
+    "eas2tas",
+    "guide",
+    "init",
+    "parameters",
+    "set_leg",
+    "shadow",
+    "stabilise",
+]

@@ -1,0 +1,76 @@
+"""The whole guidance step: route, L1 and TECS together, 10 Hz."""
+
+import numpy as np
+
+from fleet.autopilots.arduplane import l1, tecs
+from fleet.autopilots.arduplane import legs as leg_rules
+from fleet.autopilots.arduplane import params as P
+from fleet.autopilots.arduplane import state as S
+from fleet.autopilots.arduplane.state import kernel
+from fleet.mission import VA_C
+
+
+@kernel
+def init(
+    par: np.ndarray, legs: np.ndarray, k: int, start: np.ndarray, p: np.ndarray, v: np.ndarray, euler: np.ndarray,
+    Va: float, theta_c: float, delta_t: float,
+) -> np.ndarray:
+    """Begin on leg `k`, without a bump from the pitch and throttle in force.
+
+    Args:
+        par: parameters (N_PAR,)
+        legs: route (m, 9)
+        k: leg to fly
+        start: point where its line begins, NED, (3,) [m]; nan: where the aircraft is
+        p, v: position and ground velocity, NED, (3,) [m, m/s]
+        euler: phi, theta, psi (3,) [rad]
+        Va: equivalent airspeed; nan: no sensor [m/s]
+        theta_c, delta_t: pitch command and throttle in force [rad, 0..1]
+    Returns:
+        ctl (S.N_CTL,)
+    """
+    ctl = np.zeros(S.N_CTL)
+    known = np.isfinite(start[0]) and np.isfinite(start[1]) and np.isfinite(start[2])
+    leg_rules.set_leg(ctl, par, legs, k, start if known else p)
+    tecs.reset(ctl, par, -p[2], -v[2], Va, theta_c, delta_t)
+    return ctl
+
+
+@kernel
+def fly(
+    ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray, euler: np.ndarray, Va: float,
+    Va_dot: float, dt: float,
+) -> tuple[float, float, float, bool]:
+    """Fly the current leg for one step without leaving it; as `guide`, and whether the leg is over."""
+    dt = max(dt, 1e-3)
+    a_lat, over = leg_rules.steer(ctl, par, legs, p, v, euler, dt)
+    phi_c = l1.to_roll(par, a_lat, euler[1])
+    i = leg_rules.current(ctl, legs)
+    va_c = legs[i, VA_C] if i >= 0 and legs[i, VA_C] > 0.0 else par[P.VA_CRUISE]
+    h_sp = leg_rules.height_demand(ctl, par, legs, p)
+    tecs.update_speed(ctl, par, v, euler, Va, Va_dot, dt)
+    theta_c, delta_t = tecs.update(ctl, par, h_sp, va_c, -p[2], -v[2], euler[0], not np.isfinite(Va), dt)
+    return phi_c, theta_c, delta_t, over
+
+
+@kernel
+def guide(
+    ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray, euler: np.ndarray, Va: float,
+    Va_dot: float, dt: float,
+) -> tuple[float, float, float]:
+    """Fly the route for one step; goes on to the next leg by itself, holds the last. Made for 10 Hz.
+
+    Args:
+        ctl, par, legs: controller state (changed), parameters, route
+        p, v: position and ground velocity, NED, (3,) [m, m/s]
+        euler: phi, theta, psi (3,) [rad]
+        Va: equivalent airspeed as the sensor reports it; nan: no sensor [m/s]
+        Va_dot: forward acceleration, x_body . v_dot; nan: taken from the change of `v` [m/s2]
+        dt: step [s]
+    Returns:
+        phi_c, theta_c [rad], delta_t 0..1
+    """
+    phi_c, theta_c, delta_t, over = fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    if over and int(ctl[S.LEG]) + 1 < legs.shape[0]:
+        leg_rules.begin(ctl, par, legs, int(ctl[S.LEG]) + 1, p)
+    return phi_c, theta_c, delta_t

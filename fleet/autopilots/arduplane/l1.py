@@ -1,0 +1,149 @@
+"""L1: where to accelerate sideways to follow a line or a circle.
+
+    L1 = zeta T v_g / pi        K = 4 zeta^2        a_lat = K v_g^2 / L1 sin(nu)
+
+`nu` is the angle from the ground velocity to a point L1 ahead on the path. Right is positive.
+Source: Park, Deyst & How, "A New Nonlinear Guidance Logic for Trajectory Tracking" (2004); ArduPlane L1 controller.
+"""
+
+from math import asin, atan, atan2, cos, hypot, pi, sin
+
+import numpy as np
+
+from fleet.autopilots.arduplane import params as P
+from fleet.autopilots.arduplane import state as S
+from fleet.autopilots.arduplane.state import kernel
+from fleet.frames import G, wrap
+from fleet.mission import P_E, P_N
+
+_SHALLOW = 0.0873  # crosstrack angle below which its integral runs: 5 deg [rad]
+_STEEP = 0.7071  # sine of the steepest approach to a line: 45 deg [-]
+_MOST = 0.1  # limit of the crosstrack integral [rad]
+
+
+@kernel
+def clip(x: float, low: float, high: float) -> float:
+    """Limit x; nan stays nan."""
+    return low if x < low else (high if x > high else x)
+
+
+@kernel
+def ground_track(v: np.ndarray, psi: float) -> tuple[float, float, float]:
+    """Give ground velocity north, east and speed; the heading at 0.1 m/s where the wind carries it backwards [m/s]."""
+    speed = hypot(v[0], v[1])
+    if speed < 0.1 or v[0] * cos(psi) + v[1] * sin(psi) < 0.0:
+        return 0.1 * cos(psi), 0.1 * sin(psi), 0.1
+    return v[0], v[1], speed
+
+
+@kernel
+def distance(par: np.ndarray, speed: float) -> float:
+    """Give the L1 distance for a ground speed [m]."""
+    return max(par[P.DAMPING] * par[P.PERIOD] * speed / pi, 0.1)
+
+
+@kernel
+def to_roll(par: np.ndarray, a_lat: float, theta: float) -> float:
+    """Turn lateral acceleration [m/s2] into the bank that gives it in a level turn, limited [rad]."""
+    return clip(atan(a_lat / (G * max(cos(theta), 0.5))), -par[P.ROLL_LIMIT], par[P.ROLL_LIMIT])
+
+
+@kernel
+def angle_to(v_n: float, v_e: float, n: float, e: float) -> float:
+    """Give the angle from one horizontal vector to another, right positive [rad]."""
+    return atan2(v_n * e - v_e * n, v_n * n + v_e * e)
+
+
+@kernel
+def decided(ctl: np.ndarray, nu: float, n: float, e: float, psi: float) -> float:
+    """Keep turning the way chosen before while the target (n, e) lies nearly behind; remembers `nu` [rad]."""
+    before = ctl[S.NU]
+    behind = abs(wrap(atan2(e, n) - psi)) > 2 * pi / 3
+    if behind and abs(nu) > 0.9 * pi and abs(before) > 0.9 * pi and nu * before < 0.0:
+        nu = before
+    ctl[S.NU] = nu
+    return nu
+
+
+@kernel
+def follow_line(
+    ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, v: np.ndarray, psi: float, dt: float
+) -> float:
+    """Follow the line from the point before to the leg's target.
+
+    Three regimes: far behind the start, fly to the start; more than 3 s past the end, fly to the end; else capture
+    the line with nu = asin(crosstrack / L1) + integral + course error.
+
+    Args:
+        ctl, par, leg: controller state, parameters, row of the route
+        p, v: position and ground velocity, NED, (3,) [m, m/s]
+        psi: heading [rad]
+        dt: step [s]
+    Returns:
+        lateral acceleration, right positive [m/s2]
+    """
+    v_n, v_e, speed = ground_track(v, psi)
+    l1 = distance(par, speed)
+    t_n, t_e = leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]
+    length = max(hypot(t_n, t_e), 1e-6)
+    t_n, t_e = t_n / length, t_e / length
+    a_n, a_e = p[0] - ctl[S.PREV_N], p[1] - ctl[S.PREV_E]
+    along, left = a_n * t_n + a_e * t_e, a_n * t_e - a_e * t_n
+    away = hypot(a_n, a_e)
+    b_n, b_e = leg[P_N] - p[0], leg[P_E] - p[1]
+    if away > l1 and along < -_STEEP * max(away, 1.0):
+        nu = angle_to(v_n, v_e, -a_n, -a_e)
+    elif along > length + 3.0 * speed:
+        nu = angle_to(v_n, v_e, b_n, b_e)
+    else:
+        nu1 = asin(clip(left / l1, -_STEEP, _STEEP))
+        if par[P.XTRACK_I] <= 0.0:
+            ctl[S.XTRACK] = 0.0
+        elif abs(nu1) < _SHALLOW:
+            ctl[S.XTRACK] = clip(ctl[S.XTRACK] + nu1 * par[P.XTRACK_I] * dt, -_MOST, _MOST)
+        nu = nu1 + ctl[S.XTRACK] + angle_to(v_n, v_e, t_n, t_e)
+    nu = clip(decided(ctl, nu, b_n, b_e, psi), -pi / 2, pi / 2)
+    return 4.0 * par[P.DAMPING] ** 2 * speed * speed / l1 * sin(nu)
+
+
+@kernel
+def circle_radius(par: np.ndarray, radius: float) -> float:
+    """Widen a radius [m] for thin air, or for the bank limit of loiters where one is set [m]."""
+    if par[P.LIM_BANK] > 0.0:
+        tas = par[P.VA_CRUISE] * par[P.EAS2TAS]
+        return max(radius, tas * tas / (G * max(np.tan(par[P.LIM_BANK]), 0.01)))
+    return radius * par[P.EAS2TAS] ** 2
+
+
+@kernel
+def follow_circle(
+    ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, v: np.ndarray, psi: float, radius: float
+) -> tuple[float, bool]:
+    """Capture a circle, then hold it: omega = 2 pi / T, a = d (omega^2 (r - R) + 2 zeta omega r_dot + v_t^2 / r).
+
+    Args:
+        ctl, par, leg: controller state, parameters, row of the route (its target is the centre)
+        p, v: position and ground velocity, NED, (3,) [m, m/s]
+        psi: heading [rad]
+        radius: signed, positive clockwise [m]
+    Returns:
+        lateral acceleration, right positive [m/s2]; whether the circle is reached
+    """
+    v_n, v_e, speed = ground_track(v, psi)
+    d = 1.0 if radius >= 0.0 else -1.0
+    wide = max(abs(radius), 1.0)
+    c_n, c_e = leg[P_N] - p[0], leg[P_E] - p[1]
+    r = max(hypot(c_n, c_e), 0.1)
+    out_n, out_e = -c_n / r, -c_e / r
+    nu = clip(decided(ctl, angle_to(v_n, v_e, -out_n, -out_e), c_n, c_e, psi), -pi / 2, pi / 2)
+    capture = 4.0 * par[P.DAMPING] ** 2 * speed * speed / distance(par, speed) * sin(nu)
+    omega = 2 * pi / par[P.PERIOD]
+    v_t = (out_n * v_e - out_e * v_n) * d
+    v_r = v_n * out_n + v_e * out_e
+    pull = omega * omega * (r - wide) + 2.0 * par[P.DAMPING] * omega * v_r
+    if v_r > 0.0 and v_t < 0.0:
+        pull = max(pull, 0.0)
+    hold = d * (pull + v_t * v_t / max(0.5 * wide, r))
+    if r > wide and d * capture < d * hold:
+        return capture, False
+    return hold, True

@@ -1,0 +1,204 @@
+"""Which leg is flown, when it is over, and how high to be on it.
+
+A line is over within the turn distance of its end or once the finish line through its end is crossed.
+Source: ArduPlane mission logic, waypoint switching and altitude slope.
+"""
+
+from math import atan2, hypot, pi
+
+import numpy as np
+
+from fleet.autopilots.arduplane import l1
+from fleet.autopilots.arduplane import params as P
+from fleet.autopilots.arduplane import state as S
+from fleet.autopilots.arduplane.state import kernel
+from fleet.frames import wrap
+from fleet.mission import (
+    ACCEPT,
+    KIND,
+    LAND,
+    LOITER_TIME,
+    LOITER_TO_ALT,
+    LOITER_TURNS,
+    LOITER_UNLIMITED,
+    P_D,
+    P_E,
+    P_N,
+    RADIUS,
+    SEQ,
+    TAKEOFF,
+    TURNS,
+    WAYPOINT,
+)  # fmt: skip
+
+_CLIMB_AT_ONCE = 1 << 14  # FLIGHT_OPTIONS: climb to the next altitude at once
+_EXIT = pi / 18  # leave a circle within 10 deg of the way out, 10 deg more each extra turn [rad]
+_LEVEL = 5.0  # altitude error that ends LOITER_TO_ALT [m]
+
+
+@kernel
+def current(ctl: np.ndarray, legs: np.ndarray) -> int:
+    """Give the index of the leg in force; -1 when the route is empty."""
+    return min(max(int(ctl[S.LEG]), 0), legs.shape[0] - 1)
+
+
+@kernel
+def along_line(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> tuple[float, float]:
+    """Give the way made along the current line, and the line's length [m]."""
+    t_n, t_e = leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]
+    length = hypot(t_n, t_e)
+    if length < 0.1:
+        return 0.0, 0.0
+    return ((p[0] - ctl[S.PREV_N]) * t_n + (p[1] - ctl[S.PREV_E]) * t_e) / length, length
+
+
+@kernel
+def set_leg(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, from_p: np.ndarray) -> None:
+    """Begin leg `k` (clamped to the route) on the line from `from_p`, NED (3,) [m]; not finite: from its own target."""
+    ctl[:S.N_LEG] = 0.0
+    ctl[S.READY] = -1.0
+    ctl[S.LEG] = max(k, 0)
+    i = current(ctl, legs)
+    ctl[S.LEG] = max(i, 0)
+    known = np.isfinite(from_p[0]) and np.isfinite(from_p[1]) and np.isfinite(from_p[2])
+    for j in range(3):
+        ctl[S.PREV_N + j] = from_p[j] if known else (legs[i, P_N + j] if i >= 0 else 0.0)
+    if i < 0:
+        return
+    ctl[S.TURN] = pi / 2
+    if i + 1 < legs.shape[0]:
+        here = atan2(legs[i, P_E] - ctl[S.PREV_E], legs[i, P_N] - ctl[S.PREV_N])
+        ctl[S.TURN] = abs(wrap(atan2(legs[i + 1, P_E] - legs[i, P_E], legs[i + 1, P_N] - legs[i, P_N]) - here))
+
+
+@kernel
+def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndarray) -> None:
+    """Go on to leg `k` from the aircraft's position `p`, NED (3,) [m].
+
+    The new line begins where the old one ended, except after a circle or takeoff, or where its end is passed already.
+    """
+    i = current(ctl, legs)
+    onward = i >= 0 and k == i + 1 and int(legs[i, KIND]) == WAYPOINT
+    if not onward:
+        set_leg(ctl, par, legs, k, p)
+        return
+    set_leg(ctl, par, legs, k, legs[i, P_N : P_D + 1])
+    along, length = along_line(ctl, legs[current(ctl, legs)], p)
+    if along > length:
+        set_leg(ctl, par, legs, k, p)
+
+
+@kernel
+def steer(
+    ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray, euler: np.ndarray, dt: float
+) -> tuple[float, bool]:
+    """Guide along the current leg without leaving it.
+
+    Args:
+        ctl, par, legs: controller state, parameters, route
+        p, v: position and ground velocity, NED, (3,) [m, m/s]
+        euler: phi, theta, psi (3,) [rad]
+        dt: step [s]
+    Returns:
+        lateral acceleration, right positive [m/s2]; whether the leg is over
+    """
+    i = current(ctl, legs)
+    if i < 0:
+        return 0.0, False
+    leg = legs[i]
+    kind = int(leg[KIND])
+    if kind == TAKEOFF:
+        return 0.0, p[2] <= leg[P_D]
+    if kind in (WAYPOINT, LAND):
+        if hypot(leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]) < 0.1:  # no line: make one from here
+            ctl[S.PREV_N], ctl[S.PREV_E] = p[0], p[1]
+        a_lat = l1.follow_line(ctl, par, leg, p, v, euler[2], dt)
+        return a_lat, kind == WAYPOINT and _arrived(ctl, par, leg, p, v, euler[2])
+    radius = leg[RADIUS] if leg[RADIUS] != 0.0 else par[P.LOITER_RAD]
+    wide = l1.circle_radius(par, abs(radius))
+    a_lat, around = l1.follow_circle(ctl, par, leg, p, v, euler[2], wide if radius >= 0.0 else -wide)
+    _count(ctl, leg, p, around, 1.0 if radius >= 0.0 else -1.0, dt)
+    return a_lat, _circled(ctl, legs, i, p, v, euler[2], wide)
+
+
+@kernel
+def _arrived(ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, v: np.ndarray, psi: float) -> bool:
+    to_go = hypot(leg[P_N] - p[0], leg[P_E] - p[1])
+    accept = leg[ACCEPT]
+    if accept == 0.0:
+        _, _, speed = l1.ground_track(v, psi)
+        reach = min(par[P.WP_RADIUS] * par[P.EAS2TAS] ** 2, l1.distance(par, speed))
+        accept = reach * min(ctl[S.TURN], pi / 2) / (pi / 2)
+    if accept > 0.0 and to_go <= accept:
+        return True
+    along, length = along_line(ctl, leg, p)
+    if along <= length + max(-accept, 0.0):
+        return False
+    if par[P.WP_MAX_RADIUS] > 0.0 and to_go > par[P.WP_MAX_RADIUS]:  # past it but too far off: try again from here
+        ctl[S.PREV_N], ctl[S.PREV_E], ctl[S.PREV_D] = p[0], p[1], p[2]
+        return False
+    return True
+
+
+@kernel
+def _count(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, around: bool, d: float, dt: float) -> None:
+    """Add up the angle and the time flown since the circle was reached."""
+    bearing = atan2(leg[P_E] - p[1], leg[P_N] - p[0])
+    ctl[S.AROUND] = 1.0 if around else 0.0
+    if ctl[S.ON] > 0.0:
+        ctl[S.ANGLE] += wrap(bearing - ctl[S.BEARING]) * d
+        ctl[S.TIMER] += dt
+    elif around:
+        ctl[S.ON] = 1.0
+    ctl[S.BEARING] = bearing
+
+
+@kernel
+def _circled(
+    ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.ndarray, psi: float, wide: float
+) -> bool:
+    leg = legs[i]
+    if i + 1 >= legs.shape[0] or int(leg[KIND]) == LOITER_UNLIMITED or ctl[S.ON] == 0.0:
+        return False
+    if ctl[S.READY] < 0.0:
+        if not _ready(ctl, leg, p):
+            return False
+        ctl[S.READY] = max(ctl[S.ANGLE], 0.0)
+    out_n, out_e = legs[i + 1, P_N] - p[0], legs[i + 1, P_E] - p[1]
+    if hypot(legs[i + 1, P_N] - leg[P_N], legs[i + 1, P_E] - leg[P_E]) < wide:  # the way out never comes into view
+        return True
+    v_n, v_e, _ = l1.ground_track(v, psi)
+    extra = np.floor(max(ctl[S.ANGLE] - ctl[S.READY], 0.0) / (2 * pi))
+    return abs(l1.angle_to(v_n, v_e, out_n, out_e)) <= _EXIT * (1.0 + extra)
+
+
+@kernel
+def _ready(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> bool:
+    kind = int(leg[KIND])
+    if kind == LOITER_TURNS:
+        return ctl[S.ANGLE] >= 2 * pi * leg[TURNS]
+    if kind == LOITER_TIME:
+        return ctl[S.TIMER] >= leg[TURNS]
+    return kind == LOITER_TO_ALT and abs(p[2] - leg[P_D]) < _LEVEL
+
+
+@kernel
+def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray) -> float:
+    """Give the height to be at, up positive above the origin [m]: linear along a sloped leg, at once on a flat one.
+
+    Args:
+        ctl, par, legs: controller state, parameters, route
+        p: position, NED, (3,) [m]
+    """
+    i = current(ctl, legs)
+    if i < 0:
+        return -ctl[S.PREV_D]
+    leg = legs[i]
+    h, rise = -leg[P_D], ctl[S.PREV_D] - leg[P_D]
+    at_once = int(par[P.OPTIONS]) & _CLIMB_AT_ONCE != 0 or leg[SEQ] < 0.0
+    if int(leg[KIND]) == TAKEOFF or abs(rise) < par[P.SLOPE_MIN] or (rise > 0.0 and at_once) or ctl[S.ON] > 0.0:
+        return h
+    along, length = along_line(ctl, leg, p)
+    if length < 0.1:
+        return h
+    return h - rise * (1.0 - l1.clip(along / length, 0.0, 1.0))

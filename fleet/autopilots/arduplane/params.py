@@ -1,0 +1,164 @@
+"""ArduPlane's parameters -> one vector in SI for the compiled controller.
+
+Source: ArduPlane 4.x parameter list (names, defaults, units); older names from its release notes.
+"""
+
+from collections.abc import Mapping
+from math import isfinite, radians
+from typing import NamedTuple
+
+import numpy as np
+
+_DEG = radians(1.0)
+_PERCENT = 0.01
+
+
+class Row(NamedTuple):
+    """One parameter: name, default and range as ArduPilot has them, factor to SI, older names with their factor."""
+
+    name: str
+    default: float
+    factor: float
+    low: float
+    high: float
+    older: tuple[tuple[str, float], ...] = ()  # (older name, older unit in units of the new one)
+
+
+TABLE = (
+    Row("NAVL1_PERIOD", 17, 1, 1, 100),
+    Row("NAVL1_DAMPING", 0.75, 1, 0.1, 3),
+    Row("NAVL1_XTRACK_I", 0.02, 1, 0, 1),
+    Row("NAVL1_LIM_BANK", 0, _DEG, 0, 89),
+    Row("WP_RADIUS", 90, 1, 0, 1e5),
+    Row("WP_MAX_RADIUS", 0, 1, 0, 1e5),
+    Row("WP_LOITER_RAD", 60, 1, -1e5, 1e5),
+    Row("ALT_SLOPE_MIN", 15, 1, 0, 1e4, (("GLIDE_SLOPE_MIN", 1),)),
+    Row("FLIGHT_OPTIONS", 0, 1, 0, 2**31),
+    Row("ROLL_LIMIT_DEG", 45, _DEG, 1, 90, (("LIM_ROLL_CD", 0.01),)),
+    Row("PTCH_LIM_MAX_DEG", 20, _DEG, 1, 90, (("LIM_PITCH_MAX", 0.01),)),
+    Row("PTCH_LIM_MIN_DEG", -25, _DEG, -90, -1, (("LIM_PITCH_MIN", 0.01),)),
+    Row("PTCH_TRIM_DEG", 0, _DEG, -45, 45, (("TRIM_PITCH_CD", 0.01),)),
+    Row("TECS_CLMB_MAX", 5, 1, 0.1, 100),
+    Row("TECS_SINK_MIN", 2, 1, 0.1, 100),
+    Row("TECS_SINK_MAX", 5, 1, 0.1, 100),
+    Row("TECS_TIME_CONST", 5, 1, 0.5, 100),
+    Row("TECS_THR_DAMP", 0.5, 1, 0, 10),
+    Row("TECS_PTCH_DAMP", 0.3, 1, 0, 10),
+    Row("TECS_INTEG_GAIN", 0.3, 1, 0, 10),
+    Row("TECS_VERT_ACC", 7, 1, 0.1, 100),
+    Row("TECS_RLL2THR", 10, 1, 0, 1000),
+    Row("TECS_SPDWEIGHT", 1, 1, -1, 2),
+    Row("TECS_HDEM_TCONST", 3, 1, 0, 100),
+    Row("TECS_PITCH_MAX", 15, _DEG, 0, 90),
+    Row("TECS_PITCH_MIN", 0, _DEG, -90, 0),
+    Row("TRIM_THROTTLE", 45, _PERCENT, 0, 100),
+    Row("THR_MIN", 0, _PERCENT, -100, 100),
+    Row("THR_MAX", 100, _PERCENT, 1, 100),
+    Row("THR_SLEWRATE", 100, _PERCENT, 0, 1e4),
+    Row("AIRSPEED_CRUISE", 12, 1, 1, 300, (("TRIM_ARSPD_CM", 0.01),)),
+    Row("AIRSPEED_MIN", 9, 1, 1, 300, (("ARSPD_FBW_MIN", 1),)),
+    Row("AIRSPEED_MAX", 22, 1, 1, 300, (("ARSPD_FBW_MAX", 1),)),
+    Row("SCALING_SPEED", 15, 1, 1, 300),
+    Row("RLL2SRV_TCONST", 0.5, 1, 0.1, 10),
+    Row("RLL2SRV_RMAX", 0, _DEG, 0, 1000),
+    Row("RLL_RATE_FF", 0.345, 1, 0, 100),
+    Row("RLL_RATE_P", 0.08, 1, 0, 100),
+    Row("RLL_RATE_I", 0.15, 1, 0, 100),
+    Row("RLL_RATE_D", 0, 1, 0, 10),
+    Row("RLL_RATE_IMAX", 0.666, 1, 0, 10),
+    Row("RLL_RATE_FLTT", 3, 1, 0, 1000),
+    Row("RLL_RATE_FLTD", 12, 1, 0, 1000),
+    Row("PTCH2SRV_TCONST", 0.5, 1, 0.1, 10),
+    Row("PTCH2SRV_RMAX_UP", 0, _DEG, 0, 1000),
+    Row("PTCH2SRV_RMAX_DN", 0, _DEG, 0, 1000),
+    Row("PTCH2SRV_RLL", 1, 1, 0, 10),
+    Row("PTCH_RATE_FF", 0.345, 1, 0, 100),
+    Row("PTCH_RATE_P", 0.04, 1, 0, 100),
+    Row("PTCH_RATE_I", 0.15, 1, 0, 100),
+    Row("PTCH_RATE_D", 0, 1, 0, 10),
+    Row("PTCH_RATE_IMAX", 0.666, 1, 0, 10),
+    Row("PTCH_RATE_FLTT", 3, 1, 0, 1000),
+    Row("PTCH_RATE_FLTD", 12, 1, 0, 1000),
+    Row("KFF_RDDRMIX", 0.5, 1, 0, 2),
+)
+
+# Where each of them lies in `par`; the order is the table's.
+(
+    PERIOD, DAMPING, XTRACK_I, LIM_BANK, WP_RADIUS, WP_MAX_RADIUS, LOITER_RAD, SLOPE_MIN, OPTIONS, ROLL_LIMIT,
+    PITCH_HIGH, PITCH_LOW, PITCH_TRIM, CLIMB_MAX, SINK_MIN, SINK_MAX, TIME_CONST, THR_DAMP, PITCH_DAMP, INTEG,
+    VERT_ACC, ROLL_TO_THR, SPEED_WEIGHT, H_TIME, TECS_HIGH, TECS_LOW, THR_TRIM, THR_MIN, THR_MAX, THR_SLEW,
+    VA_CRUISE, VA_MIN, VA_MAX, VA_SCALING,
+    ROLL_TC, ROLL_RMAX, ROLL_FF, ROLL_P, ROLL_I, ROLL_D, ROLL_IMAX, ROLL_FLTT, ROLL_FLTD,
+    PITCH_TC, PITCH_UP, PITCH_DOWN, PITCH_ROLL, PITCH_FF, PITCH_P, PITCH_I, PITCH_D, PITCH_IMAX, PITCH_FLTT, PITCH_FLTD,
+    RUDDER_MIX,
+) = range(len(TABLE))  # fmt: skip
+EAS2TAS = len(TABLE)  # true over equivalent airspeed [-]
+N_PAR = EAS2TAS + 1
+
+NAMES = tuple(row.name for row in TABLE)
+DEFAULTS: dict[str, float] = {row.name: float(row.default) for row in TABLE}
+
+
+def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Turn autopilot parameters into the vector the kernels read.
+
+    Args:
+        values: parameters as the autopilot names and scales them, current or older names
+        altitude_m: height above mean sea level, for true airspeed [m]
+    Returns:
+        par: SI and rad, throttles 0..1, (N_PAR,)
+        absent: names that were missing, not finite or absurd; their defaults are in `par`
+    """
+    given = {**_old_gains(values), **{k: float(v) for k, v in values.items()}}
+    par, absent = np.empty(N_PAR), []
+    for i, row in enumerate(TABLE):
+        value = _find(row, given)
+        if value is None:
+            absent.append(row.name)
+        par[i] = (row.default if value is None else value) * row.factor
+    absent += _order(par)
+    par[THR_MIN] = max(par[THR_MIN], 0.0)  # reverse thrust is not modelled
+    par[EAS2TAS] = eas2tas(altitude_m)
+    return par, tuple(absent)
+
+
+def eas2tas(altitude_m: float) -> float:
+    """Give true over equivalent airspeed at a height above sea level [m]. Source: ISA, troposphere."""
+    h = min(max(altitude_m, -500.0), 11_000.0) if isfinite(altitude_m) else 0.0
+    return float((1 - 2.25577e-5 * h) ** (-4.25588 / 2))
+
+
+def _find(row: Row, given: Mapping[str, float]) -> float | None:
+    for name, unit in ((row.name, 1.0), *row.older):
+        value = given.get(name)
+        if value is not None and isfinite(value) and row.low <= value * unit <= row.high:
+            return value * unit
+    return None
+
+
+def _order(par: np.ndarray) -> list[str]:
+    """Put back to defaults what contradicts itself: a lower limit at or above its upper one."""
+    wrong = []
+    if not par[VA_MIN] < par[VA_MAX]:
+        wrong += [VA_CRUISE, VA_MIN, VA_MAX]
+    if not par[THR_MIN] < par[THR_MAX]:
+        wrong += [THR_TRIM, THR_MIN, THR_MAX]
+    for i in wrong:
+        par[i] = TABLE[i].default * TABLE[i].factor
+    return [TABLE[i].name for i in wrong]
+
+
+def _old_gains(values: Mapping[str, float]) -> dict[str, float]:
+    """Convert the angle gains of ArduPlane before 4.1 to rate gains: P -> FF, D -> P, I tau -> I, IMAX/4500.
+
+    Source: ArduPlane 4.1 release notes; FF' = FF + max((P - I tau) tau - D, 0) with tau the time constant.
+    """
+    found: dict[str, float] = {}
+    for old, new in (("RLL2SRV_", "RLL_RATE_"), ("PTCH2SRV_", "PTCH_RATE_")):
+        if not any(old + gain in values for gain in ("P", "I", "D", "FF", "IMAX")):
+            continue
+        defaults = (("P", 1.0), ("I", 0.3), ("D", 0.08), ("FF", 0.0), ("IMAX", 3000.0), ("TCONST", 0.5))
+        p, i, d, ff, imax, tau = (float(values.get(old + gain, default)) for gain, default in defaults)
+        found |= {new + "FF": ff + max((p - i * tau) * tau - d, 0.0), new + "P": d, new + "I": i * tau}
+        found[new + "IMAX"] = imax / 4500.0
+    return found

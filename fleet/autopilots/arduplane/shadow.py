@@ -1,0 +1,138 @@
+"""Shadow run: the controller flown on telemetry, so that its memory becomes that of the controller on board.
+
+What telemetry does not show (filters, integrators, angle flown on a circle) follows from what it shows. What the run
+cannot know, an integrator's value at its beginning, is shifted at the end until the outputs meet the reported ones.
+"""
+
+from math import nan, sqrt
+
+import numpy as np
+
+from fleet.autopilots.arduplane import legs as leg_rules
+from fleet.autopilots.arduplane import params as P
+from fleet.autopilots.arduplane import state as S
+from fleet.autopilots.arduplane.attitude import FULL, stabilise
+from fleet.autopilots.arduplane.guide import fly, init
+from fleet.autopilots.arduplane.state import kernel
+from fleet.frames import G, wrap
+from fleet.mission import SEQ
+
+_MEAN_OVER = 5.0  # outputs are matched over the last seconds [s]
+_LONGEST = 0.2  # a longer gap in the telemetry counts as one step of this length [s]
+
+
+@kernel
+def _find(ctl: np.ndarray, legs: np.ndarray, seq: float) -> int:
+    """Give the leg of a reported item: the current or next such; -1 where the route has none."""
+    now, n = leg_rules.current(ctl, legs), legs.shape[0]
+    for j in range(n):
+        i = (max(now, 0) + j) % n
+        if legs[i, SEQ] == seq:
+            return i
+    return -1
+
+
+@kernel
+def _usable(p: np.ndarray, v: np.ndarray, euler: np.ndarray) -> bool:
+    return np.all(np.isfinite(p)) and np.all(np.isfinite(v)) and np.all(np.isfinite(euler))
+
+
+@kernel
+def shadow(
+    par: np.ndarray, legs: np.ndarray, start: np.ndarray, t: np.ndarray, p: np.ndarray, v: np.ndarray,
+    euler: np.ndarray, rates: np.ndarray, Va: np.ndarray, phi_c: np.ndarray, theta_c: np.ndarray, delta: np.ndarray,
+    seq: np.ndarray,
+) -> tuple[np.ndarray, float]:
+    """Synchronise the controller with telemetry at about 10 Hz; rows with nan are passed over.
+
+    Args:
+        par: parameters (N_PAR,)
+        legs: route from the item in force at t[0], (m, 9)
+        start: point before the first leg, NED, (3,) [m]; nan: where the aircraft is
+        t: time (n,) [s]
+        p, v: position and ground velocity, NED, (n, 3) [m, m/s]
+        euler, rates: phi theta psi, p q r, (n, 3) [rad, rad/s]
+        Va: equivalent airspeed, nan without a sensor, (n,) [m/s]
+        phi_c, theta_c: reported commands, nan where missing, (n,) [rad]
+        delta: reported delta_a, delta_e, delta_r, delta_t, nan where missing, (n, 4) [-1..1, throttle 0..1]
+        seq: reported mission item, (n,)
+    Returns:
+        ctl at t[n-1], (S.N_CTL,)
+        root mean square of replayed minus reported phi_c [rad]; nan where none was reported
+    """
+    n = t.shape[0]
+    ctl = np.zeros(S.N_CTL)
+    missed = np.zeros(4)  # reported minus replayed: theta_c, delta_t, delta_a, delta_e
+    count = np.zeros(4)
+    square, rows, last = 0.0, 0, -1
+    for k in range(n):
+        if not _usable(p[k], v[k], euler[k]):
+            continue
+        if last < 0:
+            ctl = _begin(par, legs, start, p[k], v[k], euler[k], Va[k], theta_c[k], delta[k, 3])
+            last = k
+        dt = min(max(t[k] - t[last], 0.0), _LONGEST)
+        last = k
+        _force(ctl, par, legs, seq[k], p[k])
+        if not dt > 0.0:
+            continue
+        phi_k, theta_k, thr_k, _ = fly(ctl, par, legs, p[k], v[k], euler[k], Va[k], nan, dt)
+        if np.isfinite(phi_c[k]):
+            square += wrap(phi_c[k] - phi_k) ** 2
+            rows += 1
+        recent = t[n - 1] - t[k] <= _MEAN_OVER
+        _note(missed, count, 0, theta_c[k] - theta_k, recent)
+        _note(missed, count, 1, delta[k, 3] - thr_k, recent)
+        if np.all(np.isfinite(rates[k])):
+            roll = phi_c[k] if np.isfinite(phi_c[k]) else phi_k
+            pitch = theta_c[k] if np.isfinite(theta_c[k]) else theta_k
+            delta_a, delta_e, _ = stabilise(ctl, par, roll, pitch, euler[k], rates[k], Va[k], dt)
+            _note(missed, count, 2, delta[k, 0] - delta_a, recent)
+            _note(missed, count, 3, delta[k, 1] - delta_e, recent)
+    if last >= 0:
+        _shift(ctl, par, missed / np.maximum(count, 1.0), theta_c, delta[:, 3])
+    return ctl, (sqrt(square / rows) if rows > 0 else nan)
+
+
+@kernel
+def _begin(
+    par: np.ndarray, legs: np.ndarray, start: np.ndarray, p: np.ndarray, v: np.ndarray, euler: np.ndarray, Va: float,
+    theta_c: float, delta_t: float,
+) -> np.ndarray:
+    theta = theta_c if np.isfinite(theta_c) else euler[1]
+    thr = delta_t if np.isfinite(delta_t) else 0.5 * (par[P.THR_MIN] + par[P.THR_MAX])
+    return init(par, legs, 0, start, p, v, euler, Va, theta, thr)
+
+
+@kernel
+def _force(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, seq: float, p: np.ndarray) -> None:
+    """Fly the item that the aircraft reports: no leg ahead of it, none behind."""
+    i = leg_rules.current(ctl, legs)
+    if i < 0 or not np.isfinite(seq) or legs[i, SEQ] == seq:
+        return
+    j = _find(ctl, legs, seq)
+    if j >= 0 and j != int(ctl[S.LEG]):
+        leg_rules.begin(ctl, par, legs, j, p)
+
+
+@kernel
+def _note(missed: np.ndarray, count: np.ndarray, i: int, miss: float, recent: bool) -> None:
+    if recent and np.isfinite(miss):
+        missed[i] += miss
+        count[i] += 1.0
+
+
+@kernel
+def _shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, theta_c: np.ndarray, delta_t: np.ndarray) -> None:
+    """Shift the integrators by the mean misses, and put the slewed outputs where the reported ones are."""
+    room = 0.5 * (par[P.THR_MAX] - par[P.THR_MIN])
+    ctl[S.I_SEB] += miss[0] * ctl[S.V_HAT] * G
+    ctl[S.THETA] += miss[0]
+    ctl[S.I_THR] = min(max(ctl[S.I_THR] + miss[1], -room), room)
+    ctl[S.I_A] += miss[2] * FULL
+    ctl[S.I_E] += miss[3] * FULL
+    n = theta_c.shape[0]
+    if np.isfinite(theta_c[n - 1]):
+        ctl[S.THETA] = theta_c[n - 1]
+    if np.isfinite(delta_t[n - 1]):
+        ctl[S.THR] = delta_t[n - 1] - ctl[S.I_THR]

@@ -1,0 +1,273 @@
+"""TECS: throttle holds the total energy, pitch shares it between height and speed.
+
+    SPE = g h      SKE = V^2 / 2      STE = SPE + SKE (throttle)      SEB = w_p SPE - w_k SKE (pitch)
+
+Inside, speeds are true airspeeds and heights are up.
+Source: Lambregts, "Total Energy Based Flight Control System" (1983); ArduPlane TECS.
+"""
+
+from math import cos, sin, sqrt
+
+import numpy as np
+
+from fleet.autopilots.arduplane import params as P
+from fleet.autopilots.arduplane import state as S
+from fleet.autopilots.arduplane.l1 import clip
+from fleet.autopilots.arduplane.state import kernel
+from fleet.frames import G
+
+_W = 2.0  # bandwidth of the airspeed filter [rad/s]
+_SLOWEST = 3.0  # the airspeed filter goes no lower [m/s]
+_SMOOTH = 0.2  # lag on the acceleration taken from velocity differences [s]
+
+
+@kernel
+def pitch_limits(par: np.ndarray) -> tuple[float, float]:
+    """Give the lowest and highest pitch demand [rad]; a TECS limit of zero defers to the general one."""
+    low = max(par[P.TECS_LOW], par[P.PITCH_LOW]) if par[P.TECS_LOW] < 0.0 else par[P.PITCH_LOW]
+    high = min(par[P.TECS_HIGH], par[P.PITCH_HIGH]) if par[P.TECS_HIGH] > 0.0 else par[P.PITCH_HIGH]
+    return low, high
+
+
+@kernel
+def update_speed(
+    ctl: np.ndarray, par: np.ndarray, v: np.ndarray, euler: np.ndarray, Va: float, Va_dot: float, dt: float
+) -> None:
+    """Filter airspeed and forward acceleration: second-order complementary filter of 2 rad/s.
+
+    Args:
+        ctl, par: controller state, parameters
+        v: ground velocity, NED, (3,) [m/s]
+        euler: phi, theta, psi (3,) [rad]
+        Va: equivalent airspeed; nan: no sensor, cruise is assumed [m/s]
+        Va_dot: forward acceleration; nan: taken from the change of `v` [m/s2]
+        dt: step [s]
+    """
+    if np.isfinite(Va_dot):
+        ctl[S.ACCEL] = Va_dot
+    elif ctl[S.SEEN] > 0.0 and dt > 0.0:
+        ct, st = cos(euler[1]), sin(euler[1])
+        d_n, d_e, d_d = v[0] - ctl[S.V_N], v[1] - ctl[S.V_E], v[2] - ctl[S.V_E + 1]
+        forward = (d_n * ct * cos(euler[2]) + d_e * ct * sin(euler[2]) - d_d * st) / dt
+        ctl[S.ACCEL] += dt / (dt + _SMOOTH) * (clip(forward, -30.0, 30.0) - ctl[S.ACCEL])
+    for j in range(3):
+        ctl[S.V_N + j] = v[j]
+    ctl[S.SEEN] = 1.0
+    ctl[S.ACCEL_LP] += dt / (dt + par[P.TIME_CONST]) * (ctl[S.ACCEL] - ctl[S.ACCEL_LP])
+    if not np.isfinite(Va):
+        ctl[S.V_HAT], ctl[S.V_DOT_HAT] = par[P.VA_CRUISE] * par[P.EAS2TAS], 0.0
+        return
+    error = Va * par[P.EAS2TAS] - ctl[S.V_HAT]
+    ctl[S.V_DOT_HAT] += error * _W * _W * dt
+    ctl[S.V_HAT] += (ctl[S.V_DOT_HAT] + ctl[S.ACCEL] + error * _W * sqrt(2.0)) * dt
+    if ctl[S.V_HAT] < _SLOWEST:
+        ctl[S.V_HAT], ctl[S.V_DOT_HAT] = _SLOWEST, max(ctl[S.V_DOT_HAT], 0.0)
+
+
+@kernel
+def _slowest(par: np.ndarray, phi: float) -> float:
+    """Give the least true airspeed, raised with the load factor of the bank [m/s]."""
+    return par[P.VA_MIN] * par[P.EAS2TAS] / sqrt(max(cos(phi), 0.2))
+
+
+@kernel
+def _demand_speed(ctl: np.ndarray, par: np.ndarray, va_c: float, phi: float, dt: float) -> float:
+    """Move the speed demand at half the energy rate there is; give its rate above its slow part [m/s2]."""
+    V = ctl[S.V_HAT]
+    fastest, slowest = 0.5 * par[P.CLIMB_MAX] * ctl[S.UP] * G / V, -0.5 * par[P.SINK_MIN] * G / V
+    low, high = _slowest(par, phi), par[P.VA_MAX] * par[P.EAS2TAS]
+    if ctl[S.THR_SAT] > 0.0:  # no power left: wind the ceiling down
+        ctl[S.V_TOP] = max(ctl[S.V_TOP] + slowest * dt, min(par[P.VA_CRUISE] * par[P.EAS2TAS], high))
+    else:
+        ctl[S.V_TOP] = min(ctl[S.V_TOP] + max(fastest, 0.0) * dt, high)
+    wanted = low if ctl[S.SINKING] > 0.0 or ctl[S.SLOW] > 0.0 else va_c * par[P.EAS2TAS]
+    wanted = max(min(wanted, ctl[S.V_TOP]), low)
+    step = clip(wanted - ctl[S.V_DEM], slowest * dt, fastest * dt)
+    ctl[S.V_DEM] += step
+    rate = step / dt
+    ctl[S.V_DEM_LP] += dt / (dt + par[P.TIME_CONST]) * (rate - ctl[S.V_DEM_LP])
+    return rate - ctl[S.V_DEM_LP]
+
+
+@kernel
+def _demand_height(ctl: np.ndarray, par: np.ndarray, h_sp: float, dt: float) -> float:
+    """Rate-limit and lag the height demand; give the climb rate demand [m/s]."""
+    mean = 0.5 * (h_sp + ctl[S.H_IN])
+    ctl[S.H_IN] = h_sp
+    down, up = par[P.SINK_MAX] * ctl[S.DOWN] * dt, par[P.CLIMB_MAX] * ctl[S.UP] * dt
+    ctl[S.H_LIMITED] += clip(mean - ctl[S.H_LIMITED], -down, up)
+    tau = max(par[P.H_TIME], dt)
+    h_dot = (ctl[S.H_LIMITED] - ctl[S.H_DEM]) / tau
+    ctl[S.H_DEM] += dt / (dt + tau) * (ctl[S.H_LIMITED] - ctl[S.H_DEM])
+    _yield(ctl, dt / (dt + tau))
+    return h_dot
+
+
+@kernel
+def _yield(ctl: np.ndarray, share: float) -> None:
+    """Let the height demand wait for an aircraft whose throttle or pitch is at its limit."""
+    up = ctl[S.THETA_SAT] > 0.0 or ctl[S.THR_SAT] > 0.0
+    down = ctl[S.THETA_SAT] < 0.0 or ctl[S.THR_SAT] < 0.0
+    if up and ctl[S.H_DEM] > ctl[S.H_LAST]:
+        ctl[S.UP] *= 1.0 - share
+    elif down and ctl[S.H_DEM] < ctl[S.H_LAST]:
+        ctl[S.DOWN] *= 1.0 - share
+    else:
+        ctl[S.UP] += share * (1.0 - ctl[S.UP])
+        ctl[S.DOWN] += share * (1.0 - ctl[S.DOWN])
+    ctl[S.H_LAST] = ctl[S.H_DEM]
+
+
+@kernel
+def energy_rates(ctl: np.ndarray, par: np.ndarray) -> tuple[float, float]:
+    """Give the specific total energy rates of idle and full throttle [m2/s3]."""
+    return -par[P.SINK_MIN] * G, max(par[P.CLIMB_MAX] * ctl[S.UP], 0.1) * G
+
+
+@kernel
+def _flags(ctl: np.ndarray, par: np.ndarray, h: float, phi: float, error: float, rate: float) -> None:
+    """Notice underspeed (latched until the height is regained) and a descent at full throttle."""
+    too_slow = ctl[S.V_HAT] < 0.9 * _slowest(par, phi) and ctl[S.THR] + ctl[S.I_THR] >= 0.95 * par[P.THR_MAX]
+    ctl[S.SLOW] = 1.0 if too_slow or (ctl[S.SLOW] > 0.0 and h < ctl[S.H_IN]) else 0.0
+    full = ctl[S.THR] + ctl[S.I_THR] >= 0.9 * par[P.THR_MAX]
+    falling = error > 200.0 and rate < 0.0 and full
+    ctl[S.SINKING] = 1.0 if ctl[S.SLOW] == 0.0 and (falling or (ctl[S.SINKING] > 0.0 and error > 0.0)) else 0.0
+
+
+@kernel
+def _throttle(
+    ctl: np.ndarray, par: np.ndarray, h: float, h_dot: float, v_rate: float, phi: float, dt: float
+) -> float:
+    """Close the loop on total energy; give the throttle 0..1."""
+    idle, full = energy_rates(ctl, par)
+    V, tc, span = ctl[S.V_HAT], par[P.TIME_CONST], par[P.THR_MAX] - par[P.THR_MIN]
+    ske, low, high = 0.5 * V * V, par[P.VA_MIN] * par[P.EAS2TAS], par[P.VA_MAX] * par[P.EAS2TAS]
+    d_spe, d_ske = G * (ctl[S.H_DEM] - h), 0.5 * ctl[S.V_DEM] ** 2 - ske
+    error = clip(d_spe, min(ske - 0.5 * high * high, 0.0), max(ske - 0.5 * low * low, 0.0)) + d_ske
+    wanted = clip(d_spe / tc + V * v_rate, idle, full)
+    rate = G * h_dot + V * (ctl[S.ACCEL] - ctl[S.ACCEL_LP])
+    ctl[S.STE_LP] += min(2.0 * dt, 1.0) * (wanted - rate - ctl[S.STE_LP])
+    _flags(ctl, par, h, phi, error, rate)
+    k = span / (tc * (full - idle))
+    drag = par[P.ROLL_TO_THR] * (1.0 / clip(cos(phi) ** 2, 0.1, 1.0) - 1.0)
+    feed = par[P.THR_TRIM] + (wanted + drag) / (full - idle) * span
+    thr = (error + par[P.THR_DAMP] * ctl[S.STE_LP]) * k + feed
+    room = 0.5 * span
+    ceiling, floor = clip(par[P.THR_MAX] - thr + 0.1, -room, room), clip(par[P.THR_MIN] - thr - 0.1, -room, room)
+    ctl[S.I_THR] = clip(ctl[S.I_THR] + error * par[P.INTEG] * k * dt, floor, ceiling)
+    return _slew(ctl, par, thr, dt)
+
+
+@kernel
+def _slew(ctl: np.ndarray, par: np.ndarray, thr: float, dt: float) -> float:
+    """Slew-limit the throttle, add its integrator, note saturation, limit."""
+    step = par[P.THR_SLEW] * (par[P.THR_MAX] - par[P.THR_MIN]) * dt
+    ctl[S.THR] = clip(thr, ctl[S.THR] - step, ctl[S.THR] + step) if step > 0.0 else thr
+    thr = ctl[S.THR] + ctl[S.I_THR]
+    if ctl[S.SLOW] > 0.0:
+        thr = par[P.THR_MAX]
+    ctl[S.THR_SAT] = 1.0 if thr > par[P.THR_MAX] else (-1.0 if thr < par[P.THR_MIN] else 0.0)
+    return clip(thr, par[P.THR_MIN], par[P.THR_MAX])
+
+
+@kernel
+def _throttle_blind(ctl: np.ndarray, par: np.ndarray, phi: float, dt: float) -> float:
+    """Set the throttle from the pitch demand, without an airspeed sensor."""
+    low, high = pitch_limits(par)
+    idle, full = energy_rates(ctl, par)
+    if ctl[S.THETA] > 0.0:
+        thr = par[P.THR_TRIM] + (par[P.THR_MAX] - par[P.THR_TRIM]) * ctl[S.THETA] / high
+    else:
+        thr = par[P.THR_TRIM] + (par[P.THR_MIN] - par[P.THR_TRIM]) * ctl[S.THETA] / low
+    drag = par[P.ROLL_TO_THR] * (1.0 / clip(cos(phi) ** 2, 0.1, 1.0) - 1.0)
+    ctl[S.I_THR], ctl[S.SLOW], ctl[S.SINKING] = 0.0, 0.0, 0.0
+    return _slew(ctl, par, thr + drag / (full - idle) * (par[P.THR_MAX] - par[P.THR_MIN]), dt)
+
+
+@kernel
+def _weights(ctl: np.ndarray, par: np.ndarray, blind: bool) -> tuple[float, float]:
+    """Give the weights of height and speed in the pitch loop."""
+    weight = 0.0 if blind else (2.0 if ctl[S.SLOW] > 0.0 else clip(par[P.SPEED_WEIGHT], 0.0, 2.0))
+    return min(2.0 - weight, 1.0), min(weight, 1.0)
+
+
+@kernel
+def _pitch(ctl: np.ndarray, par: np.ndarray, h: float, h_dot: float, h_dot_c: float, blind: bool, dt: float) -> float:
+    """Close the loop on the energy balance; give the pitch demand [rad]."""
+    w_p, w_k = _weights(ctl, par, blind)
+    V, tc = ctl[S.V_HAT], par[P.TIME_CONST]
+    low, high = pitch_limits(par)
+    d_ske = 0.5 * ctl[S.V_DEM] ** 2 - 0.5 * V * V
+    free = h_dot_c * G * w_p + (G * (ctl[S.H_DEM] - h) * w_p - d_ske * w_k) / tc
+    wanted = clip(free, -par[P.SINK_MAX] * G, par[P.CLIMB_MAX] * G)
+    ctl[S.THETA_SAT] = 1.0 if free > wanted else (-1.0 if free < wanted else 0.0)
+    error = wanted - (G * h_dot * w_p - V * (ctl[S.ACCEL] - ctl[S.ACCEL_LP]) * w_k)
+    demand = wanted + par[P.PITCH_DAMP] * error
+    _integrate(ctl, par, demand, error, -d_ske * w_k, dt)
+    theta = (demand + ctl[S.I_SEB] + ctl[S.I_KE]) / (V * G)
+    if theta > high:
+        ctl[S.THETA_SAT] = 1.0
+    elif theta < low:
+        ctl[S.THETA_SAT] = -1.0
+    step = par[P.VERT_ACC] / V * dt
+    ctl[S.THETA] = clip(clip(theta, low, high), ctl[S.THETA] - step, ctl[S.THETA] + step)
+    return ctl[S.THETA]
+
+
+@kernel
+def _integrate(ctl: np.ndarray, par: np.ndarray, demand: float, error: float, excess: float, dt: float) -> None:
+    """Integrate the balance error and the speed excess; fade both while the pitch is at its limit."""
+    low, high = pitch_limits(par)
+    gain = ctl[S.V_HAT] * G
+    floor, ceiling = gain * (low - 0.0873) - demand, gain * (high + 0.0873) - demand
+    step = clip(error * par[P.INTEG] * dt, -0.1 * (ceiling - floor), 0.1 * (ceiling - floor))
+    theta = (demand + ctl[S.I_SEB] + ctl[S.I_KE] + step) / gain
+    if (theta > high and step > 0.0) or (theta < low and step < 0.0):
+        fade = par[P.TIME_CONST] / (dt + par[P.TIME_CONST])
+        ctl[S.I_SEB] *= fade
+        ctl[S.I_KE] *= fade
+    else:
+        ctl[S.I_SEB] += step
+        ctl[S.I_KE] += excess * dt / par[P.TIME_CONST]
+    room = 0.25 * (high - low) * gain
+    ctl[S.I_SEB] = clip(ctl[S.I_SEB], floor, ceiling)
+    ctl[S.I_KE] = clip(ctl[S.I_KE], -room, room)
+
+
+@kernel
+def update(
+    ctl: np.ndarray, par: np.ndarray, h_sp: float, va_c: float, h: float, h_dot: float, phi: float, blind: bool,
+    dt: float,
+) -> tuple[float, float]:
+    """Give pitch and throttle for a height and a speed; call `update_speed` first.
+
+    Args:
+        ctl, par: controller state, parameters
+        h_sp: height demand, up positive above the origin [m]
+        va_c: airspeed demand, equivalent [m/s]
+        h, h_dot: height and climb rate, up positive [m, m/s]
+        phi: roll [rad]
+        blind: no airspeed sensor
+        dt: step [s]
+    Returns:
+        theta_c [rad], delta_t 0..1
+    """
+    v_rate = _demand_speed(ctl, par, va_c, phi, dt)
+    h_dot_c = _demand_height(ctl, par, h_sp, dt)
+    delta_t = _throttle_blind(ctl, par, phi, dt) if blind else _throttle(ctl, par, h, h_dot, v_rate, phi, dt)
+    return _pitch(ctl, par, h, h_dot, h_dot_c, blind, dt), delta_t
+
+
+@kernel
+def reset(ctl: np.ndarray, par: np.ndarray, h: float, h_dot: float, Va: float, theta_c: float, delta_t: float) -> None:
+    """Begin without a bump: holding height `h` [m] and airspeed `Va` [m/s] takes `theta_c` [rad] and `delta_t`."""
+    V = max((Va if np.isfinite(Va) else par[P.VA_CRUISE]) * par[P.EAS2TAS], _SLOWEST)
+    ctl[S.V_HAT], ctl[S.V_DEM], ctl[S.V_TOP] = V, V, par[P.VA_MAX] * par[P.EAS2TAS]
+    ctl[S.H_IN], ctl[S.H_LIMITED], ctl[S.H_DEM], ctl[S.H_LAST] = h, h, h, h
+    ctl[S.UP], ctl[S.DOWN] = 1.0, 1.0
+    idle, full = energy_rates(ctl, par)
+    span = par[P.THR_MAX] - par[P.THR_MIN]
+    ctl[S.I_THR] = clip(delta_t - par[P.THR_TRIM] - h_dot * G / (full - idle) * span, -0.5 * span, 0.5 * span)
+    ctl[S.THR] = delta_t - ctl[S.I_THR]
+    ctl[S.THETA] = theta_c
+    ctl[S.I_SEB] = (theta_c - clip(h_dot / V, -1.0, 1.0)) * V * G

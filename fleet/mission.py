@@ -1,0 +1,303 @@
+"""Route: mission items as MAVLink knows them -> legs that a compiled controller reads.
+
+A leg is one row of float64; the columns are named below, the first one is a kind:
+
+    WAYPOINT         fly the line from the point before to here, then go on
+    LOITER_TURNS     circle `TURNS` times, leave towards the next leg
+    LOITER_UNLIMITED circle for good
+    LOITER_TIME      circle for `TURNS` seconds
+    LOITER_TO_ALT    circle until the altitude is reached
+    TAKEOFF          climb wings level to the altitude
+    LAND             fly to the point; nothing after it is flown by itself
+
+Item 0 is home (ArduPilot). How often a DO_JUMP was already taken is not on the wire: the count starts fresh.
+Source: MAVLink mission protocol, MAV_CMD and MAV_FRAME; ArduPlane mission command list.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import hypot, isfinite
+
+import numpy as np
+
+from fleet.contract import MAX_ITEMS, Item
+from fleet.frames import Origin, to_ned
+
+WAYPOINT, LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT, TAKEOFF, LAND = range(7)
+KIND = 0  # one of the seven above
+P_N, P_E, P_D = 1, 2, 3  # target, or centre of the circle, NED from the route's origin [m]
+RADIUS = 4  # radius of the circle, positive clockwise; 0: the autopilot's WP_LOITER_RAD [m]
+TURNS = 5  # turns; seconds for LOITER_TIME
+VA_C = 6  # commanded airspeed; <= 0: cruise [m/s]
+ACCEPT = 7  # acceptance radius; 0: from the parameters; negative: fly past by that much [m]
+SEQ = 8  # item this leg came from; -1: return to launch after the last one
+N_COLUMNS = 9
+
+NAMES = ("waypoint", "loiter turns", "loiter", "loiter time", "loiter to altitude", "takeoff", "land")
+_KINDS = {16: WAYPOINT, 17: LOITER_UNLIMITED, 18: LOITER_TURNS, 19: LOITER_TIME, 20: LOITER_UNLIMITED}
+_KINDS |= {21: LAND, 22: TAKEOFF, 31: LOITER_TO_ALT, 82: WAYPOINT, 84: TAKEOFF, 85: LAND}
+_RETURN, _LAST_NAV, _JUMP, _SPEED = 20, 95, 177, 178  # MAV_CMD: RETURN_TO_LAUNCH, NAV_LAST, DO_JUMP, DO_CHANGE_SPEED
+_ABSOLUTE, _RELATIVE, _TERRAIN = (0, 5), (3, 6), (10, 11)  # MAV_FRAME
+_SHORTEST = 1.0  # a line shorter than this has no direction worth flying [m]
+_HIGHEST = 1e5  # altitudes beyond are noise [m]
+_RTL_ALTITUDE = 100.0  # ArduPlane's default RTL_ALTITUDE [m]
+
+
+@dataclass(frozen=True)
+class Route:
+    """Where an aircraft is going, leg by leg."""
+
+    origin: Origin
+    legs: np.ndarray  # (n, 9) float64, columns above, NED [m]
+    start: np.ndarray  # (3,) the navigation point before legs[0], NED [m]; nan: begin where the aircraft is
+    sentences: tuple[str, ...] = ()  # what was wrong with the mission, and what was made of it
+
+    def __str__(self) -> str:
+        kinds = Counter(NAMES[int(kind)] for kind in self.legs[:, KIND])
+        what = ", ".join(f"{n} {name}" for name, n in kinds.items()) or "nothing to fly"
+        first = f" from item {int(self.legs[0, SEQ])}" if len(self.legs) else ""
+        return f"route of {len(self.legs)} legs{first}: {what}; {len(self.sentences)} remarks"
+
+
+@dataclass
+class _Walk:
+    """A walk through the items: what is in force, what was found."""
+
+    items: dict[int, Item]
+    last: int  # highest sequence number
+    origin: Origin
+    params: Mapping[str, float]
+    home: np.ndarray  # (3,) NED [m]
+    point: np.ndarray  # (3,) the navigation point last passed, NED [m]
+    kind: int = TAKEOFF  # of the leg that ended there; home is no point to start a line from
+    speed: float = 0.0  # commanded airspeed; 0: cruise [m/s]
+    left: dict[int, float] = field(default_factory=dict)  # jumps left at each DO_JUMP
+    taken: set[int] = field(default_factory=set)  # jumps taken since the last leg
+    legs: list[np.ndarray] = field(default_factory=list)
+    sentences: dict[str, None] = field(default_factory=dict)  # an ordered set
+
+    def say(self, sentence: str) -> None:
+        """Remember a sentence once."""
+        self.sentences.setdefault(sentence)
+
+
+def route(items: Sequence[Item], *, seq: int, origin: Origin, params: Mapping[str, float], limit: int = 64) -> Route:
+    """Unroll the legs from item `seq` on: jumps, speeds and altitude frames resolved. Never raises on a bad mission.
+
+    Args:
+        items: mission as downloaded, in any order; item 0 is home
+        seq: item in force
+        origin: where the NED frame of the legs touches the earth
+        params: autopilot parameters, for RTL_ALTITUDE, RTL_RADIUS and WP_LOITER_RAD
+        limit: most legs to unroll
+    Returns:
+        legs, the point before them, and one sentence for everything that was wrong
+    """
+    walk = _begin(items, origin, params)
+    at = _arrive(walk, _first(walk, seq))
+    # after a circle or a takeoff ArduPlane begins the line where the aircraft is
+    start = walk.point.copy() if walk.kind in (WAYPOINT, LAND) else np.full(3, np.nan)
+    walk.legs = []
+    if walk.last >= 1:
+        _unroll(walk, at, limit)
+    legs = np.array(walk.legs[:limit]) if walk.legs[:limit] else np.empty((0, N_COLUMNS))
+    return Route(origin, legs, start, tuple(walk.sentences))
+
+
+def _begin(items: Sequence[Item], origin: Origin, params: Mapping[str, float]) -> _Walk:
+    kept = {item.seq: item for item in items if 0 <= item.seq < MAX_ITEMS}
+    walk = _Walk(kept, max(kept, default=0), origin, params, np.zeros(3), np.zeros(3))
+    if any(not 0 <= item.seq < MAX_ITEMS for item in items):
+        walk.say(f"mission: found {len(items)} items, expected at most {MAX_ITEMS}; kept the first, shorten it")
+    if walk.last < 1:
+        walk.say(f"mission: found {len(items)} items, expected home and one more; nothing to fly, upload a mission")
+        return walk
+    lost = walk.last + 1 - len(kept)
+    if lost:
+        walk.say(f"mission: found {len(kept)} of {walk.last + 1} items; skipped {lost}, download the mission again")
+    walk.home = walk.point = _home(walk)
+    return walk
+
+
+def _home(walk: _Walk) -> np.ndarray:
+    item = walk.items.get(0)
+    if item is None or _fault(item) or _nowhere(item):
+        walk.say("mission item 0: found no usable position, expected home; took the origin, set home and upload again")
+        return np.zeros(3)
+    return _ned(walk.origin, item, item.alt_m)
+
+
+def _ned(origin: Origin, item: Item, altitude: float) -> np.ndarray:
+    return to_ned(origin, np.array([item.lat_e7]), np.array([item.lon_e7]), np.array([altitude * 1e3]))[0]
+
+
+def _fault(item: Item) -> str:
+    """Say what is wrong with a position, or nothing; nan fails every comparison."""
+    if not abs(item.lat_e7) <= 9e8:
+        return f"latitude {item.lat_e7} (1e-7 deg), expected within 90 deg"
+    if not abs(item.lon_e7) <= 1.8e9:
+        return f"longitude {item.lon_e7} (1e-7 deg), expected within 180 deg"
+    if not abs(item.alt_m) <= _HIGHEST:
+        return f"altitude {item.alt_m}, expected within {_HIGHEST:.0f} m"
+    if item.frame not in _ABSOLUTE + _RELATIVE + _TERRAIN:
+        return f"frame {item.frame}, expected one of {_ABSOLUTE + _RELATIVE + _TERRAIN}"
+    return ""
+
+
+def _nowhere(item: Item) -> bool:
+    return item.lat_e7 == 0 and item.lon_e7 == 0
+
+
+def _number(value: float, otherwise: float = 0.0) -> float:
+    return value if isfinite(value) else otherwise
+
+
+def _first(walk: _Walk, seq: int) -> int:
+    if walk.last >= 1 and not 0 <= seq <= walk.last:
+        walk.say(f"mission: found item in force {seq}, expected 0..{walk.last}; began at 1, ask for MISSION_CURRENT")
+        return 1
+    return max(seq, 1)
+
+
+def _arrive(walk: _Walk, seq: int) -> int:
+    """Walk the shortest way to `seq`, to learn the speed in force, the point before and the jumps used up."""
+    at = 1
+    while at < seq:
+        item = walk.items.get(at)
+        if item is not None and item.command == _JUMP:
+            target = _target(walk, item)
+            count = _number(item.param2)
+            if at < target <= seq and count != 0:
+                walk.left[at] = count - 1 if count > 0 else count
+                at = target
+                continue
+            if count > 0:
+                walk.left[at] = 0.0  # the aircraft came past it
+        elif item is not None:
+            _visit(walk, item)
+        at += 1
+    return at
+
+
+def _unroll(walk: _Walk, at: int, limit: int) -> None:
+    """Walk on from item `at` and keep the legs; after the last item comes return to launch."""
+    while at <= walk.last and len(walk.legs) < limit:
+        item = walk.items.get(at)
+        jump = item is not None and item.command == _JUMP
+        if item is not None and not jump:
+            _visit(walk, item)
+        at = _jump(walk, item) if item is not None and jump else at + 1
+    if len(walk.legs) < limit and not _ends(walk):
+        walk.legs.append(_return(walk))
+
+
+def _ends(walk: _Walk) -> bool:
+    """Tell whether the last leg is one that nothing follows by itself."""
+    return bool(walk.legs) and int(walk.legs[-1][KIND]) in (LAND, LOITER_UNLIMITED)
+
+
+def _target(walk: _Walk, item: Item) -> int:
+    """Read where a DO_JUMP goes; 0 when it goes nowhere."""
+    if 1 <= item.param1 <= walk.last:
+        return int(item.param1)
+    walk.say(f"mission item {item.seq}: found jump to {item.param1}, expected 1..{walk.last}; skipped, upload again")
+    return 0
+
+
+def _jump(walk: _Walk, item: Item) -> int:
+    """Take a DO_JUMP while it has jumps left, and give the next sequence number."""
+    target = _target(walk, item)
+    left = walk.left.get(item.seq, _number(item.param2))
+    if target == 0 or left == 0:
+        return item.seq + 1
+    if item.seq in walk.taken:
+        walk.say(f"mission item {item.seq}: found a jump circle without a leg to fly; left it, put a waypoint inside")
+        return item.seq + 1
+    walk.taken.add(item.seq)
+    walk.left[item.seq] = left - 1 if left > 0 else left
+    return target
+
+
+def _visit(walk: _Walk, item: Item) -> None:
+    """Let one item other than DO_JUMP act: change the speed, add a leg, or say why not."""
+    if item.command == _SPEED:
+        _change_speed(walk, item)
+    elif item.command in _KINDS:
+        _add(walk, item)
+    elif item.command < _LAST_NAV:
+        walk.say(f"mission item {item.seq}: found command {item.command}, no leg of ours; skipped, use another item")
+
+
+def _change_speed(walk: _Walk, item: Item) -> None:
+    if item.param2 == -2:  # MAVLink: back to the default
+        walk.speed = 0.0
+    if not (isfinite(item.param2) and item.param2 > 0):
+        return
+    walk.speed = item.param2
+    if item.param1 == 1:
+        walk.say(f"mission item {item.seq}: found a ground speed, expected an airspeed; took it as one, set type 0")
+
+
+def _add(walk: _Walk, item: Item) -> None:
+    """Add the leg of a navigation item, unless it cannot or need not be flown."""
+    if item.command == _RETURN:
+        walk.legs.append(_return(walk))
+        walk.legs[-1][SEQ] = item.seq
+        walk.point, walk.kind = walk.legs[-1][P_N : P_D + 1], LOITER_UNLIMITED
+        walk.taken.clear()
+        return
+    fault = _fault(item)
+    if fault:
+        walk.say(f"mission item {item.seq}: found {fault}; skipped, upload a corrected mission")
+        return
+    kind = _KINDS[item.command]
+    target = _point(walk, item)
+    near = hypot(*(target - walk.point)[:2]) < _SHORTEST
+    if near and kind == WAYPOINT == walk.kind and (walk.legs or not _nowhere(item)):
+        walk.say(f"mission item {item.seq}: found a leg of zero length, expected {_SHORTEST:.0f} m; skipped, remove it")
+        return
+    walk.legs.append(_leg(walk, item, kind, target))
+    walk.point, walk.kind = target, kind
+    walk.taken.clear()
+
+
+def _point(walk: _Walk, item: Item) -> np.ndarray:
+    """Place an item, NED (3,) [m]; zero latitude and longitude mean here."""
+    if item.frame in _TERRAIN:
+        walk.say(f"mission item {item.seq}: found altitude over terrain; took it over home, give it relative to home")
+    absolute = item.frame in _ABSOLUTE
+    altitude = item.alt_m + (0.0 if absolute else walk.origin.alt_mm * 1e-3 - walk.home[2])
+    point = _ned(walk.origin, item, altitude)
+    if _nowhere(item):
+        point[:2] = walk.point[:2]
+    return point
+
+
+def _leg(walk: _Walk, item: Item, kind: int, target: np.ndarray) -> np.ndarray:
+    leg = np.zeros(N_COLUMNS)
+    leg[KIND], leg[P_N : P_D + 1], leg[VA_C], leg[SEQ] = kind, target, walk.speed, item.seq
+    if kind == WAYPOINT:
+        past = _number(item.param3)
+        leg[ACCEPT] = -past if past > 0 else max(_number(item.param2), 0.0)
+    elif kind in (LOITER_TURNS, LOITER_TIME):
+        leg[TURNS] = max(_number(item.param1), 0.0)
+    if kind in (LOITER_TURNS, LOITER_UNLIMITED):
+        leg[RADIUS] = _number(item.param3)
+    elif kind == LOITER_TO_ALT:
+        leg[RADIUS] = _number(item.param2)
+    elif kind == LOITER_TIME and _number(item.param3) < 0:  # ArduPlane reads the direction only
+        leg[RADIUS] = -abs(_number(walk.params.get("WP_LOITER_RAD", 60.0), 60.0))
+    return leg
+
+
+def _return(walk: _Walk) -> np.ndarray:
+    """Make the leg that ArduPlane flies after the last item: circle over home at RTL_ALTITUDE."""
+    leg = np.zeros(N_COLUMNS)
+    height = walk.params.get("RTL_ALTITUDE", walk.params.get("ALT_HOLD_RTL", 100.0 * _RTL_ALTITUDE) / 100.0)
+    height = _number(height, _RTL_ALTITUDE)
+    leg[KIND], leg[SEQ] = LOITER_UNLIMITED, -1
+    leg[P_N : P_D + 1] = walk.home
+    leg[P_D] = walk.home[2] - height if height >= 0 else walk.point[2]  # negative: stay at this altitude
+    leg[RADIUS] = _number(walk.params.get("RTL_RADIUS", 0.0))
+    return leg
