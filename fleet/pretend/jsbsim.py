@@ -34,14 +34,15 @@ SPREAD = {  # standard deviation of each factor vary/* between aircraft of one t
 OFFSETS = {"C_l_0": 0.001, "C_m_0": 0.004, "C_n_0": 0.0004}  # what building by hand leaves askew [-]
 PAYLOAD_KG = (0.5, 2.5)  # on 9.5 kg empty
 _KG_TO_LB = 2.2046226218
+_SLUG_FT3 = 515.378819  # [kg/m3]
 _READ = (
-    "position/lat-geod-rad position/long-gc-rad position/geod-alt-ft "
-    "velocities/v-north-fps velocities/v-east-fps velocities/v-down-fps "
-    "attitude/phi-rad attitude/theta-rad attitude/psi-rad "
-    "velocities/p-rad_sec velocities/q-rad_sec velocities/r-rad_sec "
-    "accelerations/a-pilot-x-ft_sec2 accelerations/a-pilot-y-ft_sec2 accelerations/a-pilot-z-ft_sec2 "
-    "velocities/vt-fps aero/alpha-rad aero/beta-rad"
-).split()
+    *("position/lat-geod-rad", "position/long-gc-rad", "position/geod-alt-ft"),
+    *("velocities/v-north-fps", "velocities/v-east-fps", "velocities/v-down-fps"),
+    *("attitude/phi-rad", "attitude/theta-rad", "attitude/psi-rad"),
+    *("velocities/p-rad_sec", "velocities/q-rad_sec", "velocities/r-rad_sec"),
+    *("accelerations/a-pilot-x-ft_sec2", "accelerations/a-pilot-y-ft_sec2", "accelerations/a-pilot-z-ft_sec2"),
+    *("velocities/vt-fps", "aero/alpha-rad", "aero/beta-rad", "atmosphere/rho-slugs_ft3"),
+)
 _SURFACES = ("fcs/aileron-cmd-norm", "fcs/elevator-cmd-norm", "fcs/rudder-cmd-norm", "fcs/motor-cmd-norm")
 
 
@@ -56,6 +57,7 @@ class Truth(NamedTuple):
     Va: float  # true airspeed [m/s]
     alpha: float  # [rad]
     beta: float  # [rad]
+    rho: float  # air density [kg/m3]
 
 
 class Aircraft:
@@ -75,8 +77,8 @@ class Aircraft:
         self._nodes = {name: self._fdm.get_property_manager().get_node(name) for name in (*_READ, *_SURFACES)}
         self._read = [self._nodes[name].get_double_value for name in _READ]
         self._origin = origin
-        north = to_ned(origin, origin.lat_e7 + 10_000, origin.lon_e7, origin.alt_mm)[0]
-        east = to_ned(origin, origin.lat_e7, origin.lon_e7 + 10_000, origin.alt_mm)[1]
+        corner = np.array([[origin.lat_e7 + 10_000, origin.lon_e7 + 10_000, origin.alt_mm]])  # to_ned is linear
+        north, east, _ = to_ned(origin, *corner.T)[0]
         self._per_rad = north / np.radians(1e-3), east / np.radians(1e-3)  # [m/rad]
         self._vary(np.random.default_rng((seed, 1)))
         self._turbulence = turbulence
@@ -169,7 +171,8 @@ class Aircraft:
                 origin.alt_mm * 1e-3 - x[2] * FT,
             ]
         )
-        return Truth(p, x[3:6] * FT, x[6:9], x[9:12], x[12:15] * FT, float(x[15] * FT), float(x[16]), float(x[17]))
+        air = float(x[15] * FT), float(x[16]), float(x[17]), float(x[18] * _SLUG_FT3)
+        return Truth(p, x[3:6] * FT, x[6:9], x[9:12], x[12:15] * FT, *air)
 
     def __getitem__(self, name: str) -> float:
         """Read any JSBSim property by its own name, in its own unit."""

@@ -6,7 +6,7 @@ bias; airspeed has a scale error of 2 % and 0.25 m/s of noise. The autopilot fli
 Source: orders of magnitude of EKF innovations in ArduPlane flight logs; Beard & McLain (2012) ch. 7 for the sensors.
 """
 
-from math import radians
+from math import radians, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -27,18 +27,19 @@ _ERRORS = (
     ("accel_bias", 0.04, 300.0, 3),  # [m/s2]
     ("airspeed", 0.25, 0.3, 1),  # [m/s]
 )
-AIRSPEED_SCALE = 0.02
+AIRSPEED_SCALE = 0.02  # standard deviation of the pitot tube's scale error [-]
+SEA_LEVEL_RHO = 1.225  # [kg/m3]
 
 
 class Estimate(NamedTuple):
-    """What the autopilot believes; same frames and units as `Truth`."""
+    """What the autopilot believes; frames and units as in `Truth`, except the airspeed."""
 
     p: np.ndarray
     v: np.ndarray
     euler: np.ndarray
     rates: np.ndarray
     force: np.ndarray
-    Va: float
+    Va: float  # equivalent airspeed, as a pitot tube feels it: Va_true sqrt(rho / 1.225) [m/s]
 
 
 class Sensors:
@@ -60,7 +61,7 @@ class Sensors:
             truth.euler + e[9:12] + e[12:15],
             truth.rates + e[15:18] + e[18:21],
             truth.force + e[21:24] + e[24:27],
-            float(truth.Va * self.airspeed_scale + e[27]),
+            float(truth.Va * sqrt(truth.rho / SEA_LEVEL_RHO) * self.airspeed_scale + e[27]),
         )
 
 

@@ -6,6 +6,8 @@ import numpy as np
 
 from fleet import mission as legs_of
 from fleet.autopilots import arduplane
+from fleet.autopilots.arduplane import state as memory
+from fleet.autopilots.arduplane.legs import height_demand
 from fleet.frames import G, Origin, to_geodetic
 from fleet.pretend.jsbsim import CRUISE, Aircraft
 from fleet.pretend.mavlink import MOST_AIRCRAFT, TICK_HZ, Flight, Ground, Voice
@@ -36,9 +38,8 @@ class PretendUav:
             ValueError: when MAVLink has no system id for it.
         """
         if not 0 <= uav_id < MOST_AIRCRAFT:
-            raise ValueError(
-                f"uav-{uav_id}: found id {uav_id}, expected 0..{MOST_AIRCRAFT - 1} (MAVLink system ids); fly fewer aircraft"
-            )
+            most = MOST_AIRCRAFT - 1
+            raise ValueError(f"uav-{uav_id}: found id {uav_id}, expected 0..{most} (MAVLink ids); fly fewer aircraft")
         own = int(np.random.SeedSequence((seed, uav_id)).generate_state(1)[0])
         rng = np.random.default_rng((own, 4))
         self.uav_id, self.origin = uav_id, origin
@@ -111,18 +112,16 @@ class PretendUav:
             )
             if self._ctl[arduplane.LEG] >= len(self._legs) - 2:
                 self._renew()
-        surfaces = arduplane.stabilise(
+        delta_a, delta_e, delta_r = arduplane.stabilise(
             self._ctl, self._par, self._phi_c, self._theta_c, e.euler, e.rates, e.Va, DT * _INNER
         )
-        self.pulses = Servos.pulses(*surfaces, self._delta_t)
+        self.pulses = Servos.pulses(delta_a, delta_e, delta_r, self._delta_t)
         self.aircraft.drive(*Servos.commands(self.pulses))
 
     def _renew(self) -> None:
         """Unroll the endless mission further, without disturbing the autopilot's memory."""
         seq = int(self.leg[legs_of.SEQ])
-        self._legs = legs_of.route(
-            self.items, seq=seq, origin=self.origin, params=self.params, limit=_LEGS_AHEAD
-        ).legs
+        self._legs = legs_of.route(self.items, seq=seq, origin=self.origin, params=self.params, limit=_LEGS_AHEAD).legs
         self._ctl[arduplane.LEG] = 0
 
     def _flight(self) -> Flight:
@@ -140,7 +139,7 @@ class PretendUav:
             phi_c=self._phi_c,
             theta_c=self._theta_c,
             target=(float(target[0]), float(target[1])),
-            alt_error=float(-target[2]),
+            alt_error=float(height_demand(self._ctl, self._par, self._legs, e.p) + e.p[2]),
             Va_error=float(commanded - e.Va),
             xtrack_error=self._xtrack(),
             seq=int(leg[legs_of.SEQ]),
@@ -154,6 +153,6 @@ class PretendUav:
         if leg[legs_of.KIND] != legs_of.WAYPOINT:
             radius = abs(leg[legs_of.RADIUS]) or self.params["WP_LOITER_RAD"]
             return float(np.hypot(*(e.p[:2] - centre)) - radius)
-        a = ctl[[arduplane.PREV_N, arduplane.PREV_E]]
+        a = ctl[[memory.PREV_N, memory.PREV_E]]
         line, way = centre - a, e.p[:2] - a
         return float((line[0] * way[1] - line[1] * way[0]) / max(np.hypot(*line), 1e-3))

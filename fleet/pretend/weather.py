@@ -69,7 +69,7 @@ def turbulence_level(text: str) -> int:
     words = {"none": 0, "light": 3, "moderate": 4, "severe": 6}
     level = words.get(text, int(text) if text.isdecimal() else -1)
     if not 0 <= level <= 7:
-        raise ValueError(f"turbulence: found {text!r}, expected 0..7, none, light, moderate or severe; write one of them")
+        raise ValueError(f"turbulence: found {text!r}, expected 0..7 or none, light, moderate, severe; choose one")
     return level
 
 
