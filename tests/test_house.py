@@ -25,6 +25,7 @@ ROOMS = (  # inside fleet a room imports only from rooms above it, and from itse
     ("telemetry",),
     ("pretend",),
     ("config",),
+    ("children",),
     ("cli", "commands"),
 )
 RANK = {f"fleet.{name}": rank for rank, names in enumerate(ROOMS) for name in names}

@@ -1,0 +1,160 @@
+"""One example of every message, with fixed values; a new class in the contract adds its own here."""
+
+import numpy as np
+
+from fleet.contract import (
+    COLUMNS,
+    Account,
+    Alert,
+    AlertKind,
+    Array,
+    FleetRow,
+    FleetState,
+    Item,
+    Linear,
+    Link,
+    Mismatch,
+    Mission,
+    Model,
+    Outcome,
+    Params,
+    Prediction,
+    Rows,
+    Sample,
+    State,
+    Status,
+    Verdict,
+)
+
+UAV, T = 7, 1_700_000_000.25
+
+
+def _rows(name: str) -> Rows:
+    k = len(COLUMNS[name])
+    dtype = "<i4" if name == "position" else "<f4"
+    return Rows(t=Array.of([T - 0.1, T], "<f8"), x=Array.of(np.arange(2 * k).reshape(2, k) * 0.5, dtype))
+
+
+def _linear(states: tuple[str, ...], inputs: tuple[str, ...]) -> Linear:
+    n, m = len(states), len(inputs)
+    return Linear(
+        states=states,
+        inputs=inputs,
+        A=Array.of(np.eye(n) * 0.5, "<f8"),
+        B=Array.of(np.ones((n, m)), "<f8"),
+        C=Array.of(np.eye(n), "<f8"),
+        D=Array.of(np.zeros((n, m)), "<f8"),
+        x_trim=Array.of(np.arange(n), "<f8"),
+        u_trim=Array.of(np.arange(m), "<f8"),
+        dt_s=0.04,
+    )
+
+
+VERDICT = Verdict(
+    outcome=Outcome.VERIFIED,
+    sentence="fit 93 % over 4 s",
+    fit={"u": 91.0, "q": 95.0},
+    fit_hold={"u": 50.0, "q": 10.0},
+    horizon_s=4.0,
+    threshold=90.0,
+    tries=2,
+)
+ITEM = Item(
+    seq=1, command=16, frame=3, param1=5.0, param2=60.0, param3=1.0, param4=0.5, lat_e7=1, lon_e7=2, alt_m=100.0
+)
+ROW = FleetRow(
+    uav=UAV,
+    state=State.PREDICTING,
+    verdict=VERDICT.sentence,
+    fit=VERDICT.fit,
+    horizon_s=20.0,
+    worker="00000000000000ff",
+    sample_age_s=0.1,
+    prediction_age_s=0.5,
+    t10_s=18.0,
+    t10_censored=0.25,
+    t10_n=4,
+    epoch=1_700_000_000_000,
+)
+
+MESSAGES = (
+    Sample(uav=UAV, t=T, **{name: _rows(name) for name in COLUMNS}),
+    Status(
+        uav=UAV,
+        t=T,
+        link=Link.LOST,
+        mode="AUTO",
+        armed=True,
+        autopilot="ardupilot",
+        vehicle="fixed_wing",
+        rates_hz={"ATTITUDE": 25.0},
+        received=100,
+        missed=3,
+        rejected=1,
+        clock_offset_s=12.5,
+        clock_jumps=1,
+        sentence="link lost 3 s ago",
+    ),
+    Mission(uav=UAV, t=T, items=(ITEM,), seq=1, complete=True, sentence="fine"),
+    Params(uav=UAV, t=T, values={"NAVL1_PERIOD": 17.0}, complete=True, sentence="fine"),
+    Model(
+        uav=UAV,
+        t=T,
+        method="paper",
+        verdict=VERDICT,
+        longitudinal=_linear(("u", "w", "q", "theta"), ("delta_e", "delta_t")),
+        lateral=_linear(("phi", "psi", "p", "r", "v"), ("delta_a", "delta_r")),
+        window_t0=T - 20.0,
+        window_s=20.0,
+        interpolated=0.05,
+        wind_n=3.0,
+        wind_e=-1.0,
+    ),
+    Prediction(
+        uav=UAV,
+        t=T,
+        state=State.PREDICTING,
+        method="paper",
+        law="arduplane: L1 + TECS",
+        origin=(-353632620, 1491652370, 584000),
+        ahead=Array.of([0.0, 1.0, 2.0]),
+        path=Array.of(np.arange(9).reshape(3, 3)),
+        tube=Array.of(np.full((3, 3), 2.0)),
+        quantile=0.9,
+        horizon_s=2.0,
+        horizon_open=True,
+        held=0.875,
+        held_n=8,
+        coast_s=0.5,
+        seq=3,
+        sentence="as far as the mission goes",
+    ),
+    Mismatch(
+        uav=UAV,
+        t=T,
+        name="drag",
+        rivals=("thrust",),
+        segments=((T - 10.0, T - 5.0),),
+        parameters={"C_D_0": 0.02},
+        sigma={"C_D_0": 0.001},
+        fit_before=60.0,
+        fit_after=92.0,
+        sentence="drag grew",
+    ),
+    Alert(uav=UAV, t=T, kind=AlertKind.CONFLICT, active=True, sentence="uav 8 in 12 s"),
+    FleetState(t=T, rows=(ROW,), sentence="compiling the twin's physics, once"),
+    Account(
+        t=T,
+        links=("udpin:0.0.0.0:14550",),
+        uavs=(UAV,),
+        datagrams=10,
+        bytes_in=1000,
+        messages=20,
+        bad_bytes=3,
+        bad_frames=2,
+        refused={"stale": 1},
+        published=15,
+        sentence="fine",
+    ),
+)
+EXAMPLES = {type(message): message for message in MESSAGES}
