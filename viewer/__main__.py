@@ -1,0 +1,55 @@
+"""The `viewer` command: serve the operator's page."""
+
+import argparse
+import sys
+
+from fleet.bus import ROUTER, connect
+from fleet.cli import guarded, parser_for, stop_on_signal
+from viewer.app import App, quiet, serve
+
+EXAMPLES = """
+  viewer
+  viewer --port 8081 --light
+  viewer --router tcp/10.0.0.5:7447
+"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run `viewer`."""
+    parser = parser_for("viewer", "Show the fleet in a browser: flown, predicted, and how far to trust it.", EXAMPLES)
+    parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080)")
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address to serve on (default 127.0.0.1: this machine only; there is no password, so put an authenticating "
+        "reverse proxy before anything wider)",
+    )
+    parser.add_argument("--router", default=ROUTER, help=f"Zenoh router to join (default {ROUTER})")
+    parser.add_argument("--light", action="store_true", help="light colours, for bright surroundings")
+    return guarded("viewer", run, parser.parse_args(argv))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until Ctrl-C or SIGTERM.
+
+    Raises:
+        ValueError: when the port is no port.
+        OSError: when the port is taken or nobody answers at the router.
+    """
+    if not 0 < args.port < 65536:
+        raise ValueError(f"--port: found {args.port}, expected 1 to 65535; name another")
+    stop = stop_on_signal()
+    with connect(args.router) as bus:
+        server = serve(args.host, args.port)
+        try:
+            app = App(bus, server, light=args.light)
+            print(f"viewer: http://{args.host}:{args.port}", flush=True)
+            app.run(stop)
+        finally:
+            with quiet():
+                server.stop()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,164 @@
+"""The page: one server, one render thread, one selection."""
+
+import contextlib
+import io
+import threading
+import time
+
+import numpy as np
+import viser
+from viser import _messages
+
+from fleet.bus import Bus
+from viewer.camera import Cameras
+from viewer.feed import Feed
+from viewer.palette import DARK, LIGHT
+from viewer.panels import Panels
+from viewer.place import UNIT_M, Place
+from viewer.routes import home_alt_m, route
+from viewer.scene import Scene
+from viewer.selected import Selection
+from viewer.vehicle import Vehicle
+
+TICK_S = 0.1
+SLOW_S = 10.0  # how often what is missing is asked for again
+
+
+def serve(host: str, port: int) -> viser.ViserServer:
+    """Open the web server on exactly this port, without the public share tunnel.
+
+    Raises:
+        OSError: when the port is taken; viser itself would silently take the next one.
+    """
+    with quiet():
+        server = viser.ViserServer(host=host, port=port, verbose=False)
+    for share in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
+        server._websock_server.unregister_handler(share)
+    if server.get_port() != port:
+        with quiet():
+            server.stop()
+        raise OSError(f"--port: found {port} taken by another program, expected a free one; stop it or name another")
+    return server
+
+
+def quiet() -> contextlib.redirect_stdout:
+    """Keep the library's own banner off our output."""
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+class App:
+    """Draws what the feed knows: vehicles ten times a second, the rest more slowly."""
+
+    def __init__(self, bus: Bus, server: viser.ViserServer, *, light: bool = False) -> None:
+        palette = LIGHT if light else DARK
+        self.feed, self._server = Feed(bus), server
+        self.scene, self.selection = Scene(server, palette), Selection(server, palette)
+        self.panels = Panels(server, palette, self.choose)
+        self.cameras = Cameras(server)
+        self.scene.on_click(self.choose)
+        self.selected: int | None = None
+        self._dirty = threading.Event()
+        self._seen: tuple = ()
+        self._followed: np.ndarray | None = None
+
+    def choose(self, uav: int) -> None:
+        """Select a UAV; the next tick shows it."""
+        if uav in self.feed.vehicles:
+            self.selected = uav
+            self._dirty.set()
+
+    def run(self, stop: threading.Event) -> None:
+        """Draw until told to stop."""
+        asker = threading.Thread(target=self._ask, args=(stop,), name="viewer-ask", daemon=True)
+        asker.start()
+        tick, due = 0, time.monotonic()
+        while not stop.is_set():
+            with self._server.atomic():
+                self.tick(tick)
+            tick, due = tick + 1, due + TICK_S
+            if (late := time.monotonic() - due) > TICK_S:
+                due += late
+            stop.wait(max(due - time.monotonic(), 0.0))
+        asker.join(timeout=5)
+
+    def _ask(self, stop: threading.Event) -> None:
+        """Ask for what was said before we came, and again while something is missing."""
+        while not stop.is_set():
+            if any(v.mission is None or v.model is None for v in self.feed.all()) or not self.feed.vehicles:
+                with contextlib.suppress(OSError, RuntimeError):
+                    self.feed.catch_up()
+            stop.wait(SLOW_S)
+
+    def tick(self, tick: int) -> None:
+        """Draw what is due at this tick; selection changes are drawn at once."""
+        now, fleet = time.monotonic(), self.feed.all()
+        changed = self._dirty.is_set()
+        self._dirty.clear()
+        if self.selected is None and (known := [v for v in fleet if v.forecast is not None]):
+            self.selected, changed = known[0].uav, True
+        if tick % 10 == 0 or changed:
+            self.panels.draw(fleet, self.feed, now, self.selected)
+        if not fleet or self.feed.place is None:
+            return
+        self.scene.vehicles(fleet, now, self.selected)
+        if tick % 10 == 0 or changed:
+            self._slowly(fleet, now, self.feed.place)
+        if tick % (2 if len(fleet) <= 300 else 10) == 0:
+            where = {vehicle.uav: vehicle.at for vehicle in fleet}
+            self.scene.heads([where[uav] for uav in self.scene.uavs])
+            if self.panels.stems.value:
+                self.scene.draw_stems(fleet, now)
+        chosen = self._chosen(fleet)
+        if chosen is not None and (tick % 2 == 0 or changed):
+            self.selection.draw(chosen, self.feed, now, ground=self.scene.ground, size=self.scene.glyph)
+        self._follow(chosen, now)
+
+    def _chosen(self, fleet: list[Vehicle]) -> Vehicle | None:
+        return next((vehicle for vehicle in fleet if vehicle.uav == self.selected), None)
+
+    def _slowly(self, fleet: list[Vehicle], now: float, place: Place) -> None:
+        """Do what is due once a second: trails, predicted paths, routes, ground, display options, camera."""
+        options, scene, chosen = self.panels, self.scene, self._chosen(fleet)
+        scene.set_ground(_ground(fleet, place))
+        scene.beat(fleet)
+        scene.draw_predicted(fleet, now, self.selected if options.tube.value else None)
+        scene.predicted.show(options.predicted.value)
+        scene.stems.show(options.stems.value)
+        for strokes in (*scene.trails, scene.head):
+            strokes.show(options.trails.value)
+        others = [v for v in fleet if v is not chosen] if options.routes.value else []
+        scene.draw_routes([route(v.mission, place, scene.ground) for v in others])
+        self.selection.tube = options.tube.value
+        own = route(chosen.mission if chosen else None, place, scene.ground)
+        self.selection.draw_route(own)
+        self._frame(fleet, now, own.points)
+
+    def _frame(self, fleet: list[Vehicle], now: float, points: np.ndarray) -> None:
+        """Frame fleet, route and prediction when something new of these appears or someone new looks."""
+        at = [place for v in fleet if (place := v.where(now)) is not None]
+        if not at:
+            return
+        told = [v.forecast.path[:: max(len(v.forecast.path) // 8, 1)] for v in fleet if v.forecast is not None]
+        seen = (len(at), len(told), bool(len(points)), tuple(self._server.get_clients()))
+        if seen == self._seen:
+            return
+        self._seen = seen
+        cloud = np.vstack([np.array(at), *told, points])
+        cloud = cloud[np.linalg.norm(cloud - np.median(cloud, axis=0), axis=1) < 20_000 / UNIT_M]
+        span = float(np.linalg.norm(np.ptp(cloud, axis=0)))
+        self.scene.glyph = self.panels.glyph.value * float(np.clip(span / 28, 1.5, 12.0))
+        self.cameras.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, self.scene.ground]]))
+
+    def _follow(self, chosen: Vehicle | None, now: float) -> None:
+        at = chosen.where(now) if chosen is not None and self.panels.follow.value else None
+        if at is not None and self._followed is not None:
+            self.cameras.follow(at - self._followed)
+        self._followed = at
+
+
+def _ground(fleet: list[Vehicle], place: Place) -> float:
+    """Guess the ground: the lowest home of a mission, else 60 m below the lowest aircraft, scene [10 m]."""
+    homes = [alt for vehicle in fleet if (alt := home_alt_m(vehicle.mission)) is not None]
+    if homes:
+        return (min(homes) - place.origin.alt_mm * 1e-3) / UNIT_M
+    return min([float(v.at[2]) for v in fleet if v.at is not None], default=0.0) - 6.0

@@ -1,0 +1,175 @@
+"""From the bus to memory: the latest of every topic per UAV, never an exception, never more than fits."""
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from fleet.bus import Bus, key
+from fleet.codec import Stamp
+from fleet.contract import Alert, AlertKind, FleetState, Mission, Model, Prediction, Sample, State, Status
+from fleet.frames import Origin
+from viewer.place import Place
+from viewer.vehicle import JUMP_S, Forecast, Vehicle, forecast
+
+MAX_VEHICLES = 2_000  # ids are written by strangers: more than this many are counted, not kept
+GIVE_UP_S = 10.0  # a writer silent for so long has lost its claim: a lower epoch (a restarted fleet) may speak
+LATE = (Status, Mission, Model, Prediction, FleetState)  # asked for at the start, so that a late viewer is complete
+
+
+class Feed:
+    """Everything heard, one `Vehicle` per UAV; written by the bus's threads, read by the render thread."""
+
+    def __init__(self, bus: Bus, clock: Callable[[], float] = time.monotonic) -> None:
+        self.vehicles: dict[int, Vehicle] = {}
+        self.place: Place | None = None
+        self.sentences: dict[int, str] = {}  # what each worker says of itself
+        self.counts: Counter[str] = Counter()
+        self.since = clock()
+        self.lock = threading.Lock()
+        self._bus, self._clock = bus, clock
+        hears: dict[type, Callable[[Any, Stamp | None, float], None]] = {
+            Sample: self._sample,
+            Status: self._keep("status"),
+            Mission: self._keep("mission"),
+            Model: self._model,
+            Prediction: self._prediction,
+            Alert: self._alert,
+            FleetState: self._fleet,
+        }
+        self._hears = hears
+        for kind in hears:
+            bus.subscribe(kind, self._guarded(kind))
+
+    @property
+    def listening(self) -> str:
+        """Name the key the first sign of life comes on."""
+        return key(Sample, "*")
+
+    def catch_up(self) -> None:
+        """Ask everyone for what was said before we listened; what is newer by now is kept."""
+        for kind in LATE:
+            hear = self._guarded(kind)
+            for message, stamp in self._bus.ask(kind):
+                hear(message, stamp)
+
+    def all(self) -> list[Vehicle]:
+        """Give the UAVs in order of their ids."""
+        with self.lock:
+            return [self.vehicles[uav] for uav in sorted(self.vehicles)]
+
+    def trail(self, vehicle: Vehicle) -> np.ndarray:
+        """Copy the flown trail: (n, 5) fleet time [s], scene ENU [10 m], Va [m/s]."""
+        with self.lock:
+            return np.array(vehicle.trail, float).reshape(-1, 5)
+
+    def past(self, vehicle: Vehicle) -> list[Forecast]:
+        """Copy the forecasts of the last minute, oldest first."""
+        with self.lock:
+            return list(vehicle.past)
+
+    def fits(self, vehicle: Vehicle) -> np.ndarray:
+        """Copy the history of fits: (n, 2) fleet time [s], mean over the states [%]."""
+        with self.lock:
+            return np.array(vehicle.fits, float).reshape(-1, 2)
+
+    def _guarded(self, kind: type) -> Callable[[Any, Stamp | None], None]:
+        """Wrap one hearer: under the lock, and a strange message is counted instead of raised."""
+
+        def hear(message: Any, stamp: Stamp | None) -> None:
+            with self.lock:
+                try:
+                    self._hears[kind](message, stamp, self._clock())
+                    self.counts[kind.__name__] += 1
+                except (ValueError, IndexError, TypeError, OverflowError):
+                    self.counts["strange"] += 1
+
+        return hear
+
+    def _vehicle(self, uav: int) -> Vehicle:
+        if uav not in self.vehicles:
+            if len(self.vehicles) >= MAX_VEHICLES or not 0 <= uav < 1_000_000:
+                raise ValueError(f"uav-{uav}: one too many, or no id; the page keeps {MAX_VEHICLES}")
+            self.vehicles[uav] = Vehicle(uav)
+        return self.vehicles[uav]
+
+    def _sample(self, sample: Sample, _: Stamp | None, now: float) -> None:
+        if self.place is None and (origin := _first_fix(sample)) is not None:
+            self.place = Place(origin)
+        if self.place is not None:
+            self._vehicle(sample.uav).hear_sample(sample, self.place, now)
+
+    def _keep(self, name: str) -> Callable[[Any, Stamp | None, float], None]:
+        def hear(message: Any, _: Stamp | None, __: float) -> None:
+            setattr(self._vehicle(message.uav), name, message)
+
+        return hear
+
+    def _believe(self, vehicle: Vehicle, epoch: int, now: float) -> bool:
+        """Tell whether a worker may speak for a UAV: not below the highest epoch that still speaks."""
+        if epoch < vehicle.epoch and now - vehicle.believed < GIVE_UP_S:
+            self.counts["outdated"] += 1
+            return False
+        vehicle.epoch, vehicle.believed = epoch, now
+        return True
+
+    def _model(self, model: Model, stamp: Stamp | None, now: float) -> None:
+        vehicle = self._vehicle(model.uav)
+        if not self._believe(vehicle, stamp.epoch if stamp else 0, now):
+            return
+        vehicle.model = model
+        fits = [fit for fit in model.verdict.fit.values() if np.isfinite(fit)]
+        if fits and np.isfinite(model.t):
+            vehicle.fits.append((model.t, float(np.clip(np.mean(fits), 0, 100))))
+
+    def _prediction(self, message: Prediction, stamp: Stamp | None, now: float) -> None:
+        vehicle = self._vehicle(message.uav)
+        if not self._believe(vehicle, stamp.epoch if stamp else 0, now):
+            return
+        if vehicle.prediction is not None and 0 < vehicle.prediction.t - message.t < JUMP_S:
+            return  # asked for or delayed, and newer is here
+        if self.place is None and message.path.shape[0]:
+            self.place = Place(_checked(Origin(*message.origin)))
+        found = forecast(message, self.place, now) if self.place is not None else None
+        vehicle.prediction, vehicle.forecast = message, found
+        if found is not None and (not vehicle.past or found.t - vehicle.past[-1].t >= 0.9):
+            vehicle.past.append(found)
+
+    def _alert(self, alert: Alert, _: Stamp | None, __: float) -> None:
+        alerts = self._vehicle(alert.uav).alerts
+        alerts.pop(alert.kind, None)
+        if alert.active:
+            alerts[alert.kind] = alert
+
+    def _fleet(self, fleet: FleetState, stamp: Stamp | None, now: float) -> None:
+        self.sentences[stamp.writer if stamp else 0] = fleet.sentence
+        for row in fleet.rows:
+            vehicle = self._vehicle(row.uav)
+            if row.state is not State.UNCLAIMED and self._believe(vehicle, row.epoch, now):
+                vehicle.row = row
+
+    def alerts(self) -> list[tuple[Vehicle, AlertKind, Alert]]:
+        """Give the alerts in force, newest first."""
+        with self.lock:
+            found = [(v, kind, alert) for v in self.vehicles.values() for kind, alert in v.alerts.items()]
+        return sorted(found, key=lambda one: -one[2].t)
+
+
+def _first_fix(sample: Sample) -> Origin | None:
+    """Read the frame's origin off the first position of a sample; None before a fix."""
+    if sample.position is None:
+        return None
+    x = sample.position.x.numpy()
+    if x.ndim != 2 or x.shape[1] < 3 or not len(x) or not np.isfinite(x[0]).all() or not x[0, :2].any():
+        return None
+    return _checked(Origin(int(x[0, 0]), int(x[0, 1]), int(x[0, 2])))
+
+
+def _checked(origin: Origin) -> Origin:
+    """Refuse an origin that is not on this earth."""
+    if abs(origin.lat_e7) > 890_000_000 or abs(origin.lon_e7) > 1_800_000_000 or abs(origin.alt_mm) > 100_000_000:
+        raise ValueError(f"origin: found {origin}, expected a place below 89 degrees and 100 km; check the sender")
+    return origin

@@ -1,0 +1,113 @@
+"""The panels: left the fleet, its alerts and what to show; right the selected UAV."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import viser
+
+from viewer.detail import Charts, about
+from viewer.feed import Feed
+from viewer.palette import WORD, Palette, triple
+from viewer.vehicle import Vehicle
+from viewer.words import alerts, empty, summary, table
+
+COMMANDS = 50  # UAVs offered in the command palette (Ctrl+K)
+
+
+class Panels:
+    """All that is not 3-D."""
+
+    def __init__(self, server: viser.ViserServer, palette: Palette, choose: Callable[[int], None]) -> None:
+        self._gui, self._palette, self._choose = server.gui, palette, choose
+        self._commands: dict[int, Any] = {}
+        self._beat = False
+        self._gui.configure_theme(
+            dark_mode=palette.dark, show_logo=False, show_share_button=False, brand_color=triple(palette.predicting)
+        )
+        self._gui.set_panel_label("ParaUAV")
+        self._gui.main_panel.dock_left()
+        self._gui.main_panel.set_width(340)
+        css = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+        self._gui.add_html(f"<style>:root{{--muted:{palette.muted}}}{css}</style>")
+        self._banner = self._gui.add_html("")
+        self._build_left()
+        self._build_right()
+
+    def _build_left(self) -> None:
+        gui, tabs = self._gui, self._gui.add_tab_group()
+        with tabs.add_tab("Fleet", viser.Icon.DRONE):
+            self._summary = gui.add_html("")
+            self._search = gui.add_text("Search", "")
+            self._show = gui.add_button_group("Show", ("All", "Alerts", "Selected"))
+            self._filter = "All"
+            self._table = gui.add_html("")
+            self._picked = gui.add_text("picked", "", visible=False)
+        with tabs.add_tab("Alerts", viser.Icon.ALERT_TRIANGLE):
+            self._alerts = gui.add_html("")
+        with tabs.add_tab("Display", viser.Icon.ADJUSTMENTS):
+            self.predicted = gui.add_checkbox("Predicted paths", True)
+            self.trails = gui.add_checkbox("Flown trails", True)
+            self.stems = gui.add_checkbox("Altitude stems", True)
+            self.tube = gui.add_checkbox("Tube of selected", True)
+            self.routes = gui.add_checkbox("Routes of all", False)
+            self.follow = gui.add_checkbox("Follow selected", False)
+            self.glyph = gui.add_slider("Aircraft size", min=0.5, max=4.0, step=0.1, initial_value=1.0)
+        self._picked.on_update(lambda _: self._pick(self._picked.value))
+        self._show.on_click(lambda _: setattr(self, "_filter", self._show.value))
+
+    def _build_right(self) -> None:
+        panel = self._gui.add_panel()
+        with panel.add_tab("Selected", viser.Icon.FOCUS_2):
+            self._about = self._gui.add_html("")
+            self._charts = Charts(self._gui, self._palette)
+        panel.dock_right()
+        panel.set_width(350)
+
+    def _pick(self, text: str) -> None:
+        """Take the id a row click wrote into the hidden input; anything but a number is somebody else's mischief."""
+        if text.isdecimal() and len(text) <= 6:
+            self._choose(int(text))
+
+    def draw(self, fleet: list[Vehicle], feed: Feed, now: float, selected: int | None) -> None:
+        """Write everything anew; call it about once a second, and when the selection changes."""
+        self._beat = not self._beat
+        self._banner.content = (
+            f'<div class="stale {"a" if self._beat else "b"}">The viewer has stopped sending: this picture is old.</div>'
+        )
+        chosen = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
+        if not fleet:
+            self._summary.content, self._table.content = empty(feed, now), ""
+        else:
+            self._summary.content = summary(fleet, feed, self._palette, now)
+            kept = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
+            self._table.content = table(kept, len(fleet), self._palette, now, self._handler(), selected)
+        self._alerts.content = alerts(feed, self._palette)
+        nobody = '<div class="uav soft">Nobody is selected: click a row or an aircraft, or press Ctrl+K.</div>'
+        self._about.content = about(chosen, self._palette, now) if chosen is not None else nobody
+        self._charts.draw(chosen, feed, now)
+        self._offer(fleet)
+
+    def _passes(self, vehicle: Vehicle, now: float, selected: int | None) -> bool:
+        if self._filter == "Alerts" and not vehicle.alerts:
+            return False
+        if self._filter == "Selected" and vehicle.uav != selected:
+            return False
+        mode = vehicle.status.mode if vehicle.status is not None else ""
+        text = f"{vehicle.name} {vehicle.uav} {WORD[vehicle.state(now)]} {mode}".lower()
+        return all(word in text for word in self._search.value.lower().split())
+
+    def _handler(self) -> str:
+        """Give the handler of a table row: it sets the hidden input, as if someone had typed the id there."""
+        return (
+            "var m=window.__viserMutable;m&&m.sendMessage({{type:'GuiUpdateMessage',uuid:'%s',updates:{{value:'{}'}}}})"
+            % self._picked._impl.uuid
+        )
+
+    def _offer(self, fleet: list[Vehicle]) -> None:
+        """Offer the first UAVs in the command palette."""
+        for vehicle in fleet[:COMMANDS]:
+            if vehicle.uav not in self._commands and len(self._commands) < COMMANDS:
+                command = self._gui.add_command(f"Select {vehicle.name}", icon=viser.Icon.DRONE)
+                command.on_trigger(lambda _, uav=vehicle.uav: self._choose(uav))
+                self._commands[vehicle.uav] = command

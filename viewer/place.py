@@ -1,0 +1,61 @@
+"""Where things are drawn: one local east-north-up frame for the whole fleet, in scene units of 10 m."""
+
+import numpy as np
+
+from fleet.frames import Origin, to_geodetic, to_ned
+
+UNIT_M = 10.0  # metres per scene unit: keeps a fleet of kilometres well inside the renderer's near and far planes
+REACH_M = 100_000.0  # farther from the origin than this the tangent plane lies, and nothing is drawn
+
+
+class Place:
+    """The common frame: its origin is the first position anyone reported."""
+
+    def __init__(self, origin: Origin) -> None:
+        self.origin = origin
+
+    def geodetic(self, lat_e7: np.ndarray, lon_e7: np.ndarray, alt_mm: np.ndarray) -> np.ndarray:
+        """Map geodetic positions, (n,) [1e-7 deg, 1e-7 deg, mm], to the scene: (n, 3) ENU [10 m].
+
+        Raises:
+            ValueError: when a position is not on this earth or farther than 100 km from the fleet; check the sender.
+        """
+        lat, lon, alt = (np.asarray(x, float) for x in (lat_e7, lon_e7, alt_mm))
+        if not all(np.isfinite(x).all() for x in (lat, lon, alt)) or (np.abs(lat) > 9e8).any():
+            raise ValueError("position: found a value that is no latitude, longitude or altitude; check the sender")
+        scene = ned_to_scene(to_ned(self.origin, lat, lon, alt))
+        if (np.abs(scene) > REACH_M / UNIT_M).any():
+            raise ValueError("position: found one more than 100 km from the fleet; open another viewer for it")
+        return scene
+
+    def local(self, origin: Origin, ned: np.ndarray) -> np.ndarray:
+        """Map NED positions relative to another origin, (n, 3) [m], to the scene: (n, 3) ENU [10 m]."""
+        ned = np.asarray(ned, float)
+        if not np.isfinite(ned).all() or (np.abs(ned) > 2 * REACH_M).any():
+            raise ValueError("path: found values that are not finite or beyond 200 km; resend")
+        if origin == self.origin:
+            return ned_to_scene(ned)
+        return self.geodetic(*to_geodetic(origin, ned).T)
+
+
+def ned_to_scene(ned: np.ndarray) -> np.ndarray:
+    """Turn NED [m] into east, north, up [10 m]: (..., 3)."""
+    return np.stack([ned[..., 1], ned[..., 0], -ned[..., 2]], axis=-1) / UNIT_M
+
+
+def scene_quat(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
+    """Turn attitudes (n,) [rad] into scene orientations (n, 4), scalar first, of a mesh that looks along +x, left +y, up +z.
+
+    In ENU with a forward-left-up body the 3-2-1 angles are yaw = pi/2 - psi, pitch = -theta, roll = phi.
+    """
+    a, b, c = (np.pi / 2 - psi) / 2, -np.asarray(theta) / 2, np.asarray(phi) / 2
+    cy, sy, cp, sp, cr, sr = np.cos(a), np.sin(a), np.cos(b), np.sin(b), np.cos(c), np.sin(c)
+    return np.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        axis=-1,
+    )

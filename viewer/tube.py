@@ -1,0 +1,65 @@
+"""The shape of doubt: a skin round the mean path as wide as the band, its rings, and what lies beyond the horizon."""
+
+import numpy as np
+
+SIDES = 24  # corners of one ring
+
+
+def frame_of(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Give the cross and vertical unit vectors along a path (n, 3): two (n, 3); hovering keeps the last direction."""
+    run = np.gradient(path, axis=0) if len(path) > 1 else np.zeros_like(path)
+    flat = run * [1.0, 1.0, 0.0]
+    length = np.linalg.norm(flat, axis=1)
+    moving = length > 1e-6
+    index = np.maximum.accumulate(np.where(moving, np.arange(len(path)), 0))
+    if not moving.any():
+        flat, length = np.tile([1.0, 0.0, 0.0], (len(path), 1)), np.ones(len(path))
+    elif not moving[0]:
+        index[: int(np.argmax(moving))] = int(np.argmax(moving))
+    ahead = flat[index] / length[index][:, None]
+    cross = np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(path))], axis=-1)
+    along = np.where(np.linalg.norm(run, axis=1)[index, None] > 1e-6, run[index], ahead)
+    along = along / np.linalg.norm(along, axis=1)[:, None]
+    return cross, np.cross(along, cross)
+
+
+def rings(path: np.ndarray, axes: np.ndarray, sides: int = SIDES) -> np.ndarray:
+    """Draw the band's cross-section at each point.
+
+    Args:
+        path: mean position, (n, 3) [10 m]
+        axes: half-axes along, cross, vertical, (n, 3) [10 m]
+    Returns:
+        corners, (n, sides, 3) [10 m]
+    """
+    cross, up = frame_of(path)
+    turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)[None, :, None]
+    return path[:, None] + np.cos(turn) * (axes[:, 1, None, None] * cross[:, None]) + np.sin(turn) * (
+        axes[:, 2, None, None] * up[:, None]
+    )
+
+
+def skin(n: int, sides: int = SIDES) -> np.ndarray:
+    """Give the triangles between n rings: (2 (n - 1) sides, 3) indices into the flattened corners."""
+    near = np.arange(n - 1)[:, None] * sides + np.arange(sides)
+    next_ = np.arange(n - 1)[:, None] * sides + (np.arange(sides) + 1) % sides
+    halves = [np.stack([near, next_, near + sides], -1), np.stack([next_, next_ + sides, near + sides], -1)]
+    return np.concatenate([half.reshape(-1, 3) for half in halves]).astype(np.uint32)
+
+
+def closed(ring: np.ndarray) -> np.ndarray:
+    """Join the corners of rings (..., sides, 3) into closed loops: (..., sides, 2, 3)."""
+    return np.stack([ring, np.roll(ring, -1, axis=-2)], axis=-2)
+
+
+def curtain(path: np.ndarray, ground: float) -> tuple[np.ndarray, np.ndarray]:
+    """Hang a curtain from a path to the ground: corners (2 n, 3), triangles (2 (n - 1), 3)."""
+    foot = path * [1.0, 1.0, 0.0] + [0.0, 0.0, ground]
+    k = np.arange(len(path) - 1) * 2
+    faces = np.concatenate([np.stack([k, k + 1, k + 2], -1), np.stack([k + 1, k + 3, k + 2], -1)])
+    return np.stack([path, foot], axis=1).reshape(-1, 3), faces.astype(np.uint32)
+
+
+def marks(until: float, steps: tuple[float, ...] = (5, 10, 20, 30, 60)) -> list[float]:
+    """Choose the look-aheads to mark [s]: those that leave room before the horizon."""
+    return [step for step in steps if step < until - max(2.0, 0.12 * until)]

@@ -1,0 +1,152 @@
+"""What the viewer remembers of one UAV: the latest of each topic, and a bounded trail."""
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet.contract import Alert, AlertKind, FleetRow, Link, Mission, Model, Outcome, Prediction, Sample, State, Status
+from fleet.frames import Origin
+from viewer.place import UNIT_M, Place
+
+TRAIL_ROWS = 900  # about 90 s at 10 Hz
+SILENT_S = 3.0  # without a sample for this long the link counts as lost, whatever was last said
+JUMP_S = 5.0  # a step back in time by more than this is another flight: start afresh
+MAX_STEPS = 5_000  # look-ahead steps accepted from outside
+
+
+class Forecast(NamedTuple):
+    """A prediction, checked and moved into the scene."""
+
+    t: float  # fleet time it starts at [s since 1970]
+    heard: float  # when it arrived, monotonic [s]
+    ahead: np.ndarray  # look-ahead, rising, (n,) [s]
+    path: np.ndarray  # mean position, scene ENU, (n, 3) [10 m]
+    tube: np.ndarray  # half-axes along, cross, vertical, (n, 3) [10 m]
+    message: Prediction
+
+    @property
+    def until(self) -> float:
+        """Give the look-ahead up to which anything is claimed: the horizon, within what was sent [s]."""
+        horizon = self.message.horizon_s
+        return float(min(max(horizon if np.isfinite(horizon) else 0.0, 0.0), self.ahead[-1]))
+
+    def at(self, ahead: np.ndarray | float) -> np.ndarray:
+        """Interpolate the mean path at look-aheads (k,) [s] -> (k, 3) [10 m]; held beyond both ends."""
+        return np.stack([np.interp(ahead, self.ahead, self.path[:, i]) for i in range(3)], axis=-1)
+
+    def width(self, ahead: np.ndarray) -> np.ndarray:
+        """Interpolate the half-axes at look-aheads (k,) [s] -> (k, 3) [10 m]."""
+        return np.stack([np.interp(ahead, self.ahead, self.tube[:, i]) for i in range(3)], axis=-1)
+
+
+def forecast(message: Prediction, place: Place, heard: float) -> Forecast | None:
+    """Check a prediction and move it into the scene; None where it carries no path.
+
+    Raises:
+        ValueError: when its arrays disagree, are not finite or do not rise in time; the worker must resend.
+    """
+    ahead, path, tube = (a.numpy().astype(float) for a in (message.ahead, message.path, message.tube))
+    n = ahead.shape[0] if ahead.ndim == 1 else -1
+    if n == 0:
+        return None
+    if not 2 <= n <= MAX_STEPS or path.shape != (n, 3) or tube.shape != (n, 3):
+        raise ValueError(f"uav-{message.uav}: prediction has shapes {ahead.shape} {path.shape} {tube.shape}; resend")
+    if not (np.isfinite(ahead).all() and np.isfinite(message.t) and (np.diff(ahead) > 0).all()):
+        raise ValueError(f"uav-{message.uav}: prediction has times that do not rise; resend")
+    tube = np.clip(np.nan_to_num(tube / UNIT_M), 0.0, 1e4)
+    return Forecast(message.t, heard, ahead, place.local(Origin(*message.origin), path), tube, message)
+
+
+@dataclass
+class Vehicle:
+    """One UAV as the page knows it."""
+
+    uav: int
+    epoch: int = 0
+    believed: float = -np.inf  # when a worker's result was last accepted, monotonic [s]
+    heard: float = -np.inf  # when a sample last arrived, monotonic [s]
+    t: float = -np.inf  # fleet time of the newest sample [s]
+    at: np.ndarray | None = None  # newest position, scene ENU, (3,) [10 m]
+    alt_m: float = np.nan  # above mean sea level [m]
+    attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)  # phi theta psi [rad]
+    Va: float = np.nan  # [m/s]
+    status: Status | None = None
+    mission: Mission | None = None
+    model: Model | None = None
+    prediction: Prediction | None = None
+    forecast: Forecast | None = None
+    row: FleetRow | None = None
+    alerts: dict[AlertKind, Alert] = field(default_factory=dict)
+    trail: deque = field(default_factory=lambda: deque(maxlen=TRAIL_ROWS))  # t, east, north, up, Va
+    past: deque = field(default_factory=lambda: deque(maxlen=60))  # forecasts, about one a second
+    fits: deque = field(default_factory=lambda: deque(maxlen=200))  # t, mean fit [%]
+
+    @property
+    def name(self) -> str:
+        """Name the UAV as the page does."""
+        return f"UAV-{self.uav:03d}"
+
+    def state(self, now: float) -> State:
+        """Judge where its twin stands; the worst news wins. `now` is monotonic [s]."""
+        silent = now - self.heard > SILENT_S
+        if silent or (self.status is not None and self.status.link is Link.LOST):
+            return State.LINK_LOST
+        if self.row is not None:
+            return self.row.state
+        if self.prediction is not None:
+            return self.prediction.state
+        if self.model is not None:
+            return State.VERIFIED if self.model.verdict.outcome is Outcome.VERIFIED else State.IDENTIFYING
+        return State.WAITING
+
+    def age(self, now: float) -> float:
+        """Give the time since the last sample arrived [s]; infinite before any."""
+        return now - self.heard
+
+    def clock(self, now: float) -> float:
+        """Estimate the aircraft's fleet time now [s], from the newest thing heard of it."""
+        told = [(self.t, self.heard)]
+        if self.forecast is not None:
+            told.append((self.forecast.t, self.forecast.heard))
+        t, heard = max(told)
+        return t + (now - heard)
+
+    def where(self, now: float) -> np.ndarray | None:
+        """Give the place to draw it, (3,) [10 m]: the last sample's, or, link lost, the predicted ghost's."""
+        if self.forecast is not None and (self.at is None or self.state(now) is State.LINK_LOST):
+            return self.forecast.at(self.clock(now) - self.forecast.t)
+        return self.at
+
+    def hear_sample(self, sample: Sample, place: Place, now: float) -> None:
+        """Take over the newest rows of a sample."""
+        if not np.isfinite(sample.t):
+            raise ValueError(f"uav-{self.uav}: sample time {sample.t}; resend")
+        if sample.t < self.t - JUMP_S:
+            self.forget()
+        self.heard, self.t = now, max(sample.t, self.t)
+        if sample.air is not None and (air := sample.air.x.numpy()).ndim == 2 and len(air) and np.isfinite(air[-1, 0]):
+            self.Va = float(air[-1, 0])
+        if sample.attitude is not None and (turn := sample.attitude.x.numpy()).ndim == 2 and len(turn):
+            phi, theta, psi = (float(x) for x in turn[-1, :3])
+            if np.isfinite([phi, theta, psi]).all():
+                self.attitude = (phi, theta, psi)
+        if sample.position is not None:
+            self._hear_position(sample.position.t.numpy(), sample.position.x.numpy().astype(float), place)
+
+    def _hear_position(self, t: np.ndarray, x: np.ndarray, place: Place) -> None:
+        if x.ndim != 2 or x.shape[1] < 3 or t.shape != (len(x),):
+            raise ValueError(f"uav-{self.uav}: position rows of shape {x.shape}; resend")
+        fix = np.isfinite(x[:, :3]).all(axis=1) & np.isfinite(t) & (np.abs(x[:, :2]).sum(axis=1) > 0)
+        if not fix.any():
+            return
+        enu = place.geodetic(*x[fix, :3].T)
+        self.trail.extend((float(k), *p, self.Va) for k, p in zip(t[fix], enu.tolist(), strict=True))
+        self.at, self.alt_m = enu[-1], float(x[fix][-1, 2]) * 1e-3
+
+    def forget(self) -> None:
+        """Drop everything that belongs to a flight: the clock went back."""
+        self.t, self.forecast, self.prediction, self.model, self.row = -np.inf, None, None, None, None
+        for history in (self.trail, self.past, self.fits):
+            history.clear()

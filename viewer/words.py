@@ -1,0 +1,110 @@
+"""What the page says, as HTML. Everything that came over the bus is escaped here, at the edge, and nowhere else."""
+
+from html import escape
+from math import isfinite
+
+from fleet.contract import State
+from viewer.feed import Feed
+from viewer.palette import GLYPH, WORD, Palette
+from viewer.vehicle import Vehicle
+
+SEVERITY = (State.LINK_LOST, State.UNCLAIMED, State.WAITING, State.IDENTIFYING, State.PREDICTING, State.VERIFIED)
+MAX_ROWS = 50
+
+
+def severity(vehicle: Vehicle, now: float) -> tuple[bool, int, float, int]:
+    """Rank a UAV: alerts first, then the worst state, then the shortest horizon."""
+    return (not vehicle.alerts, SEVERITY.index(vehicle.state(now)), horizon_s(vehicle), vehicle.uav)
+
+
+def horizon_s(vehicle: Vehicle) -> float:
+    """Give the horizon in force [s]; 0 where nothing is predicted."""
+    return vehicle.forecast.until if vehicle.forecast is not None else 0.0
+
+
+def fit(vehicle: Vehicle) -> float | None:
+    """Give the mean fit over the states of the last verdict [%]; None before any."""
+    source = vehicle.model.verdict.fit if vehicle.model is not None else vehicle.row.fit if vehicle.row is not None else {}
+    values = [value for value in source.values() if isfinite(value)]
+    return sum(values) / len(values) if values else None
+
+
+def empty(feed: Feed, now: float) -> str:
+    """Say what is listened to and what to check, while nobody is there."""
+    n, strange = sum(feed.counts.values()) - feed.counts["strange"], feed.counts["strange"]
+    odd = f" {strange} could not be read." if strange else ""
+    said = "".join(f"<br>{escape(text)}" for text in feed.sentences.values() if text)
+    return (
+        f'<div class="uav"><h1>No vehicles yet</h1><div class="soft">Listening on <code>{escape(feed.listening)}</code> '
+        f"for {now - feed.since:.0f} s. {n} messages.{odd}{said}<br>Check that a gateway is running on this router and "
+        "that aircraft send to it: <code>fleet status</code>, <code>fleet up --uavs 8</code>.</div></div>"
+    )
+
+
+def summary(fleet: list[Vehicle], feed: Feed, palette: Palette, now: float) -> str:
+    """Count the fleet by state, with the median horizon and the measured coverage."""
+    states = [vehicle.state(now) for vehicle in fleet]
+    chips = "".join(
+        f'<span class="chip"><b style="color:{palette.state(state)}">{GLYPH[state]}</b><b>{states.count(state)}</b>'
+        f'<span class="soft">{WORD[state]}</span></span>'
+        for state in SEVERITY
+        if state in states
+    )
+    horizons = sorted(h for vehicle in fleet if (h := horizon_s(vehicle)) > 0)
+    median = f" · median horizon {horizons[len(horizons) // 2]:.0f} s" if horizons else ""
+    said = "".join(f'<div class="soft">{escape(text)}</div>' for text in feed.sentences.values() if text)
+    plural = "UAV" if len(fleet) == 1 else "UAVs"
+    return f'<div class="uav"><h1>{len(fleet)} {plural}<small>{median}{_fleet_coverage(fleet)}</small></h1>{chips}{said}</div>'
+
+
+def _fleet_coverage(fleet: list[Vehicle]) -> str:
+    told = [v.prediction for v in fleet if v.prediction is not None and v.prediction.held_n > 0 and isfinite(v.prediction.held)]
+    n = sum(p.held_n for p in told)
+    if not n:
+        return ""
+    return f" · cov. {sum(p.held * p.held_n for p in told) / n * 100:.0f}/{told[0].quantile * 100:.0f} %"
+
+
+def table(fleet: list[Vehicle], total: int, palette: Palette, now: float, pick: str, selected: int | None) -> str:
+    """List the worst up to 50 of those that pass the filter; `pick` is the handler of a row, `{}` its UAV."""
+    worst = sorted(fleet, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
+    longest = max((horizon_s(vehicle) for vehicle in worst), default=0.0) or 1.0
+    rows = "".join(_row(vehicle, palette, now, pick, vehicle.uav == selected, longest) for vehicle in worst)
+    return (
+        '<div class="uav list"><table><tr><th></th><th>UAV</th><th>status</th><th class="num">fit %</th>'
+        f'<th class="num">horizon</th></tr>{rows}</table>'
+        f'<div class="foot">{len(worst)} of {total} · alerts and worst state first, then shortest horizon</div></div>'
+    )
+
+
+def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, on: bool, longest: float) -> str:
+    state, horizon, mean = vehicle.state(now), horizon_s(vehicle), fit(vehicle)
+    colour = palette.mismatch if vehicle.alerts else palette.state(state)
+    glyph = "▲" if vehicle.alerts else GLYPH[state]
+    word = f"{WORD[state]} {ago(vehicle.age(now))}" if state is State.LINK_LOST else WORD[state]
+    bar = f'<i><i style="width:{min(horizon / longest, 1) * 100:.0f}%;background:{colour}"></i></i>'
+    return (
+        f'<tr class="pick{" on" if on else ""}" data-uav="{vehicle.uav}" onpointerdown="{pick.format(vehicle.uav)}">'
+        f'<td style="color:{colour}">{glyph}</td><td>{vehicle.name}</td>'
+        f'<td style="color:{palette.state(state)}">{word}</td><td class="num">{"–" if mean is None else f"{mean:.0f}"}</td>'
+        f'<td><div class="bar">{bar}<span class="num" style="width:30px">{f"{horizon:.0f} s" if horizon else "–"}</span>'
+        "</div></td></tr>"
+    )
+
+
+def alerts(feed: Feed, palette: Palette) -> str:
+    """List the alerts in force, newest first, at most 50."""
+    found = feed.alerts()
+    cards = "".join(
+        f'<div class="say" style="border-color:{palette.mismatch}"><b>▲ {vehicle.name}</b> '
+        f'<span class="soft">{escape(kind.value.replace("_", " "))}</span><br>{escape(alert.sentence)}</div>'
+        for vehicle, kind, alert in found[:MAX_ROWS]
+    )
+    return f'<div class="uav">{cards or "<div class=soft>No alert is in force.</div>"}</div>'
+
+
+def ago(seconds: float) -> str:
+    """Say an age in a few letters."""
+    if not isfinite(seconds):
+        return "never heard"
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
