@@ -78,8 +78,8 @@ class Craft:
             return
         raw = 0.0 if row.tick is Tick.NONE else raw_seconds(row.tick, message)
         t = self._clocks.fleet(row.tick, raw, arrival)
-        if t is None or not self._shelf.put(row.field, row.rank, t, values):
-            self._refused += 1
+        fresh = t is not None and self._shelf.put(row.field, row.rank, t, values)
+        self._refused += not fresh and row.tick is not Tick.NONE  # without a time of its own it may well repeat one
         if self._clocks.jumps != self._jumps:
             self._jumps = self._clocks.jumps
             self.say(f"the aircraft's clock jumped ({self._jumps} times so far), time was anchored anew", arrival)

@@ -115,6 +115,24 @@ class _Reader:
         return length if abs(t - self._t) < LONGEST_GAP_S else 0
 
 
+def ticks(path: Path | str) -> Iterator[tuple[float, list[Record]]]:
+    """Read a recording in steps of 0.1 s: (end of the step [s since 1970], what arrived within it).
+
+    Raises:
+        ValueError: when it is no recording.
+    """
+    due: float | None = None
+    heard: list[Record] = []
+    for record in timed(path):
+        due = record[0] + FLUSH_S if due is None else due
+        while record[0] >= due:
+            yield due, heard
+            due, heard = due + FLUSH_S, []
+        heard.append(record)
+    if due is not None:
+        yield due, heard
+
+
 def replay_messages(path: Path | str, offset: int = 0, intake: Intake | None = None) -> Iterator[News]:
     """Read a recording as the gateway would have heard it, in time order; fleet time is the recording's own.
 
@@ -126,12 +144,7 @@ def replay_messages(path: Path | str, offset: int = 0, intake: Intake | None = N
         ValueError: when it is no recording.
     """
     intake = Intake(offset) if intake is None else intake
-    due: float | None = None
-    t = 0.0
-    for t, frame in timed(path):
-        due = t + FLUSH_S if due is None else due
-        while t >= due:
-            yield from intake.flush(due)
-            due += FLUSH_S
-        intake.hear(t, frame)
-    yield from intake.flush(t)
+    for now, heard in ticks(path):
+        for t, frame in heard:
+            intake.hear(t, frame)
+        yield from intake.flush(now)

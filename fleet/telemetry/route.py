@@ -120,6 +120,7 @@ class RouteBook:
         if accepted:
             if draft is not None and draft.whole():
                 self._adopt(draft)
+            self._drafts[False] = None  # half of a list that is no more
             self.stale = True  # the autopilot may have changed it, home for one; ask it
 
     def _adopt(self, draft: _Draft) -> None:

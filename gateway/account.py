@@ -1,0 +1,46 @@
+"""The counters of one gateway, gathered from its links once a second."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+from fleet.contract import Account
+from fleet.telemetry.intake import Intake
+from gateway.link import Link
+
+
+class Tally:
+    """Count what arrives, before anything is decoded."""
+
+    def __init__(self) -> None:
+        self.datagrams = 0
+        self.bytes_in = 0
+
+    def add(self, data: bytes) -> None:
+        """Count one piece of bytes."""
+        self.datagrams += 1
+        self.bytes_in += len(data)
+
+    def account(self, t: float, links: Sequence[Link], intakes: Sequence[Intake], published: int) -> Account:
+        """Make the message; `t` is fleet time [s since 1970]."""
+        counts: Counter[str] = Counter()
+        refused: Counter[str] = Counter()
+        uavs: set[int] = set()
+        for link, intake in zip(links, intakes, strict=True):
+            counts.update(intake.counters())
+            refused.update(intake.refused)
+            uavs.update(craft.uav for craft in intake.crafts.values())
+            if link.dropped:
+                refused["dropped: decoding fell behind"] += link.dropped
+        return Account(
+            t=t,
+            links=tuple(link.spec.text for link in links),
+            uavs=tuple(sorted(uavs)),
+            datagrams=self.datagrams,
+            bytes_in=self.bytes_in,
+            messages=counts["messages"],
+            bad_bytes=counts["bad_bytes"],
+            bad_frames=counts["bad_frames"],
+            refused=dict(refused),
+            published=published,
+            sentence="" if uavs else "no aircraft heard yet; point its telemetry at one of the links",
+        )

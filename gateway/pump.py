@@ -1,0 +1,96 @@
+"""The working thread: queue -> decode -> intake -> bus, and questions back to the aircraft."""
+
+import queue
+import threading
+import time
+from collections.abc import Sequence
+
+from fleet.bus import Bus
+from fleet.telemetry.craft import Craft
+from fleet.telemetry.intake import Intake
+from gateway.account import Tally
+from gateway.link import QUEUE, Batch, Link, wall
+from gateway.onboard import Onboard
+from gateway.publish import Publisher
+
+TICK_S = 0.1
+ACCOUNT_S = 1.0
+
+
+class Pump:
+    """Everything one gateway does between its links and the bus.
+
+    Args:
+        links: opened links
+        bus: where messages go
+        listen_only: send nothing at all
+    """
+
+    def __init__(self, links: Sequence[Link], bus: Bus, listen_only: bool = False) -> None:
+        self.links = links
+        self.tally = Tally()
+        self.publisher = Publisher(bus)
+        claims: dict[int, Craft] = {}
+        self.intakes = [Intake(link.spec.offset, claims) for link in links]
+        self._onboards = [Onboard() for _ in links]
+        self._listen_only = listen_only
+        self._queue: queue.Queue[Batch] = queue.Queue(QUEUE)
+        self._open = set(range(len(links)))
+        self._live = [number for number, link in enumerate(links) if link.spec.kind != "replay"]
+        self._recorded = float("-inf")  # newest recorded time
+
+    def run(self, stop: threading.Event) -> None:
+        """Work until `stop` is set or every recording has ended; the links' threads end with it."""
+        for number, link in enumerate(self.links):
+            link.start(number, self._queue, stop)
+        try:
+            tick = account = time.monotonic()
+            while self._open and not stop.is_set():
+                self._drain(tick)
+                mono = time.monotonic()
+                if mono >= tick:
+                    self._tick(mono)
+                    tick = max(tick + TICK_S, time.monotonic() + TICK_S / 2)  # the queue always gets its turn
+                if mono >= account:
+                    account = mono + ACCOUNT_S
+                    self._tell()
+            self._tell()
+        finally:
+            stop.set()
+            for link in self.links:
+                link.close()
+
+    def take(self, batch: Batch) -> None:
+        """Work through one batch."""
+        intake = self.intakes[batch.link]
+        for t, source, data in batch.heard:
+            self.tally.add(data)
+            intake.hear(t, data, source)
+        if batch.now is not None:
+            self._recorded = max(self._recorded, batch.now)
+            self.publisher.publish(intake.flush(batch.now))
+        if batch.ended:
+            self._open.discard(batch.link)
+
+    def _drain(self, until: float) -> None:
+        """Work through the queue until the next tick is due; `until` is on the monotonic clock [s]."""
+        while (left := until - time.monotonic()) > 0:
+            try:
+                self.take(self._queue.get(timeout=left))
+            except queue.Empty:
+                return
+            if not self._open:
+                return
+
+    def _tick(self, mono: float) -> None:
+        for number in self._live:
+            intake, link, now = self.intakes[number], self.links[number], wall()
+            self.publisher.publish(intake.flush(now))
+            if not self._listen_only:
+                for where, data in self._onboards[number].tick(now, intake.crafts.values()):
+                    link.send(where, data)
+        self.publisher.repeat(mono)
+
+    def _tell(self) -> None:
+        now = wall() if self._live else self._recorded
+        self.publisher.account(self.tally.account(now, self.links, self.intakes, self.publisher.published))
