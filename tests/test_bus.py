@@ -1,0 +1,245 @@
+"""One law for both buses: what is published is heard, what is asked is answered, the highest epoch wins."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from queue import Empty, SimpleQueue
+from typing import Any, NamedTuple
+
+import msgspec
+import pytest
+import zenoh
+from conftest import ROOT
+from examples import EXAMPLES
+
+from fleet.bus import Bus, MemoryBus, connect, endpoint, key, newest, open_router, reachable, uav_in
+from fleet.codec import Stamp, encode, encoding
+from fleet.contract import Account, Alert, FleetState, Prediction, Sample, Status
+
+PATIENCE_S = 10.0
+STAMP = Stamp(epoch=5, writer=99)
+PREDICTION = EXAMPLES[Prediction]
+
+
+class Pair(NamedTuple):
+    """Two ends of one bus, and a way to put raw bytes on it."""
+
+    here: Any
+    there: Any
+    inject: Callable[[type, bytes, str], None]
+
+
+def memory_pair(stack: ExitStack, port: int) -> Pair:
+    bus = stack.enter_context(MemoryBus())
+    return Pair(bus, bus, bus.deliver)
+
+
+def zenoh_pair(stack: ExitStack, port: int) -> Pair:
+    router = f"tcp/127.0.0.1:{port}"
+    raw = stack.enter_context(open_router(router))
+    here, there = (stack.enter_context(connect(router)) for _ in range(2))
+    return Pair(here, there, lambda kind, payload, named: raw.put(key(kind, 7), payload, encoding=named))
+
+
+@pytest.fixture(params=[memory_pair, zenoh_pair], ids=["memory", "zenoh"])
+def pair(request: pytest.FixtureRequest, free_port: int) -> Iterator[Pair]:
+    with ExitStack() as stack:
+        yield request.param(stack, free_port)
+
+
+def told(heard: SimpleQueue, tell: Callable[[], None]) -> Any:
+    """Tell until it is heard, since a subscription takes a moment to travel; give the first thing heard."""
+    for _ in range(int(PATIENCE_S / 0.05)):
+        tell()
+        try:
+            return heard.get(timeout=0.05)
+        except Empty:
+            continue
+    pytest.fail(f"nothing heard within {PATIENCE_S} s")
+
+
+def asked(bus: Bus, kind: type, who: int | str, count: int = 1) -> list[tuple[Any, Stamp | None]]:
+    """Ask until that many answer, since a queryable takes a moment to travel."""
+    deadline = threading.Event()
+    timer = threading.Timer(PATIENCE_S, deadline.set)
+    timer.start()
+    try:
+        while not deadline.is_set():
+            found = bus.ask(kind, who)
+            if len(found) >= count:
+                return found
+    finally:
+        timer.cancel()
+    pytest.fail(f"fewer than {count} answers within {PATIENCE_S} s")
+
+
+# --- publish and subscribe -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stamp", [STAMP, None])
+@pytest.mark.parametrize("kind", list(EXAMPLES), ids=lambda kind: kind.__name__)
+def test_what_is_published_is_heard_with_its_stamp(pair: Pair, kind: type, stamp: Stamp | None) -> None:
+    heard: SimpleQueue = SimpleQueue()
+    pair.there.subscribe(kind, lambda message, stamp: heard.put((message, stamp)))
+    assert told(heard, lambda: pair.here.publish(EXAMPLES[kind], stamp)) == (EXAMPLES[kind], stamp)
+
+
+def test_a_subscriber_hears_its_own_class_alone(pair: Pair) -> None:
+    heard: SimpleQueue = SimpleQueue()
+    pair.there.subscribe(Status, lambda message, _: heard.put(message))
+
+    def tell() -> None:
+        for kind in (Sample, Alert, FleetState, Status):  # in order, so the others would be heard first
+            pair.here.publish(EXAMPLES[kind])
+
+    assert told(heard, tell) == EXAMPLES[Status]
+
+
+def test_bytes_that_do_not_decode_are_counted_and_the_next_message_is_heard(pair: Pair) -> None:
+    heard: SimpleQueue = SimpleQueue()
+    pair.there.subscribe(Status, lambda message, _: heard.put(message))
+    told(heard, lambda: pair.here.publish(EXAMPLES[Status]))
+    good, name = encode(EXAMPLES[Status]), encoding(Status)
+    assert pair.there.bad == 0
+    pair.inject(Status, b"\xc1 no message", name)
+    pair.inject(Status, good, name[:-1] + "2")
+    pair.inject(Status, good[:-1], name)
+    last = msgspec.structs.replace(EXAMPLES[Status], sentence="last")
+    pair.inject(Status, encode(last), name)
+    found = heard.get(timeout=PATIENCE_S)
+    while found != last:
+        assert found == EXAMPLES[Status]
+        found = heard.get(timeout=PATIENCE_S)
+    assert pair.there.bad == 3
+
+
+# --- ask and answer --------------------------------------------------------------------------------------------------
+
+
+def about(uav: int, t: float = 1.0) -> Prediction:
+    return msgspec.structs.replace(PREDICTION, uav=uav, t=t)
+
+
+def test_one_wildcard_queryable_answers_for_all_and_for_one(pair: Pair) -> None:
+    seen = []
+
+    def reply(uav: int | None, parameters: dict[str, str], payload: bytes) -> list[tuple[Prediction, Stamp]]:
+        seen.append((uav, parameters, payload))
+        return [(about(n), Stamp(n, 1)) for n in (3, 1, 2)]
+
+    pair.there.answer(Prediction, reply)
+    assert asked(pair.here, Prediction, "*", 3) == [(about(n), Stamp(n, 1)) for n in (1, 2, 3)]
+    assert asked(pair.here, Prediction, 2) == [(about(2), Stamp(2, 1))], "answers about others are left out"
+    assert pair.here.ask(Prediction, 9) == []
+    assert [uav for uav, _, _ in seen[-3:]] == [None, 2, 9]
+    assert seen[-1] == (9, {}, b"")
+
+
+def test_the_highest_epoch_wins_whoever_answers_first(pair: Pair) -> None:
+    pair.there.answer(Prediction, lambda *_: [(about(1, t=50.0), Stamp(8, 1)), (about(2), Stamp(1, 1))])
+    pair.here.answer(Prediction, lambda *_: [(about(1, t=10.0), Stamp(9, 2)), (about(3), None)])
+    found = asked(pair.here, Prediction, "*", 3)
+    assert found == [(about(1, t=10.0), Stamp(9, 2)), (about(2), Stamp(1, 1)), (about(3), None)]
+
+
+def test_a_refusal_does_not_silence_the_others(pair: Pair) -> None:
+    def refuse(*_: object) -> list[tuple[Prediction, Stamp | None]]:
+        raise ValueError("prediction: found horizon=x, expected a number; write horizon=30")
+
+    pair.here.answer(Prediction, refuse)
+    pair.there.answer(Prediction, lambda *_: [(about(4), STAMP)])
+    assert asked(pair.here, Prediction, "*") == [(about(4), STAMP)]
+
+
+def test_control_messages_are_answered_by_every_process(pair: Pair) -> None:
+    pair.there.answer(FleetState, lambda *_: [(EXAMPLES[FleetState], None)])
+    pair.here.answer(FleetState, lambda *_: [(EXAMPLES[FleetState], None)])
+    assert asked(pair.here, FleetState, "*", 2) == [(EXAMPLES[FleetState], None)] * 2
+
+
+def test_nobody_to_ask_is_an_empty_answer(pair: Pair) -> None:
+    assert pair.here.ask(Account) == []
+
+
+def test_newest_prefers_the_epoch_then_the_time() -> None:
+    early, late = about(1, t=1.0), about(1, t=2.0)
+    assert newest([(late, Stamp(1, 1)), (early, Stamp(2, 1))]) == [(early, Stamp(2, 1))]
+    assert newest([(early, Stamp(2, 1)), (late, Stamp(2, 2))]) == [(late, Stamp(2, 2))]
+    assert newest([(late, None), (early, Stamp(1, 1))]) == [(early, Stamp(1, 1))]
+    assert newest([]) == []
+
+
+# --- zenoh alone -----------------------------------------------------------------------------------------------------
+
+
+def test_selector_parameters_and_payload_reach_the_queryable_and_a_refusal_its_asker(free_port: int) -> None:
+    seen: SimpleQueue = SimpleQueue()
+
+    def reply(*given: object) -> list[tuple[Prediction, Stamp | None]]:
+        seen.put(given)
+        raise ValueError("prediction: found horizon=30, expected at most 10; ask for less")
+
+    router = f"tcp/127.0.0.1:{free_port}"
+    with open_router(router) as raw, connect(router) as bus:
+        bus.answer(Prediction, reply)
+        replies: list[zenoh.Reply] = []
+        for _ in range(1000):
+            replies = replies or list(raw.get(key(Prediction, 7) + "?horizon=30;step=0.5", payload=b"route"))
+        assert seen.get(timeout=PATIENCE_S) == (7, {"horizon": "30", "step": "0.5"}, b"route")
+        assert replies[0].err is not None and replies[0].err.payload.to_string().endswith("ask for less")
+
+
+def test_a_process_is_present_until_it_leaves(free_port: int) -> None:
+    router = f"tcp/127.0.0.1:{free_port}"
+    gone, came = threading.Event(), threading.Event()
+
+    def changed(sample: zenoh.Sample) -> None:
+        (came if sample.kind == zenoh.SampleKind.PUT else gone).set()
+
+    with open_router(router) as raw:
+        watch = raw.liveliness().declare_subscriber("parauav/@live/**", changed)
+        with connect(router) as bus:
+            bus.present("worker/w1")
+            assert came.wait(PATIENCE_S) and not gone.is_set()
+        assert gone.wait(PATIENCE_S)
+        watch.undeclare()
+
+
+def test_the_router_of_deploy_listens_on_loopback_alone() -> None:
+    config = zenoh.Config.from_file(str(ROOT / "deploy" / "zenohd.json5"))
+    assert config.get_json("listen/endpoints") == '["tcp/127.0.0.1:7447"]'
+    assert config.get_json("mode") == '"router"'
+    assert config.get_json("scouting/multicast/enabled") == "false"
+
+
+# --- keys and endpoints ----------------------------------------------------------------------------------------------
+
+
+def test_keys() -> None:
+    assert key(Sample, 7) == "parauav/7/sample" and key(Sample, "*") == "parauav/*/sample"
+    assert key(FleetState, "ab") == "parauav/@fleet/state/ab" and key(Account, "*") == "parauav/@gateway/*"
+    assert uav_in("parauav/7/sample") == 7
+    for name in ("parauav/*/sample", "parauav/@fleet/state/7", "parauav/-7/sample", "parauav/²/sample", "7", ""):
+        assert uav_in(name) is None, name
+
+
+@pytest.mark.parametrize("text", ["", "udp/127.0.0.1:7447", "tcp/:7447", "tcp/h:0", "tcp/h:65536", "tcp/h:x", "h:7447"])
+def test_an_endpoint_that_is_none_is_refused_in_a_sentence(text: str) -> None:
+    for use in (endpoint, reachable, connect, open_router):
+        with pytest.raises(ValueError, match=r"--router: found .*, expected e\.g\. tcp/127\.0\.0\.1:7447; name"):
+            use(text)
+
+
+def test_endpoints() -> None:
+    assert endpoint("tcp/127.0.0.1:7447") == ("127.0.0.1", 7447)
+    assert endpoint("tls/[::1]:7447") == ("::1", 7447)
+
+
+def test_reachable_follows_the_router(free_port: int) -> None:
+    router = f"tcp/127.0.0.1:{free_port}"
+    assert not reachable(router)
+    with pytest.raises(ConnectionError, match=r"nobody answers; start `zenohd` or `fleet up`"):
+        connect(router)
+    with open_router(router):
+        assert reachable(router)
+    assert not reachable(router)
