@@ -18,6 +18,7 @@ REACH_M = 1_300.0  # waypoints stay this near to home
 LEGS = 10
 TURNS_DEG = (25, 45, 60, 75, 90, 90, 110, 130, 150)
 LOW_M, HIGH_M = 80.0, 200.0  # above home
+CLIMB, SINK = 0.08, 0.055  # steepest slopes: what the motor lifts, what an idling motor sinks [-]
 
 
 class Start(NamedTuple):
@@ -74,8 +75,9 @@ def mission(seed: int, cruise: float, origin: Origin = HOME) -> tuple[tuple[Item
     before = walk.spot()
     for leg in range(LEGS):
         turn = _turn(rng, at_least=60) if leg == 2 else _turn(rng)
-        climb = float(rng.choice([0, 0, 1, -1, 1, -1])) * rng.uniform(20, 50)
-        walk.advance(turn, rng.uniform(350, 750), climb)
+        length = rng.uniform(350, 750)
+        climb = float(rng.choice([0, 0, CLIMB, -SINK, CLIMB, -SINK])) * rng.uniform(0.5, 1.0) * length
+        walk.advance(turn, length, climb)
         if leg == 1:
             start = _before_turn(rng, before, walk.spot(), len(items))
         if leg == loiter_at:
