@@ -35,12 +35,17 @@ def chromium() -> str:
     return found
 
 
-@pytest.fixture
-def free_port() -> int:
+def unused_port() -> int:
     """Number of a loopback TCP port that nobody holds."""
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         return s.getsockname()[1]
+
+
+@pytest.fixture
+def free_port() -> int:
+    """The same, as a fixture."""
+    return unused_port()
 
 
 def pytest_configure(config: pytest.Config) -> None:

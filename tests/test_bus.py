@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import msgspec
 import pytest
 import zenoh
-from conftest import ROOT
+from conftest import ROOT, unused_port
 from examples import EXAMPLES
 
 from fleet.bus import Bus, MemoryBus, connect, endpoint, key, newest, open_router, reachable, uav_in
@@ -29,22 +29,24 @@ class Pair(NamedTuple):
     inject: Callable[[type, bytes, str], None]
 
 
-def memory_pair(stack: ExitStack, port: int) -> Pair:
-    bus = stack.enter_context(MemoryBus())
-    return Pair(bus, bus, bus.deliver)
+@pytest.fixture(scope="module")
+def router() -> Iterator[tuple[str, zenoh.Session]]:
+    """A router on a free loopback port: its endpoint and its session."""
+    at = f"tcp/127.0.0.1:{unused_port()}"
+    with open_router(at) as session:
+        yield at, session
 
 
-def zenoh_pair(stack: ExitStack, port: int) -> Pair:
-    router = f"tcp/127.0.0.1:{port}"
-    raw = stack.enter_context(open_router(router))
-    here, there = (stack.enter_context(connect(router)) for _ in range(2))
-    return Pair(here, there, lambda kind, payload, named: raw.put(key(kind, 7), payload, encoding=named))
-
-
-@pytest.fixture(params=[memory_pair, zenoh_pair], ids=["memory", "zenoh"])
-def pair(request: pytest.FixtureRequest, free_port: int) -> Iterator[Pair]:
+@pytest.fixture(params=["memory", "zenoh"])
+def pair(request: pytest.FixtureRequest) -> Iterator[Pair]:
     with ExitStack() as stack:
-        yield request.param(stack, free_port)
+        if request.param == "memory":
+            bus = stack.enter_context(MemoryBus())
+            yield Pair(bus, bus, bus.deliver)
+            return
+        at, raw = request.getfixturevalue("router")
+        here, there = (stack.enter_context(connect(at)) for _ in range(2))
+        yield Pair(here, there, lambda kind, payload, named: raw.put(key(kind, 7), payload, encoding=named))
 
 
 def told(heard: SimpleQueue, tell: Callable[[], None]) -> Any:
@@ -172,15 +174,15 @@ def test_newest_prefers_the_epoch_then_the_time() -> None:
 # --- zenoh alone -----------------------------------------------------------------------------------------------------
 
 
-def test_selector_parameters_and_payload_reach_the_queryable_and_a_refusal_its_asker(free_port: int) -> None:
+def test_selector_parameters_and_payload_reach_the_queryable_and_a_refusal_its_asker(router: tuple) -> None:
     seen: SimpleQueue = SimpleQueue()
 
     def reply(*given: object) -> list[tuple[Prediction, Stamp | None]]:
         seen.put(given)
         raise ValueError("prediction: found horizon=30, expected at most 10; ask for less")
 
-    router = f"tcp/127.0.0.1:{free_port}"
-    with open_router(router) as raw, connect(router) as bus:
+    at, raw = router
+    with connect(at) as bus:
         bus.answer(Prediction, reply)
         replies: list[zenoh.Reply] = []
         for _ in range(1000):
@@ -189,20 +191,19 @@ def test_selector_parameters_and_payload_reach_the_queryable_and_a_refusal_its_a
         assert replies[0].err is not None and replies[0].err.payload.to_string().endswith("ask for less")
 
 
-def test_a_process_is_present_until_it_leaves(free_port: int) -> None:
-    router = f"tcp/127.0.0.1:{free_port}"
+def test_a_process_is_present_until_it_leaves(router: tuple) -> None:
+    at, raw = router
     gone, came = threading.Event(), threading.Event()
 
     def changed(sample: zenoh.Sample) -> None:
         (came if sample.kind == zenoh.SampleKind.PUT else gone).set()
 
-    with open_router(router) as raw:
-        watch = raw.liveliness().declare_subscriber("parauav/@live/**", changed)
-        with connect(router) as bus:
-            bus.present("worker/w1")
-            assert came.wait(PATIENCE_S) and not gone.is_set()
-        assert gone.wait(PATIENCE_S)
-        watch.undeclare()
+    watch = raw.liveliness().declare_subscriber("parauav/@live/**", changed)
+    with connect(at) as bus:
+        bus.present("worker/w1")
+        assert came.wait(PATIENCE_S) and not gone.is_set()
+    assert gone.wait(PATIENCE_S)
+    watch.undeclare()
 
 
 def test_the_router_of_deploy_listens_on_loopback_alone() -> None:
