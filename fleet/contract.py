@@ -55,7 +55,7 @@ class Array(msgspec.Struct, frozen=True):
         Raises:
             ValueError: when dtype, shape and byte count disagree; the sender must repair it.
         """
-        if self.dtype not in DTYPES or any(n < 0 for n in self.shape):
+        if self.dtype not in DTYPES or len(self.shape) > 4 or not all(0 <= n < 2**31 for n in self.shape):
             raise ValueError(f"array: found dtype {self.dtype!r} shape {self.shape}, expected one of {DTYPES}; resend")
         want = prod(self.shape) * np.dtype(self.dtype).itemsize
         if want != len(self.data):

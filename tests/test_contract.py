@@ -197,7 +197,7 @@ def test_an_array_comes_back_as_it_went(dtype: str) -> None:
     ],
 )
 def test_an_array_that_lies_is_refused(dtype: str, shape: tuple[int, ...], size: int) -> None:
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match=r"^array: found .*; resend$"):
         Array(dtype, shape, bytes(size)).numpy()
 
 
