@@ -63,11 +63,11 @@ class Decoder:
         return None if message.get_type().startswith("UNKNOWN") else message
 
     def _is_foreign(self, buf: bytearray, at: int, length: int) -> bool:
-        """Tell whether a frame with an unknown id is one all the same: another frame, or nothing, follows it."""
+        """Tell whether a frame with an id unknown here is one all the same: then it fills what arrived exactly."""
         if _message_id(buf, at) in dialect.mavlink_map:
             return False
         self.bad_frames += 1
-        return at + length == len(buf) or buf[at + length] in (V1, V2)
+        return at == 0 and length == len(buf)
 
 
 def _next_magic(buf: bytearray, at: int) -> int:

@@ -11,6 +11,7 @@ from fleet.telemetry.heartbeat import is_aircraft
 from fleet.telemetry.route import MESSAGES
 
 MOST_UAVS = 250
+SECOND = "second sender for a live id"
 MOST_SENDERS = 512  # addresses with a decoder of their own on one link
 
 News = Sample | Status | Mission | Params
@@ -32,6 +33,7 @@ class Intake:
         self.crafts: dict[int, Craft] = {}  # by MAVLink system id
         self._claims: Claims = {} if claims is None else claims
         self._decoders: OrderedDict[Hashable, Decoder] = OrderedDict()
+        self._rivals: set[int] = set()  # systems whose UAV id another link holds
         self._gone: Counter[str] = Counter()  # counters of decoders no longer kept
 
     def hear(self, arrival: float, data: bytes, source: Hashable = None) -> None:
@@ -47,7 +49,8 @@ class Intake:
 
     def flush(self, now: float) -> list[News]:
         """Hand over what is new; `now` is fleet time [s since 1970]."""
-        return [news for craft in self.crafts.values() for news in craft.take(now)]
+        mine = [craft for craft in self.crafts.values() if self._claims.get(craft.uav) is craft]
+        return [news for craft in mine for news in craft.take(now)]
 
     def counters(self) -> Counter[str]:
         """Give messages, bad_bytes and bad_frames over all senders."""
@@ -69,9 +72,8 @@ class Intake:
         system, component = message.get_srcSystem(), message.get_srcComponent()
         craft = self.crafts.get(system)
         if craft is not None and craft.component == component:
-            if craft.source != source and not self._move(craft, source, arrival):
-                return
-            craft.hear(arrival, message)
+            if self._may_speak(craft, source, arrival):
+                craft.hear(arrival, message)
         elif craft is None and message.get_type() == "HEARTBEAT" and is_aircraft(message):
             self._meet(arrival, message, source)
         else:
@@ -86,22 +88,27 @@ class Intake:
         elif len(self.crafts) >= MOST_UAVS:
             self.refused[f"more than {MOST_UAVS} aircraft on one link"] += 1
         elif holder is not None and arrival - holder.heard < LOST_S:
+            self._rivals.add(system)
             self._alarm(holder, arrival)
         else:
+            self._rivals.discard(system)
             craft = Craft(uav, system, message.get_srcComponent(), source)
             self.crafts[system] = self._claims[uav] = craft
             craft.hear(arrival, message)
 
-    def _move(self, craft: Craft, source: Hashable, arrival: float) -> bool:
-        """Follow an aircraft to a new address once the old one is silent; before that it is an alarm."""
-        if arrival - craft.heard < LOST_S:
-            self._alarm(craft, arrival)
+    def _may_speak(self, craft: Craft, source: Hashable, arrival: float) -> bool:
+        """Tell whether this is the one sender of its id; another takes over once that one is silent."""
+        holder = self._claims.get(craft.uav, craft)
+        if holder is craft and craft.source == source:
+            return True
+        if arrival - holder.heard < LOST_S:
+            self._alarm(holder, arrival)
             return False
-        craft.source = source
+        self._claims[craft.uav], craft.source = craft, source
         return True
 
     def _alarm(self, craft: Craft, arrival: float) -> None:
-        self.refused["second sender for a live id"] += 1
+        self.refused[SECOND] += 1
         craft.say(
             "a second sender uses this id and was refused; give every aircraft its own MAVLink system id", arrival
         )
@@ -114,6 +121,8 @@ class Intake:
         elif name == "HEARTBEAT":
             reason = "a second autopilot on one system id" if is_aircraft(message) else "not an aircraft"
             self.refused[reason] += 1
+        elif message.get_srcSystem() in self._rivals:
+            self.refused[SECOND] += 1
         elif message.get_srcSystem() in self.crafts:
             self.refused["not an autopilot"] += 1
         else:

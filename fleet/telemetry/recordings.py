@@ -36,6 +36,8 @@ def records(path: Path | str) -> Iterator[Record]:
         raise ValueError(
             f"{path.name}: found {path.suffix or 'no suffix'}, expected {' or '.join(SUFFIXES)}; convert it"
         )
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: found no such file, expected a recording; check the path")
     reader = _Reader(path.name)
     for chunk in _chunks(path):
         yield from reader.feed(chunk)

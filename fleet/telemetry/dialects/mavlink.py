@@ -86,7 +86,7 @@ TABLE: tuple[Row, ...] = (
         lambda m: _command(m, m.aspd_error),
         autopilots=("px4", "generic"),
     ),
-    Row("MISSION_CURRENT", "leg", Tick.NONE, lambda m: (m.seq,)),
+    Row("MISSION_CURRENT", "leg", Tick.NONE, lambda m: (-1 if m.seq == 65535 else m.seq,)),
 )
 
 ROWS: dict[str, tuple[Row, ...]] = {

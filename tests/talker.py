@@ -1,0 +1,52 @@
+"""A MAVLink voice for tests: packs messages as one system, and the recordings' whereabouts."""
+
+import os
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+T0 = 1_700_000_000.0  # fleet time at which the tests begin [s since 1970]
+PLANE, ARDU = mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA
+AUTO = 10
+
+
+class Talker:
+    """Pack messages as one MAVLink system, sequence numbers running."""
+
+    def __init__(self, system: int = 7, component: int = 1) -> None:
+        self._mav = mav.MAVLink(None, srcSystem=system, srcComponent=component)
+
+    def pack(self, *messages, v1: bool = False) -> bytes:
+        out = b""
+        for message in messages:
+            out += bytes(message.pack(self._mav, force_mavlink1=v1))
+            self._mav.seq = (self._mav.seq + 1) % 256
+        return out
+
+    def heartbeat(self, kind: int = PLANE, autopilot: int = ARDU, base: int = 0x81, custom: int = AUTO) -> bytes:
+        return self.pack(mav.MAVLink_heartbeat_message(kind, autopilot, base, custom, 4, 3))
+
+    def attitude(self, boot_s: float, phi: float = 0.1) -> bytes:
+        return self.pack(mav.MAVLink_attitude_message(round(boot_s * 1e3) % 2**32, phi, 0.2, 0.3, 0.01, 0.02, 0.03))
+
+    def count(self, n: int) -> bytes:
+        return self.pack(mav.MAVLink_mission_count_message(255, 190, n))
+
+    def item(self, seq: int, command: int = 16, x: int = 470000000, y: int = 80000000, z: float = 50.0, p1: float = 0):
+        return self.pack(mav.MAVLink_mission_item_int_message(255, 190, seq, 3, command, 0, 1, p1, 0, 0, 0, x, y, z))
+
+    def mission(self, *items) -> bytes:
+        return self.count(len(items)) + b"".join(items)
+
+    def param(self, name: str, value: float, index: int = 65535, count: int = 0, kind: int = 9) -> bytes:
+        return self.pack(mav.MAVLink_param_value_message(name.encode(), value, kind, count, index))
+
+
+def recording(name: str) -> Path:
+    """Find a recording, or skip with the reason."""
+    default = Path(__file__).parents[1] / "../shared/recordings"
+    root = Path(os.environ.get("PARAUAV_RECORDINGS", default))
+    if not (root / name).is_file():
+        pytest.skip(f"no {name} under {root}; set PARAUAV_RECORDINGS")
+    return root / name
