@@ -1,10 +1,11 @@
-"""A MAVLink voice for tests: packs messages as one system, and the recordings' whereabouts."""
+"""A MAVLink voice for tests: packs messages as one system; and ears for what the intake makes of them."""
 
-import os
-from pathlib import Path
+import math
 
-import pytest
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from fleet.contract import COLUMNS, Mission, Params, Sample
 
 T0 = 1_700_000_000.0  # fleet time at which the tests begin [s since 1970]
 PLANE, ARDU = mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA
@@ -33,7 +34,9 @@ class Talker:
     def count(self, n: int) -> bytes:
         return self.pack(mav.MAVLink_mission_count_message(255, 190, n))
 
-    def item(self, seq: int, command: int = 16, x: int = 470000000, y: int = 80000000, z: float = 50.0, p1: float = 0):
+    def item(
+        self, seq: int, command: int = 16, *, x: int = 470000000, y: int = 80000000, z: float = 50.0, p1: float = 0
+    ):
         return self.pack(mav.MAVLink_mission_item_int_message(255, 190, seq, 3, command, 0, 1, p1, 0, 0, 0, x, y, z))
 
     def mission(self, *items) -> bytes:
@@ -43,10 +46,22 @@ class Talker:
         return self.pack(mav.MAVLink_param_value_message(name.encode(), value, kind, count, index))
 
 
-def recording(name: str) -> Path:
-    """Find a recording, or skip with the reason."""
-    default = Path(__file__).parents[1] / "../shared/recordings"
-    root = Path(os.environ.get("PARAUAV_RECORDINGS", default))
-    if not (root / name).is_file():
-        pytest.skip(f"no {name} under {root}; set PARAUAV_RECORDINGS")
-    return root / name
+def of(kind, messages, uav=None) -> list:
+    """Pick messages of one class, and of one aircraft where it is named."""
+    return [m for m in messages if isinstance(m, kind) and uav in (None, m.uav)]
+
+
+def assert_finite(news):
+    assert math.isfinite(news.t)
+    if isinstance(news, Sample):
+        for field in COLUMNS:
+            rows = getattr(news, field)
+            if rows is not None:
+                assert np.isfinite(rows.t.numpy()).all()
+                assert np.isfinite(rows.x.numpy()).all()
+                assert (np.diff(rows.t.numpy()) > 0).all()
+    elif isinstance(news, Params):
+        assert all(map(math.isfinite, news.values.values()))
+    elif isinstance(news, Mission):
+        for i in news.items:
+            assert all(map(math.isfinite, (i.param1, i.param2, i.param3, i.param4, i.alt_m)))

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
-from talker import T0, Talker
+from talker import T0, Talker, of
 
 from fleet.contract import MAX_ITEMS, Mission, Params, Sample, Status
 from fleet.telemetry.intake import MOST_SENDERS, Intake
@@ -14,10 +14,6 @@ from fleet.telemetry.shelf import MOST_ROWS
 
 DO_JUMP, LAND = 177, 21
 NAN = math.nan
-
-
-def of(kind, messages, uav=None):
-    return [m for m in messages if isinstance(m, kind) and uav in (None, m.uav)]
 
 
 class Air:
@@ -111,7 +107,7 @@ def test_a_mission_parameter_that_is_nan():
 @pytest.mark.parametrize("targets", [(1, 1), (2, 1), (9, 9), (-3, 1)])
 def test_a_mission_of_jumps_that_lead_nowhere(targets):
     air = Air()
-    jumps = [air.bad.item(seq, DO_JUMP, 0, 0, 0, p1=to) for seq, to in zip((1, 2), targets, strict=True)]
+    jumps = [air.bad.item(seq, DO_JUMP, x=0, y=0, z=0, p1=to) for seq, to in zip((1, 2), targets, strict=True)]
     mission = mission_of(air, air.bad.mission(air.bad.item(0), *jumps))
     assert len(mission.items) == 3
     assert "jump of item 1 never reaches a waypoint" in mission.sentence
@@ -119,7 +115,7 @@ def test_a_mission_of_jumps_that_lead_nowhere(targets):
 
 def test_a_jump_back_to_a_waypoint_is_a_mission_like_any_other():
     air = Air()
-    items = [air.bad.item(0), air.bad.item(1, x=1), air.bad.item(2, x=2), air.bad.item(3, DO_JUMP, 0, 0, 0, p1=1)]
+    items = [air.bad.item(0), air.bad.item(1, x=1), air.bad.item(2, x=2), air.bad.item(3, DO_JUMP, x=0, y=0, z=0, p1=1)]
     assert mission_of(air, air.bad.mission(*items)).sentence == ""
 
 

@@ -1,0 +1,84 @@
+import numpy as np
+import pytest
+from talker import T0
+
+from fleet.telemetry.clock import WRAP_BOOT_S, WRAP_USEC_S, Clock, Clocks
+from fleet.telemetry.dialects.mavlink import Tick
+
+
+def test_the_fastest_message_tells_the_offset():
+    rng = np.random.default_rng(1)
+    clock, boot = Clock(), 100.0
+    for _ in range(2000):
+        boot += 0.04
+        t = clock.fleet(boot, T0 + boot + 0.01 + rng.exponential(0.05))
+    assert t == pytest.approx(T0 + boot + 0.01, abs=5e-3)
+    assert clock.jumps == 0
+
+
+def test_drift_is_followed():
+    clock, t = Clock(), 0.0
+    for step in range(10_000):
+        true = step * 0.1
+        t = clock.fleet(true * (1 - 100e-6), T0 + true)
+    assert t == pytest.approx(T0 + true, abs=5e-3)  # 0.1 s would have built up
+
+
+def test_32_bits_wrap_without_a_jump():
+    for wrap in (WRAP_BOOT_S, WRAP_USEC_S):
+        clock = Clock(wrap)
+        times = [clock.fleet((wrap - 5 + s * 0.1) % wrap, T0 + s * 0.1) for s in range(100)]
+        assert np.diff(times) == pytest.approx(0.1, abs=1e-3)
+        assert clock.jumps == 0
+
+
+@pytest.mark.parametrize("jump", [-50.0, -1e4, 40.0, 1e6])
+def test_a_jump_is_counted_once_and_time_goes_on(jump):
+    clock, times = Clock(), []
+    for step in range(400):
+        boot = 2e4 + step * 0.05 + (jump if step >= 200 else 0.0)
+        times.append(clock.fleet(boot, T0 + step * 0.05))
+    assert clock.jumps == 1
+    kept = [t for t in times if t is not None]
+    assert len(kept) >= 398
+    assert (np.diff(kept) > 0).all()
+    assert kept[-1] == pytest.approx(T0 + 399 * 0.05, abs=0.05)
+
+
+def test_one_late_message_is_no_jump():
+    clock = Clock()
+    for step in range(100):
+        clock.fleet(50 + step * 0.05, T0 + step * 0.05)
+    assert clock.fleet(40.0, T0 + 5.0) is None
+    assert clock.fleet(55.0, T0 + 5.0) == pytest.approx(T0 + 5.0, abs=1e-2)
+    assert clock.jumps == 0
+
+
+def test_a_stalled_radio_is_no_jump():
+    clock = Clock()
+    for step in range(100):
+        clock.fleet(step * 0.05, T0 + step * 0.05)
+    late = [clock.fleet(5 + step * 0.05, T0 + 10.0 + step * 1e-3) for step in range(100)]
+    assert np.diff(late) == pytest.approx(0.05, abs=1e-3)
+    assert clock.jumps == 0
+
+
+def test_usec_counts_from_boot_or_from_1970_and_is_cut_to_32_bits():
+    clocks = Clocks()
+    boot = 3 * WRAP_USEC_S + 100
+    t = clocks.fleet(Tick.BOOT_MS, boot, T0)
+    assert clocks.fleet(Tick.USEC32, (boot + 0.02) % WRAP_USEC_S, T0 + 0.02) == pytest.approx(t + 0.02)
+    assert clocks.fleet(Tick.USEC, boot + 0.03, T0 + 0.03) == pytest.approx(t + 0.03)
+    unix = 1.6e9
+    times = [clocks.fleet(Tick.USEC, unix + s * 0.1, T0 + 1 + s * 0.1) for s in range(50)]
+    assert np.diff(times) == pytest.approx(0.1, abs=1e-6)
+    assert times[0] == pytest.approx(T0 + 1)
+    assert clocks.jumps == 0
+
+
+def test_a_message_without_time_takes_the_newest():
+    clocks = Clocks()
+    assert clocks.fleet(Tick.NONE, 0.0, T0) == T0
+    t = clocks.fleet(Tick.BOOT_MS, 9.0, T0 + 0.1)
+    assert clocks.fleet(Tick.NONE, 0.0, T0 + 0.13) == pytest.approx(t + 0.03)
+    assert clocks.fleet(Tick.NONE, 0.0, T0 + 60.0) == pytest.approx(t + 0.5)
