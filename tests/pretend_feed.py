@@ -1,6 +1,6 @@
 """A pretend gateway and worker on the bus: plausible messages of N UAVs, for working on the viewer and for its tests.
 
-    python tests/pretend_feed.py --uavs 8 --router tcp/127.0.0.1:7447
+python tests/pretend_feed.py --uavs 8 --router tcp/127.0.0.1:7447
 """
 
 import argparse
@@ -95,7 +95,9 @@ class PretendUav:
         ]
         middle = to_geodetic(HOME, self.centre[None])[0]
         items.append(
-            Item(seq=9, command=18, param3=70, lat_e7=int(middle[0]), lon_e7=int(middle[1]), alt_m=float(-self.centre[2]))
+            Item(
+                seq=9, command=18, param3=70, lat_e7=int(middle[0]), lon_e7=int(middle[1]), alt_m=float(-self.centre[2])
+            )
         )
         items.append(Item(seq=10, command=177, param1=1, param2=-1))
         return Mission(uav=self.uav, t=t, items=tuple(items), seq=3, complete=True, sentence=self.text)
@@ -161,8 +163,9 @@ class PretendUav:
         )
 
     def row(self) -> FleetRow:
-        good = self.state is not State.IDENTIFYING
-        return FleetRow(uav=self.uav, state=self.state, verdict=self.text, worker="000000000000abcd", epoch=1, t10_s=17.5, t10_n=9)
+        return FleetRow(
+            uav=self.uav, state=self.state, verdict=self.text, worker="000000000000abcd", epoch=1, t10_s=17.5, t10_n=9
+        )
 
 
 def rows(t: np.ndarray, x: np.ndarray, dtype: str = "<f4") -> Rows:
@@ -191,6 +194,10 @@ class PretendFleet:
 
         return reply
 
+    @staticmethod
+    def _coast(one: PretendUav, t: float, lost_since: float) -> float:
+        return max(t - lost_since, 0.0) if one.state is State.LINK_LOST else 0.0
+
     def advance(self, t: float, *, lost_since: float = 1e18) -> None:
         """Publish what is due until `t`; link-lost UAVs fall silent at `lost_since`."""
         t0, self._last, self._t = self._last or t - 0.2, t, t
@@ -202,7 +209,7 @@ class PretendFleet:
         first, self._second = self._second == 0, int(t)
         for one in self.uavs:
             self._bus.publish(one.status(t))
-            if (message := one.prediction(t, max(t - lost_since, 0.0))) is not None:
+            if (message := one.prediction(t, self._coast(one, t, lost_since))) is not None:
                 self._bus.publish(message, STAMP)
             if first or self._second % 5 == one.uav % 5:
                 self._bus.publish(one.model(t), STAMP)

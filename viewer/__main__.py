@@ -21,8 +21,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to serve on (default 127.0.0.1: this machine only; there is no password, so put an authenticating "
-        "reverse proxy before anything wider)",
+        help="address to serve on (default 127.0.0.1: this machine only; there is no password, so put an "
+        "authenticating reverse proxy before anything wider)",
     )
     parser.add_argument("--router", default=ROUTER, help=f"Zenoh router to join (default {ROUTER})")
     parser.add_argument("--light", action="store_true", help="light colours, for bright surroundings")

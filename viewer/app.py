@@ -53,7 +53,7 @@ class App:
         palette = LIGHT if light else DARK
         self.feed, self._server = Feed(bus), server
         self.scene, self.selection = Scene(server, palette), Selection(server, palette)
-        self.panels = Panels(server, palette, self.choose)
+        self.panels = Panels(server, palette, self.visit)
         self.cameras = Cameras(server)
         self.scene.on_click(self.choose)
         self.selected: int | None = None
@@ -66,6 +66,15 @@ class App:
         if uav in self.feed.vehicles:
             self.selected = uav
             self._dirty.set()
+
+    def visit(self, uav: int) -> None:
+        """Select a UAV that may be out of sight, and turn the cameras to it."""
+        self.choose(uav)
+        vehicle, place = self.feed.vehicles.get(uav), self.feed.place
+        if vehicle is None or place is None or (at := vehicle.where(time.monotonic())) is None:
+            return
+        told = [vehicle.forecast.path] if vehicle.forecast is not None else []
+        self.cameras.fly_to(np.vstack([at, *told]))
 
     def run(self, stop: threading.Event) -> None:
         """Draw until told to stop."""
@@ -139,14 +148,14 @@ class App:
         if not at:
             return
         told = [v.forecast.path[:: max(len(v.forecast.path) // 8, 1)] for v in fleet if v.forecast is not None]
-        seen = (len(at), len(told), bool(len(points)), tuple(self._server.get_clients()))
+        seen = (len(at), len(told), bool(len(points)), self.cameras.watchers())
         if seen == self._seen:
             return
         self._seen = seen
         cloud = np.vstack([np.array(at), *told, points])
         cloud = cloud[np.linalg.norm(cloud - np.median(cloud, axis=0), axis=1) < 20_000 / UNIT_M]
         span = float(np.linalg.norm(np.ptp(cloud, axis=0)))
-        self.scene.glyph = self.panels.glyph.value * float(np.clip(span / 28, 1.5, 12.0))
+        self.scene.glyph = self.panels.glyph.value * float(np.clip(span / 42, 1.2, 12.0))
         self.cameras.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, self.scene.ground]]))
 
     def _follow(self, chosen: Vehicle | None, now: float) -> None:

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 
 FOV = np.radians(50.0)  # vertical field of view [rad]
-VIEW = (np.radians(-125.0), np.radians(32.0))  # where the camera stands: azimuth from east, elevation [rad]
+VIEW = (np.radians(-125.0), np.radians(38.0))  # where the camera stands: azimuth from east, elevation [rad]
 
 
-def frame(points: np.ndarray, aspect: float, margin: float = 1.12) -> tuple[np.ndarray, np.ndarray]:
+def frame(points: np.ndarray, aspect: float, margin: float = 1.05) -> tuple[np.ndarray, np.ndarray]:
     """Place the camera so that every point is in view.
 
     Args:
@@ -29,7 +29,9 @@ def frame(points: np.ndarray, aspect: float, margin: float = 1.12) -> tuple[np.n
         distance = float(np.max(np.maximum(np.abs(x) / (tall * aspect), np.abs(y) / tall) * margin + z))
         depth = distance - z
         look_at = look_at + right * _middle(x / depth) * distance + up * _middle(y / depth) * distance
-    return look_at + to_eye * max(distance, 12.0), look_at
+    eye = look_at + to_eye * max(distance, 12.0)
+    sink = (eye[2] - float(points[:, 2].mean())) / to_eye[2]  # orbit about the fleet, not about a point underground
+    return eye, eye - to_eye * max(sink, 6.0)
 
 
 def _middle(x: np.ndarray) -> float:
@@ -45,6 +47,14 @@ class Cameras:
         start = server.initial_camera
         start.fov, start.near, start.far = FOV, 0.1, 5000.0
 
+    def watchers(self) -> tuple[tuple[int, float], ...]:
+        """Tell who looks, and through what shape of picture: (client, width over height), (n,)."""
+        clients = self._server.get_clients().items()
+        return tuple(
+            (number, round(client.camera.image_width / max(client.camera.image_height, 1), 1))
+            for number, client in clients
+        )
+
     def show(self, points: np.ndarray) -> None:
         """Frame the points for everyone who has not moved their camera."""
         position, look_at = frame(points, 1.0)
@@ -58,6 +68,16 @@ class Cameras:
             position, look_at = frame(points, aspect)
             camera.position, camera.look_at = position, look_at
             self._placed[number] = position
+
+    def fly_to(self, points: np.ndarray) -> None:
+        """Turn every camera to some points (n, 3) [10 m], no farther off than it takes to see them all."""
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        enough = 1.6 * float(np.linalg.norm(points - middle, axis=1).max()) / np.tan(FOV / 2) + 12.0
+        for client in self._server.get_clients().values():
+            away = client.camera.position - client.camera.look_at
+            length = float(np.linalg.norm(away)) or 1.0
+            client.camera.position = middle + away / length * min(length, enough)
+            client.camera.look_at = middle
 
     def follow(self, step: np.ndarray) -> None:
         """Move every camera along with what it follows, by a step (3,) [10 m]."""

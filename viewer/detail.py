@@ -37,14 +37,20 @@ def _cards(vehicle: Vehicle) -> str:
         "horizon": horizon,
         "airspeed": f"{vehicle.Va:.1f} m/s" if isfinite(vehicle.Va) else "–",
     }
-    return '<div class="cards">' + "".join(f'<div class="card"><span class="soft">{k}</span><b>{v}</b></div>' for k, v in cards.items()) + "</div>"
+    return (
+        '<div class="cards">'
+        + "".join(f'<div class="card"><span class="soft">{k}</span><b>{v}</b></div>' for k, v in cards.items())
+        + "</div>"
+    )
 
 
 def why(vehicle: Vehicle, now: float) -> list[str]:
     """Say why there is no prediction, or what limits it; plain text, not yet escaped."""
     state, said = vehicle.state(now), []
     if state is State.LINK_LOST:
-        ghost = "the twin flies on alone; what moves is its prediction" if vehicle.forecast is not None else "no twin yet"
+        ghost = (
+            "the twin flies on alone; what moves is its prediction" if vehicle.forecast is not None else "no twin yet"
+        )
         said.append(f"No sample for {ago(vehicle.age(now))}: {ghost}.")
     elif state in (State.WAITING, State.UNCLAIMED) and vehicle.model is None:
         said.append("No worker has judged this UAV yet; check that `twin_worker` runs on this router.")
@@ -60,7 +66,10 @@ def why(vehicle: Vehicle, now: float) -> list[str]:
 
 
 def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
-    cards = [f'<div class="say" style="border-color:{palette.mismatch}">▲ {escape(a.sentence)}</div>' for a in list(vehicle.alerts.values())]
+    cards = [
+        f'<div class="say" style="border-color:{palette.mismatch}">▲ {escape(a.sentence)}</div>'
+        for a in list(vehicle.alerts.values())
+    ]
     cards += [f'<div class="say">{escape(text)}</div>' for text in why(vehicle, now)]
     verdict = vehicle.model.verdict if vehicle.model is not None else None
     if verdict is not None:
@@ -82,7 +91,10 @@ def _fits(vehicle: Vehicle) -> str:
     names = list(verdict.fit)[:12]
     head = "".join(f'<th class="num">{escape(name)}</th>' for name in names)
     ours = "".join(f'<td class="num">{verdict.fit[name]:.0f}</td>' for name in names)
-    hold = "".join(f'<td class="num soft">{verdict.fit_hold[name]:.0f}</td>' if name in verdict.fit_hold else "<td></td>" for name in names)
+    hold = "".join(
+        f'<td class="num soft">{verdict.fit_hold[name]:.0f}</td>' if name in verdict.fit_hold else "<td></td>"
+        for name in names
+    )
     return (
         f'<div class="soft">fit per state over {verdict.horizon_s:.1f} s, %</div><table><tr><th></th>{head}</tr>'
         f"<tr><td>model</td>{ours}</tr><tr class=soft><td>hold</td>{hold}</tr></table>"
@@ -102,14 +114,26 @@ def _facts(vehicle: Vehicle, now: float) -> str:
     facts = {
         "coverage": coverage(vehicle),
         "method": f"{told.method} · {told.law or 'no law'}" if told is not None else "–",
-        "mode": f"{status.mode or '–'} · {status.autopilot} · {'armed' if status.armed else 'disarmed'}" if status is not None else "–",
-        "link": f"{status.received} received, {status.missed} missed, {status.rejected} refused" if status is not None else "–",
+        "mode": f"{status.mode or '–'} · {status.autopilot} · {'armed' if status.armed else 'disarmed'}"
+        if status is not None
+        else "–",
+        "link": f"{status.received} received, {status.missed} missed, {status.rejected} refused"
+        if status is not None
+        else "–",
         "sample": f"{ago(vehicle.age(now))} old",
-        "prediction": f"{ago(now - vehicle.forecast.heard)} old, coasted {told.coast_s:.0f} s" if vehicle.forecast and told else "–",
-        "within 10 %": f"{row.t10_s:.1f} s median, n = {row.t10_n}" if row is not None and row.t10_s is not None else "–",
+        "prediction": f"{ago(now - vehicle.forecast.heard)} old, coasted {told.coast_s:.0f} s"
+        if vehicle.forecast and told
+        else "–",
+        "within 10 %": f"{row.t10_s:.1f} s median, n = {row.t10_n}"
+        if row is not None and row.t10_s is not None
+        else "–",
         "worker": f"{row.worker} · epoch {row.epoch}" if row is not None else "–",
     }
-    return "<table>" + "".join(f'<tr><td class="soft">{k}</td><td class="num">{escape(v)}</td></tr>' for k, v in facts.items()) + "</table>"
+    return (
+        "<table>"
+        + "".join(f'<tr><td class="soft">{k}</td><td class="num">{escape(v)}</td></tr>' for k, v in facts.items())
+        + "</table>"
+    )
 
 
 class Charts:
@@ -123,25 +147,24 @@ class Charts:
             (("along", p.predicting), ("cross", p.verified), ("vertical", p.identifying), ("horizon", p.horizon)),
             (two,) * 5,
         )
-        self._fit = self._chart("Mean fit of each verdict, %", (("fit", p.verified),), (two, two), y=(0, 100))
+        self._fit = self._chart("Mean fit of each verdict, %", (("fit", p.verified),), (two, two))
         self._alt = self._chart("Altitude, m", (("flown", p.flown), ("predicted", p.predicting)), (two,) * 3)
         self._va = self._chart("Airspeed, m/s", (("Va", p.flown),), (two,) * 2)
 
-    def _chart(self, title: str, lines: tuple, data: tuple, y: tuple[float, float] | None = None) -> tuple[Any, Any]:
+    def _chart(self, title: str, lines: tuple, data: tuple) -> tuple[Any, Any]:
         legend = " ".join(f'<span style="color:{colour};white-space:nowrap">━ {name}</span>' for name, colour in lines)
         head = self._gui.add_html(f'<div class="uav" style="padding-bottom:0"><b>{title}</b> {legend}</div>')
-        series = tuple(uplot.Series(label=name, stroke=colour, width=2) for name, colour in lines)
-        scales: dict[str, Any] = {"x": {"time": False}}
-        if y is not None:
-            scales["y"] = {"range": y}
+        series = tuple(
+            uplot.Series(label=name, stroke=colour, width=2, points={"show": False}) for name, colour in lines
+        )
         plot = self._gui.add_uplot(
             data,
             (uplot.Series(label="s"), *series),
-            scales=scales,
+            scales={"x": {"time": False}},
             axes=({}, {"size": 44}),
             legend={"show": False},
             padding=(10, 16, 0, 0),
-            height=112,
+            height=126,
         )
         return head, plot
 
@@ -155,14 +178,29 @@ class Charts:
 
 
 def _put(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None) -> None:
+    """Show data, x first. The y scale is given: a gap (not a number) would spoil the chart's own."""
     for part in chart:
         part.visible = data is not None
-    if data is not None:
-        chart[1].data = data
+    if data is None:
+        return
+    scales = {"x": {"time": False}, "y": {"range": scale(np.concatenate(data[1:]))}}
+    if chart[1].scales != scales:  # a new scale builds the chart anew: rarely, please
+        chart[1].scales = scales
+    chart[1].data = data
+
+
+def scale(y: np.ndarray) -> tuple[float, float]:
+    """Choose a range for y that holds its finite values and seldom changes: whole multiples of 1, 2 or 5 times 10^k."""
+    y = y[np.isfinite(y)]
+    low, high = (float(y.min()), float(y.max())) if len(y) else (0.0, 1.0)
+    rough = max(high - low, 0.02 * abs(high), 1e-3) / 2
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = float(power * next(m for m in (1, 2, 5, 10) if m * power >= rough * 0.999))
+    return float(np.floor(low / step) * step), float((np.floor(high / step) + 1) * step)
 
 
 def _band(vehicle: Vehicle | None) -> tuple[np.ndarray, ...] | None:
-    """Give the half-axes against look-ahead, and an upright line at the horizon: (x, along, cross, vertical, horizon)."""
+    """Give half-axes against look-ahead, and an upright line at the horizon: x, along, cross, vertical, horizon."""
     if vehicle is None or (told := vehicle.forecast) is None:
         return None
     x = np.sort(np.concatenate([np.linspace(0, told.ahead[-1], 60), [told.until, told.until]]))

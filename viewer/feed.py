@@ -17,7 +17,14 @@ from viewer.vehicle import JUMP_S, Forecast, Vehicle, forecast
 
 MAX_VEHICLES = 2_000  # ids are written by strangers: more than this many are counted, not kept
 GIVE_UP_S = 10.0  # a writer silent for so long has lost its claim: a lower epoch (a restarted fleet) may speak
-LATE = (Status, Mission, Model, Prediction, FleetState)  # asked for at the start, so that a late viewer is complete
+LATE = (
+    Status,
+    Mission,
+    Model,
+    Prediction,
+    Alert,
+    FleetState,
+)  # asked for at the start, so that a late viewer is complete
 
 
 class Feed:

@@ -109,7 +109,7 @@ def triple(colour: str) -> tuple[int, int, int]:
 
 
 def mix(colour: str, other: str, share: float) -> np.ndarray:
-    """Blend two colours, `share` of the first; lines have no alpha, so they fade towards the ground. -> (3,) [0..255]."""
+    """Blend two colours, `share` of the first; lines have no alpha, so they fade to the ground: (3,) [0..255]."""
     return rgb(colour) * share + rgb(other) * (1 - share)
 
 

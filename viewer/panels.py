@@ -1,6 +1,7 @@
 """The panels: left the fleet, its alerts and what to show; right the selected UAV."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from viewer.palette import WORD, Palette, triple
 from viewer.vehicle import Vehicle
 from viewer.words import alerts, empty, summary, table
 
+STALE = "The viewer has stopped sending: this picture is old. Restart it; the page comes back by itself."
 COMMANDS = 50  # UAVs offered in the command palette (Ctrl+K)
 
 
@@ -72,9 +74,7 @@ class Panels:
     def draw(self, fleet: list[Vehicle], feed: Feed, now: float, selected: int | None) -> None:
         """Write everything anew; call it about once a second, and when the selection changes."""
         self._beat = not self._beat
-        self._banner.content = (
-            f'<div class="stale {"a" if self._beat else "b"}">The viewer has stopped sending: this picture is old.</div>'
-        )
+        self._banner.content = f'<div class="stale {"a" if self._beat else "b"}">{STALE}</div>'
         chosen = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
         if not fleet:
             self._summary.content, self._table.content = empty(feed, now), ""
@@ -99,15 +99,16 @@ class Panels:
 
     def _handler(self) -> str:
         """Give the handler of a table row: it sets the hidden input, as if someone had typed the id there."""
-        return (
-            "var m=window.__viserMutable;m&&m.sendMessage({{type:'GuiUpdateMessage',uuid:'%s',updates:{{value:'{}'}}}})"
-            % self._picked._impl.uuid
-        )
+        message = f"{{{{type:'GuiUpdateMessage',uuid:'{self._picked._impl.uuid}',updates:{{{{value:'{{}}'}}}}}}}}"
+        return f"var m=window.__viserMutable;m&&m.sendMessage({message})"
 
     def _offer(self, fleet: list[Vehicle]) -> None:
         """Offer the first UAVs in the command palette."""
         for vehicle in fleet[:COMMANDS]:
             if vehicle.uav not in self._commands and len(self._commands) < COMMANDS:
                 command = self._gui.add_command(f"Select {vehicle.name}", icon=viser.Icon.DRONE)
-                command.on_trigger(lambda _, uav=vehicle.uav: self._choose(uav))
+                command.on_trigger(partial(self._on_command, vehicle.uav))
                 self._commands[vehicle.uav] = command
+
+    def _on_command(self, uav: int, _: Any) -> None:
+        self._choose(uav)

@@ -44,7 +44,7 @@ def ned_to_scene(ned: np.ndarray) -> np.ndarray:
 
 
 def scene_quat(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
-    """Turn attitudes (n,) [rad] into scene orientations (n, 4), scalar first, of a mesh that looks along +x, left +y, up +z.
+    """Turn attitudes (n,) [rad] into orientations (n, 4), scalar first, of a mesh that looks along +x, left is +y.
 
     In ENU with a forward-left-up body the 3-2-1 angles are yaw = pi/2 - psi, pitch = -theta, roll = phi.
     """

@@ -1,4 +1,4 @@
-"""A mission as lines: navigation items in order, loiters as circles; anything else an aircraft may upload is survived."""
+"""A mission as lines: navigation items in order, loiters as circles; all else an aircraft may upload is survived."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,18 @@ from viewer.place import UNIT_M, Place
 # MAV_CMD. Source: MAVLink common.xml.
 WAYPOINT, LOITER_UNLIM, LOITER_TURNS, LOITER_TIME, RTL, LAND, TAKEOFF, LOITER_TO_ALT = 16, 17, 18, 19, 20, 21, 22, 31
 SPLINE, VTOL_TAKEOFF, VTOL_LAND, DO_JUMP = 82, 84, 85, 177
-AT_A_PLACE = {WAYPOINT, LOITER_UNLIM, LOITER_TURNS, LOITER_TIME, LAND, TAKEOFF, LOITER_TO_ALT, SPLINE, VTOL_TAKEOFF, VTOL_LAND}
+AT_A_PLACE = {
+    WAYPOINT,
+    LOITER_UNLIM,
+    LOITER_TURNS,
+    LOITER_TIME,
+    LAND,
+    TAKEOFF,
+    LOITER_TO_ALT,
+    SPLINE,
+    VTOL_TAKEOFF,
+    VTOL_LAND,
+}
 RADIUS_IN = {LOITER_UNLIM: "param3", LOITER_TURNS: "param3", LOITER_TIME: "", LOITER_TO_ALT: "param2"}
 ABSOLUTE = {0, 5}  # MAV_FRAME: GLOBAL, GLOBAL_INT; every other altitude counts from home
 RADIUS_M = 60.0  # where an item names no loiter radius: the default of ArduPlane's WP_LOITER_RAD
@@ -30,7 +41,7 @@ NOTHING = Route(np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), n
 
 
 def home_alt_m(mission: Mission | None) -> float | None:
-    """Give home's altitude above mean sea level [m]: item 0 of an ArduPilot mission; None where the mission has none."""
+    """Give home's altitude [m above mean sea level]: item 0 of an ArduPilot mission; None where there is none."""
     if mission is None or len(mission.items) < 2:
         return None
     first, rest = mission.items[0], mission.items[1:]

@@ -98,7 +98,9 @@ class Scene:
             self._colours = colours
             self._vehicles.batched_colors = mesh_colour(colours * 0.85)
 
-    def _enlist(self, uavs: tuple[int, ...], at: np.ndarray, quat: np.ndarray, size: np.ndarray, colours: np.ndarray) -> None:
+    def _enlist(
+        self, uavs: tuple[int, ...], at: np.ndarray, quat: np.ndarray, size: np.ndarray, colours: np.ndarray
+    ) -> None:
         """Start the batch anew for another set of UAVs; those who stay keep their trails."""
         old = {uav: i for i, uav in enumerate(self.uavs)}
         ring = np.repeat(at[:, None], (CHUNKS + 1) * STEPS + 1, axis=1)
@@ -172,13 +174,15 @@ class Scene:
             colour = 0.35 * rgb(self._palette.state(vehicle.state(now))) + 0.65 * rgb(self._palette.ink)
             lines.append(cut)
             colours.append(faded(colour, rgb(self._palette.ground), np.linspace(0.85, 0.3, 2 * DASHES))[::2])
-        self.predicted.draw(np.concatenate(lines) if lines else [], np.concatenate(colours) if lines else None)
+        self.predicted.draw(
+            np.concatenate(lines) if lines else NOTHING.legs, np.concatenate(colours) if lines else None
+        )
 
     def draw_stems(self, fleet: list[Vehicle], now: float) -> None:
         """Drop a stem from every aircraft to a small foot on the ground."""
         shown = [(v, at) for v in fleet if (at := v.where(now)) is not None] if len(fleet) <= CROWD else []
         if not shown:
-            return self.stems.draw([])
+            return self.stems.draw(NOTHING.legs)
         at = np.array([place for _, place in shown])
         foot = at * [1, 1, 0] + [0, 0, self.ground + 0.05]
         hexagon = circle(np.zeros(3), 0.35 * self.glyph, 6)
@@ -226,7 +230,9 @@ def aircraft() -> tuple[np.ndarray, np.ndarray]:
         vertices.append(box)
         faces.append((quads if half[1] > 0 else quads[:, ::-1]) + 8 * k)
     n = 8 * len(boxes)
-    vertices.append(np.array([[-0.25, 0.01, 0.03], [-0.38, 0.01, 0.03], [-0.40, 0.0, 0.20], [-0.32, 0.0, 0.20], [0.58, 0, 0]]))
+    vertices.append(
+        np.array([[-0.25, 0.01, 0.03], [-0.38, 0.01, 0.03], [-0.40, 0.0, 0.20], [-0.32, 0.0, 0.20], [0.58, 0, 0]])
+    )
     faces.append(np.array([(0, 1, 2), (0, 2, 3), (2, 1, 0), (3, 2, 0)]) + n)
     faces.append(np.array([(4, n + 4, 5), (6, n + 4, 4), (7, n + 4, 6), (5, n + 4, 7)]) * 1)
     return 1.1 * np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)

@@ -6,7 +6,7 @@ import numpy as np
 
 from viewer.feed import Feed
 from viewer.palette import Palette, mix, rgb, triple
-from viewer.routes import Route
+from viewer.routes import NOTHING, Route
 from viewer.strokes import Strokes, chain, dash_lines, dashed
 from viewer.tube import closed, curtain, marks, rings, skin
 from viewer.vehicle import Forecast, Vehicle
@@ -50,7 +50,9 @@ class Selection:
         )
 
     def _label(self, name: str) -> Any:
-        scale, anchor = {"name": (0.95, "bottom-center"), "horizon": (0.8, "bottom-left")}.get(name, (0.65, "top-center"))
+        scale, anchor = {"name": (0.95, "bottom-center"), "horizon": (0.8, "bottom-left")}.get(
+            name, (0.75, "top-center")
+        )
         return self._scene.add_label(
             f"/selected/label_{name}", "", font_screen_scale=scale, anchor=anchor, depth_test=False, visible=False
         )
@@ -65,7 +67,7 @@ class Selection:
     def clear(self) -> None:
         """Hide everything: nobody is selected."""
         for strokes in (self._thin, self._route, self._bold, self._horizon):
-            strokes.draw([])
+            strokes.draw(NOTHING.legs)
         for node in (*self._bands, self._curtain, *self._labels.values()):
             node.visible = False
 
@@ -86,7 +88,7 @@ class Selection:
         self._draw_hindcast(feed.past(vehicle), trail, vehicle.clock(now), thin)
         self._thin.draw(*thin.all())
         self._bold.draw(*bold.all())
-        self.say("name", caption(vehicle, now), at + [0, 0, 0.8 * size])
+        self.say("name", caption(vehicle, now), _above(at, 0.8 * size))
 
     def _draw_forecast(
         self, told: Forecast | None, clock: float, ground: float, thin: "_Sheaf", bold: "_Sheaf"
@@ -119,7 +121,7 @@ class Selection:
         """Claim nothing: no band, no horizon; a path without a horizon is grey dashes."""
         for node in (*self._bands, self._curtain):
             node.visible = False
-        self._horizon.draw([])
+        self._horizon.draw(NOTHING.legs)
         for name in LABELS[1:6]:
             self.say(name, "", None)
         if told is not None:
@@ -145,7 +147,7 @@ class Selection:
         at = np.arange(5.0, reach, 5.0)
         happened = np.stack([np.interp(told.t + at, trail[:, 0], trail[:, i]) for i in (1, 2, 3)], axis=-1)
         thin.add(np.stack([told.at(at), happened], axis=1), colour)
-        self.say("then", f"predicted {clock - told.t:.0f} s ago", told.at(0.15 * reach) - [0, 0, 0.6])
+        self.say("then", f"predicted {clock - told.t:.0f} s ago", told.at(0.4 * reach) - [0, 0, 0.6])
 
     def draw_route(self, route: Route) -> None:
         """Draw the mission: legs and loiters solid, jumps and returns dashed, a small ring at each item."""
@@ -153,7 +155,9 @@ class Selection:
         lines.add(np.concatenate([route.legs, route.circles]), mix(p.route, p.ground, 0.8))
         lines.add(dash_lines(route.back, 3.0), mix(p.route, p.ground, 0.6))
         if len(route.points):
-            lines.add(closed(np.stack([_disc(point, 1.2, 12) for point in route.points])).reshape(-1, 2, 3), rgb(p.route))
+            lines.add(
+                closed(np.stack([_disc(point, 1.2, 12) for point in route.points])).reshape(-1, 2, 3), rgb(p.route)
+            )
         self._route.draw(*lines.all())
 
 
@@ -175,6 +179,10 @@ class _Sheaf:
 def _disc(centre: np.ndarray, radius: float, sides: int = 40) -> np.ndarray:
     turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     return centre + radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(sides)], axis=-1)
+
+
+def _above(at: np.ndarray, height: float) -> np.ndarray:
+    return at + np.array([0.0, 0.0, height])
 
 
 def caption(vehicle: Vehicle, now: float) -> str:

@@ -13,10 +13,12 @@ class Strokes:
     """One node of line segments."""
 
     def __init__(self, scene: Any, name: str, width: float) -> None:
-        self._node = scene.add_line_segments(name, _NONE, np.zeros((1, 2, 3), np.uint8), thickness=width, thickness_units="screen")
+        self._node = scene.add_line_segments(
+            name, _NONE, np.zeros((1, 2, 3), np.uint8), thickness=width, thickness_units="screen"
+        )
 
     def draw(self, segments: np.ndarray, colours: np.ndarray | None = None) -> None:
-        """Show segments (n, 2, 3) [10 m]; colours (3,), (n, 3) or (n, 2, 3), sRGB [0..255]; None keeps the last ones."""
+        """Show segments (n, 2, 3) [10 m]; colours (3,), (n, 3) or (n, 2, 3), sRGB [0..255]; None keeps them."""
         segments = np.asarray(segments, np.float32).reshape(-1, 2, 3)
         if not len(segments):
             segments, colours = _NONE, np.zeros(3)

@@ -34,8 +34,10 @@ def rings(path: np.ndarray, axes: np.ndarray, sides: int = SIDES) -> np.ndarray:
     """
     cross, up = frame_of(path)
     turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)[None, :, None]
-    return path[:, None] + np.cos(turn) * (axes[:, 1, None, None] * cross[:, None]) + np.sin(turn) * (
-        axes[:, 2, None, None] * up[:, None]
+    return (
+        path[:, None]
+        + np.cos(turn) * (axes[:, 1, None, None] * cross[:, None])
+        + np.sin(turn) * (axes[:, 2, None, None] * up[:, None])
     )
 
 

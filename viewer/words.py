@@ -24,7 +24,9 @@ def horizon_s(vehicle: Vehicle) -> float:
 
 def fit(vehicle: Vehicle) -> float | None:
     """Give the mean fit over the states of the last verdict [%]; None before any."""
-    source = vehicle.model.verdict.fit if vehicle.model is not None else vehicle.row.fit if vehicle.row is not None else {}
+    source = (
+        vehicle.model.verdict.fit if vehicle.model is not None else vehicle.row.fit if vehicle.row is not None else {}
+    )
     values = [value for value in source.values() if isfinite(value)]
     return sum(values) / len(values) if values else None
 
@@ -35,9 +37,10 @@ def empty(feed: Feed, now: float) -> str:
     odd = f" {strange} could not be read." if strange else ""
     said = "".join(f"<br>{escape(text)}" for text in feed.sentences.values() if text)
     return (
-        f'<div class="uav"><h1>No vehicles yet</h1><div class="soft">Listening on <code>{escape(feed.listening)}</code> '
-        f"for {now - feed.since:.0f} s. {n} messages.{odd}{said}<br>Check that a gateway is running on this router and "
-        "that aircraft send to it: <code>fleet status</code>, <code>fleet up --uavs 8</code>.</div></div>"
+        f'<div class="uav"><h1>No vehicles yet</h1><div class="soft">Listening on <code>{escape(feed.listening)}'
+        f"</code> for {now - feed.since:.0f} s. {n} messages.{odd}{said}<br>Check that a gateway "
+        "is running on this router and that aircraft send to it: <code>fleet status</code>, "
+        "<code>fleet up --uavs 8</code>.</div></div>"
     )
 
 
@@ -54,11 +57,16 @@ def summary(fleet: list[Vehicle], feed: Feed, palette: Palette, now: float) -> s
     median = f" · median horizon {horizons[len(horizons) // 2]:.0f} s" if horizons else ""
     said = "".join(f'<div class="soft">{escape(text)}</div>' for text in feed.sentences.values() if text)
     plural = "UAV" if len(fleet) == 1 else "UAVs"
-    return f'<div class="uav"><h1>{len(fleet)} {plural}<small>{median}{_fleet_coverage(fleet)}</small></h1>{chips}{said}</div>'
+    head = f"<h1>{len(fleet)} {plural}<small>{median}{_fleet_coverage(fleet)}</small></h1>"
+    return f'<div class="uav">{head}{chips}{said}</div>'
 
 
 def _fleet_coverage(fleet: list[Vehicle]) -> str:
-    told = [v.prediction for v in fleet if v.prediction is not None and v.prediction.held_n > 0 and isfinite(v.prediction.held)]
+    told = [
+        v.prediction
+        for v in fleet
+        if v.prediction is not None and v.prediction.held_n > 0 and isfinite(v.prediction.held)
+    ]
     n = sum(p.held_n for p in told)
     if not n:
         return ""
@@ -83,11 +91,12 @@ def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, on: bool, lo
     glyph = "▲" if vehicle.alerts else GLYPH[state]
     word = f"{WORD[state]} {ago(vehicle.age(now))}" if state is State.LINK_LOST else WORD[state]
     bar = f'<i><i style="width:{min(horizon / longest, 1) * 100:.0f}%;background:{colour}"></i></i>'
+    percent, seconds = "–" if mean is None else f"{mean:.0f}", f"{horizon:.0f} s" if horizon else "–"
     return (
         f'<tr class="pick{" on" if on else ""}" data-uav="{vehicle.uav}" onpointerdown="{pick.format(vehicle.uav)}">'
         f'<td style="color:{colour}">{glyph}</td><td>{vehicle.name}</td>'
-        f'<td style="color:{palette.state(state)}">{word}</td><td class="num">{"–" if mean is None else f"{mean:.0f}"}</td>'
-        f'<td><div class="bar">{bar}<span class="num" style="width:30px">{f"{horizon:.0f} s" if horizon else "–"}</span>'
+        f'<td style="color:{palette.state(state)}">{word}</td><td class="num">{percent}</td>'
+        f'<td><div class="bar">{bar}<span class="num" style="width:30px">{seconds}</span>'
         "</div></td></tr>"
     )
 

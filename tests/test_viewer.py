@@ -1,0 +1,342 @@
+"""The viewer without a browser: colours, epochs, frames, the shape of doubt, hostile missions, words."""
+
+import numpy as np
+import pytest
+from pretend_feed import HOME, HOSTILE, STAMP, PretendFleet, PretendUav
+
+from fleet.bus import MemoryBus
+from fleet.codec import Stamp
+from fleet.contract import Alert, AlertKind, Array, Item, Link, Mission, Prediction, Rows, Sample, State, Status
+from fleet.frames import Origin, body_to_ned, to_geodetic
+from viewer.camera import FOV, frame
+from viewer.detail import about, why
+from viewer.feed import GIVE_UP_S, Feed
+from viewer.palette import DARK, LIGHT, line_colour, rgb, shown_line
+from viewer.place import UNIT_M, Place, scene_quat
+from viewer.routes import route
+from viewer.scene import DASHES, aircraft, cut_at_horizon
+from viewer.tube import curtain, marks, rings, skin
+from viewer.vehicle import SILENT_S
+from viewer.words import empty, summary, table
+
+T = 1_700_000_000.0
+
+
+class Clock:
+    """Monotonic time that only the test moves."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def feed_of(clock: Clock, uavs: int = 3, *, hostile: int | None = None) -> tuple[Feed, PretendFleet, MemoryBus]:
+    bus = MemoryBus()
+    feed = Feed(bus, clock)
+    fleet = PretendFleet(bus, uavs, hostile=hostile)
+    fleet.advance(T)
+    return feed, fleet, bus
+
+
+# --- colours ---
+
+
+@pytest.mark.parametrize("palette", [DARK, LIGHT], ids=["dark", "light"])
+def test_a_line_is_shown_in_the_colour_asked_for(palette) -> None:
+    reached = 0
+    for name in (
+        "predicting",
+        "verified",
+        "identifying",
+        "lost",
+        "mismatch",
+        "horizon",
+        "muted",
+        "tube",
+        "route",
+        "ring",
+    ):
+        wanted = rgb(getattr(palette, name))
+        vertex = line_colour(wanted)
+        if vertex.min() > 0 and vertex.max() < 255:  # else the tone mapping cannot show it at all
+            reached += 1
+            assert np.abs(shown_line(vertex) - wanted).max() < 3, name
+    assert reached >= 5
+
+
+def test_without_the_inversion_a_line_would_be_washed_out() -> None:
+    assert np.abs(shown_line(rgb("#56B4E9")) - [185, 214, 222]).max() <= 1  # as measured in the browser
+
+
+# --- frames ---
+
+
+def test_positions_land_where_they_should() -> None:
+    place = Place(HOME)
+    ned = np.array([[100.0, 250.0, -40.0], [-3000.0, 20.0, 5.0]])
+    scene = place.geodetic(*to_geodetic(HOME, ned).T)
+    assert np.allclose(scene * UNIT_M, [[250, 100, 40], [20, -3000, -5]], atol=0.02)
+
+
+def test_a_path_from_another_origin_lands_on_the_same_spot() -> None:
+    lat, lon, alt = to_geodetic(HOME, np.array([[900.0, -700.0, -120.0]]))[0]
+    other, place = Origin(int(lat), int(lon), int(alt)), Place(HOME)
+    ned = np.array([[10.0, 20.0, -30.0]])
+    assert np.allclose(place.local(other, ned), place.local(HOME, ned + np.array([900, -700, -120])), atol=0.01)
+
+
+@pytest.mark.parametrize(("phi", "theta", "psi"), [(0, 0, 0), (0.5, 0.2, 1.0), (-0.4, -0.3, 3.0), (0.1, 0.6, -2.0)])
+def test_the_mesh_points_where_the_aircraft_points(phi: float, theta: float, psi: float) -> None:
+    angles = (np.array([phi]), np.array([theta]), np.array([psi]))
+    w, x, y, z = scene_quat(*angles)[0]
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    for mesh, body in (([1, 0, 0], [1, 0, 0]), ([0, 1, 0], [0, -1, 0]), ([0, 0, 1], [0, 0, -1])):
+        n, e, d = body_to_ned(*angles, np.array([body], float))[0]
+        assert np.allclose(turn @ mesh, [e, n, -d], atol=1e-9)
+
+
+@pytest.mark.parametrize("bad", [np.nan, 9.5e8, 4e8])
+def test_a_place_off_this_earth_or_far_away_is_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="position"):
+        Place(HOME).geodetic(np.array([bad]), np.array([8e7]), np.array([0.0]))
+
+
+# --- feed ---
+
+
+def test_a_lower_epoch_is_dropped_until_the_higher_one_falls_silent(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    one = PretendUav(0)
+    bus.publish(one.prediction(T + 1, 0.0), Stamp(5, 1))
+    bus.publish(one.prediction(T + 2, 0.0), Stamp(4, 2))
+    assert feed.vehicles[0].forecast.t == T + 1
+    assert feed.counts["outdated"] == 1
+    clock.now += GIVE_UP_S + 1
+    bus.publish(one.prediction(T + 3, 0.0), Stamp(4, 2))
+    assert feed.vehicles[0].forecast.t == T + 3
+
+
+def test_a_late_viewer_is_complete_after_asking(clock: Clock) -> None:
+    bus = MemoryBus()
+    fleet = PretendFleet(bus, 2)
+    fleet.advance(T)
+    feed = Feed(bus, clock)
+    feed.catch_up()
+    late = feed.vehicles[0]
+    assert late.mission is not None and late.status is not None and late.model is not None and late.forecast is not None
+    assert feed.vehicles[1].forecast is None  # still identifying: nobody claims a path
+
+
+def test_strange_messages_are_counted_and_change_nothing(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 2)
+    before = feed.vehicles[0].at.copy(), feed.vehicles[0].forecast
+    good = PretendUav(0).prediction(T + 1, 0.0)
+    nan, short = np.full(good.path.shape, np.nan), np.zeros((3, 3))
+    strange = [
+        Prediction(**{**_fields(good), "path": Array.of(nan)}),
+        Prediction(**{**_fields(good), "path": Array.of(short)}),
+        Prediction(**{**_fields(good), "ahead": Array.of(np.zeros(good.ahead.shape))}),
+        Prediction(**{**_fields(good), "origin": (999_999_999_999, 0, 0)}),
+        Prediction(**{**_fields(good), "tube": Array("<f4", (9, 9), b"")}),
+        Sample(uav=0, t=T + 1, position=Rows(t=Array.of([T], "<f8"), x=Array.of([[1.0, 2.0]]))),
+        Sample(uav=0, t=float("nan")),
+        Sample(uav=-4, t=T),
+    ]
+    for message in strange:
+        bus.publish(message, STAMP)
+    assert feed.counts["strange"] == len(strange)
+    assert np.array_equal(feed.vehicles[0].at, before[0])
+    assert feed.vehicles[0].forecast is before[1]
+
+
+def _fields(message: Prediction) -> dict:
+    return {name: getattr(message, name) for name in message.__struct_fields__}
+
+
+def test_no_fix_draws_nothing(clock: Clock) -> None:
+    feed = Feed(bus := MemoryBus(), clock)
+    bus.publish(Sample(uav=0, t=T, position=Rows(t=Array.of([T], "<f8"), x=Array.of([[0, 0, 0]], "<i8"))))
+    assert feed.place is None and not feed.vehicles
+
+
+def test_the_trail_is_bounded_and_starts_afresh_when_the_clock_goes_back(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    one = PretendUav(0)
+    for k in range(30):
+        bus.publish(one.sample(T + 10 * k, T + 10 * (k + 1)))
+    trail = feed.trail(feed.vehicles[0])
+    assert trail.shape == (900, 5) and np.isfinite(trail).all()
+    bus.publish(one.sample(T, T + 0.5))
+    assert len(feed.trail(feed.vehicles[0])) == 5
+
+
+def test_without_samples_the_link_is_lost_and_the_ghost_moves_on(clock: Clock) -> None:
+    feed, _, _ = feed_of(clock, 1)
+    one = feed.vehicles[0]
+    assert one.state(clock.now) is State.PREDICTING
+    clock.now += SILENT_S + 2
+    assert one.state(clock.now) is State.LINK_LOST
+    expected = one.forecast.at(one.clock(clock.now) - one.forecast.t)
+    assert np.allclose(one.where(clock.now), expected)
+    assert np.linalg.norm(one.where(clock.now) - one.at) * UNIT_M > 20
+    clock.now += 1_000
+    assert np.allclose(one.where(clock.now), one.forecast.path[-1])  # and no farther than was predicted
+
+
+def test_an_alert_comes_and_goes(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    for active, n in ((True, 1), (False, 0)):
+        bus.publish(Alert(uav=0, t=T, kind=AlertKind.GROUND, active=active, sentence="x"))
+        assert len(feed.alerts()) == n
+
+
+# --- shapes ---
+
+
+def test_the_tube_is_as_wide_as_told() -> None:
+    path = np.stack([np.linspace(0, 50, 21), np.zeros(21), np.full(21, 10.0)], axis=-1)
+    axes = np.tile([3.0, 2.0, 0.5], (21, 1))
+    hoops = rings(path, axes)
+    assert np.allclose(np.ptp(hoops[:, :, 1], axis=1), 4.0)
+    assert np.allclose(np.ptp(hoops[:, :, 2], axis=1), 1.0)
+    assert skin(21).max() == hoops.shape[0] * hoops.shape[1] - 1
+
+
+def test_the_tube_stays_finite_where_the_path_stands_still_or_climbs_upright() -> None:
+    still, upright = np.zeros((9, 3)), np.stack([np.zeros(9), np.zeros(9), np.arange(9.0)], axis=-1)
+    stop = np.vstack([np.linspace([0, 0, 0], [5, 5, 0], 5), np.tile([5, 5, 0], (4, 1))])
+    for path in (still, upright, stop, stop[::-1]):
+        hoops = rings(path, np.ones((len(path), 3)))
+        assert np.isfinite(hoops).all()
+        assert np.allclose(np.linalg.norm(hoops - path[:, None], axis=2), 1.0)
+        assert np.isfinite(curtain(path, -2.0)[0]).all()
+
+
+def test_dashes_end_at_the_horizon_and_begin_at_the_aircraft() -> None:
+    ahead = np.linspace(0, 40, 81)
+    path = np.stack([ahead, 0 * ahead, 0 * ahead], axis=-1)
+    cut = cut_at_horizon(ahead, path, 3.0, 17.0)
+    assert cut.shape == (DASHES, 2, 3)
+    assert cut[0, 0, 0] == pytest.approx(3.0) and cut[-1, 1, 0] == pytest.approx(17.0)
+    spent = cut_at_horizon(ahead, path, 30.0, 17.0)  # the horizon has passed: nothing is claimed
+    assert np.array_equal(spent[:, 0], spent[:, 1])
+
+
+def test_time_marks_leave_room_before_the_horizon() -> None:
+    assert marks(26.0) == [5, 10, 20]
+    assert marks(4.0) == []
+
+
+def test_the_camera_sees_every_point() -> None:
+    points = np.random.default_rng(7).uniform(-90, 90, (200, 3)) * [1, 1, 0.2] + [400, -30, 10]
+    for aspect in (0.7, 1.0, 1.8):
+        eye, look_at = frame(points, aspect)
+        ahead = (look_at - eye) / np.linalg.norm(look_at - eye)
+        right = np.cross(ahead, [0, 0, 1.0]) / np.linalg.norm(np.cross(ahead, [0, 0, 1.0]))
+        depth = (points - eye) @ ahead
+        x = (points - eye) @ right / depth / np.tan(FOV / 2) / aspect
+        y = (points - eye) @ np.cross(right, ahead) / depth / np.tan(FOV / 2)
+        assert depth.min() > 0 and max(np.abs(x).max(), np.abs(y).max()) < 1.02
+        assert max(np.abs(x).max(), np.abs(y).max()) > 0.85  # and not from the moon
+
+
+def test_the_aircraft_is_a_sound_mesh() -> None:
+    vertices, faces = aircraft()
+    assert np.isfinite(vertices).all() and faces.max() == len(vertices) - 1
+    assert vertices[:, 0].max() > -vertices[:, 0].min() * 0.9  # the nose is in front
+
+
+# --- missions ---
+
+
+def test_a_route_joins_its_items_at_their_heights() -> None:
+    one = PretendUav(2)
+    found = route(one.mission(T), Place(HOME), ground=-3.0)
+    assert found.legs.shape == (8, 2, 3) and found.back.shape == (1, 2, 3) and len(found.circles) == 48
+    assert np.allclose(found.legs[0, 0, 2] * UNIT_M, -one.ned(-one.phase / one.rate)[2], atol=0.5)
+    radii = np.linalg.norm(found.circles[:, 0, :2] - found.legs[-1, 1, :2], axis=1) * UNIT_M
+    assert np.allclose(radii, 70, atol=0.5)
+
+
+NAN, FAR = float("nan"), 900_000_000
+HOSTILE_ITEMS = {
+    "no items": (),
+    "home only": (Item(seq=0, command=16, frame=0),),
+    "nan altitude": (Item(seq=0, command=16, lat_e7=1, lon_e7=1, alt_m=NAN), Item(seq=1, command=22, alt_m=NAN)),
+    "jump to itself": (Item(seq=0, command=177, param1=0), Item(seq=1, command=177, param1=NAN)),
+    "jump loop": tuple(Item(seq=k, command=177, param1=1 - k, param2=-1) for k in range(2)),
+    "no length": tuple(Item(seq=k, command=16, lat_e7=HOME.lat_e7, lon_e7=HOME.lon_e7) for k in range(4)),
+    "other side": tuple(Item(seq=k, command=16, lat_e7=-k * FAR, lon_e7=2 * FAR) for k in range(4)),
+    "huge": (Item(seq=0, command=19, lat_e7=2**62, lon_e7=-(2**62), alt_m=1e300, param3=1e300),),
+    "wild radius": tuple(
+        Item(seq=k, command=c, lat_e7=HOME.lat_e7, lon_e7=HOME.lon_e7, param2=r, param3=r)
+        for k, (c, r) in enumerate([(17, NAN), (18, 1e9), (31, -80.0), (19, 0.0), (20, NAN), (999, 1.0)])
+    ),
+}
+
+
+@pytest.mark.parametrize("items", HOSTILE_ITEMS.values(), ids=HOSTILE_ITEMS)
+def test_a_hostile_mission_is_survived(items: tuple[Item, ...]) -> None:
+    found = route(Mission(uav=0, t=T, items=items), Place(HOME), ground=0.0)
+    for part in found:
+        assert np.isfinite(part).all()
+    assert all(part.shape[1:] == (2, 3) for part in found[:3])
+    assert (np.linalg.norm(found.legs[:, 1] - found.legs[:, 0], axis=1) > 0).all()
+
+
+# --- words ---
+
+
+def test_what_comes_over_the_bus_is_escaped_everywhere(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 2, hostile=0)
+    bus.publish(Alert(uav=0, t=T, kind=AlertKind.GROUND, sentence=HOSTILE))
+    page = about(feed.vehicles[0], DARK, clock.now) + summary(feed.all(), feed, DARK, clock.now)
+    page += table(feed.all(), 2, DARK, clock.now, "{}", 0)
+    assert "<img" not in page and page.count("&lt;img") >= 4
+
+
+def test_who_has_no_prediction_is_told_why(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 2)
+    assert "before a model is verified" in " ".join(why(feed.vehicles[1], clock.now))
+    assert "window has 41 samples" in about(feed.vehicles[1], DARK, clock.now)
+    bus.publish(Status(uav=1, t=T, link=Link.LOST, sentence="no heartbeat for 6 s"))
+    clock.now += 6
+    told = " ".join(why(feed.vehicles[1], clock.now))
+    assert "No sample for 6 s" in told and "no heartbeat for 6 s" in told
+
+
+def test_the_panel_says_measured_coverage(clock: Clock) -> None:
+    feed, _, _ = feed_of(clock, 1)
+    assert "90 % tube held 91 %, n = 412" in about(feed.vehicles[0], DARK, clock.now)
+
+
+def test_an_empty_page_says_what_it_listens_to(clock: Clock) -> None:
+    feed = Feed(MemoryBus(), clock)
+    clock.now += 42
+    page = empty(feed, clock.now)
+    assert "parauav/*/sample" in page and "for 42 s" in page and "0 messages" in page
+
+
+def test_the_worst_and_shortest_stand_first(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 8)
+    bus.publish(Alert(uav=4, t=T, kind=AlertKind.CONFLICT, sentence="x"))
+    page = table(feed.all(), 8, DARK, clock.now, "{}", None)
+    order = [int(part.split('"')[0]) for part in page.split('data-uav="')[1:]]
+    assert set(order[:2]) == {4, 6} and order[2:4] == [5, 1]
+    horizons = [
+        feed.vehicles[uav].forecast.until for uav in order[4:] if feed.vehicles[uav].row.state is State.PREDICTING
+    ]
+    assert horizons == sorted(horizons)
