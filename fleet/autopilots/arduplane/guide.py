@@ -32,8 +32,16 @@ def init(
     ctl = np.zeros(S.N_CTL)
     known = np.isfinite(start[0]) and np.isfinite(start[1]) and np.isfinite(start[2])
     leg_rules.set_leg(ctl, par, legs, k, start if known else p)
+    ctl[S.LINE] = 1.0 if known else 0.0
     tecs.reset(ctl, par, -p[2], -v[2], Va, theta_c, delta_t)
     return ctl
+
+
+@kernel
+def speed(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray) -> float:
+    """Give the airspeed commanded on the current leg, equivalent [m/s]."""
+    i = leg_rules.current(ctl, legs)
+    return legs[i, VA_C] if i >= 0 and legs[i, VA_C] > 0.0 else par[P.VA_CRUISE]
 
 
 @kernel
@@ -45,11 +53,10 @@ def fly(
     dt = max(dt, 1e-3)
     a_lat, over = leg_rules.steer(ctl, par, legs, p, v, euler, dt)
     phi_c = l1.to_roll(par, a_lat, euler[1])
-    i = leg_rules.current(ctl, legs)
-    va_c = legs[i, VA_C] if i >= 0 and legs[i, VA_C] > 0.0 else par[P.VA_CRUISE]
     h_sp = leg_rules.height_demand(ctl, par, legs, p)
     tecs.update_speed(ctl, par, v, euler, Va, Va_dot, dt)
-    theta_c, delta_t = tecs.update(ctl, par, h_sp, va_c, -p[2], -v[2], euler[0], not np.isfinite(Va), dt)
+    va_c, blind = speed(ctl, par, legs), not np.isfinite(Va)
+    theta_c, delta_t = tecs.update(ctl, par, h_sp, va_c, -p[2], -v[2], euler[0], blind, dt)
     return phi_c, theta_c, delta_t, over
 
 

@@ -33,6 +33,7 @@ from fleet.mission import (
 
 _CLIMB_AT_ONCE = 1 << 14  # FLIGHT_OPTIONS: climb to the next altitude at once
 _EXIT = pi / 18  # leave a circle within 10 deg of the way out, 10 deg more each extra turn [rad]
+_FAR = 3.0  # farther from a circle than so many radii its line is followed, not the circle
 _LEVEL = 5.0  # altitude error that ends LOITER_TO_ALT [m]
 
 
@@ -83,7 +84,8 @@ def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndar
         set_leg(ctl, par, legs, k, p)
         return
     set_leg(ctl, par, legs, k, legs[i, P_N : P_D + 1])
-    along, length = along_line(ctl, legs[current(ctl, legs)], p)
+    ctl[S.LINE] = 1.0
+    along, length = along_line(ctl, legs[k], p)
     if along > length:
         set_leg(ctl, par, legs, k, p)
 
@@ -115,9 +117,11 @@ def steer(
         a_lat = l1.follow_line(ctl, par, leg, p, v, euler[2], dt)
         return a_lat, kind == WAYPOINT and _arrived(ctl, par, leg, p, v, euler[2])
     radius = leg[RADIUS] if leg[RADIUS] != 0.0 else par[P.LOITER_RAD]
-    wide = l1.circle_radius(par, abs(radius))
-    a_lat, around = l1.follow_circle(ctl, par, leg, p, v, euler[2], wide if radius >= 0.0 else -wide)
-    _count(ctl, leg, p, around, 1.0 if radius >= 0.0 else -1.0, dt)
+    d, wide = 1.0 if radius >= 0.0 else -1.0, l1.circle_radius(par, abs(radius))
+    if ctl[S.ON] == 0.0 and ctl[S.LINE] > 0.0 and hypot(leg[P_N] - p[0], leg[P_E] - p[1]) > _FAR * wide:
+        return l1.follow_line(ctl, par, leg, p, v, euler[2], dt), False
+    a_lat, around = l1.follow_circle(ctl, par, leg, p, v, euler[2], d * wide)
+    _count(ctl, leg, p, around, d, dt)
     return a_lat, _circled(ctl, legs, i, p, v, euler[2], wide)
 
 
@@ -148,7 +152,8 @@ def _count(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, around: bool, d: flo
     if ctl[S.ON] > 0.0:
         ctl[S.ANGLE] += wrap(bearing - ctl[S.BEARING]) * d
         ctl[S.TIMER] += dt
-    elif around:
+    along, length = along_line(ctl, leg, p)
+    if around or along > length:
         ctl[S.ON] = 1.0
     ctl[S.BEARING] = bearing
 

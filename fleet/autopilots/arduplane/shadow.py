@@ -12,7 +12,7 @@ from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.arduplane import state as S
 from fleet.autopilots.arduplane.attitude import FULL, stabilise
-from fleet.autopilots.arduplane.guide import fly, init
+from fleet.autopilots.arduplane.guide import fly, init, speed
 from fleet.autopilots.arduplane.state import kernel
 from fleet.frames import G, wrap
 from fleet.mission import SEQ
@@ -34,7 +34,7 @@ def _find(ctl: np.ndarray, legs: np.ndarray, seq: float) -> int:
 
 @kernel
 def _usable(p: np.ndarray, v: np.ndarray, euler: np.ndarray) -> bool:
-    return np.all(np.isfinite(p)) and np.all(np.isfinite(v)) and np.all(np.isfinite(euler))
+    return bool(np.all(np.isfinite(p)) and np.all(np.isfinite(v)) and np.all(np.isfinite(euler)))
 
 
 @kernel
@@ -101,7 +101,9 @@ def _begin(
 ) -> np.ndarray:
     theta = theta_c if np.isfinite(theta_c) else euler[1]
     thr = delta_t if np.isfinite(delta_t) else 0.5 * (par[P.THR_MIN] + par[P.THR_MAX])
-    return init(par, legs, 0, start, p, v, euler, Va, theta, thr)
+    ctl = init(par, legs, 0, start, p, v, euler, Va, theta, thr)
+    ctl[S.V_DEM] = speed(ctl, par, legs) * par[P.EAS2TAS]  # long in force, more likely than not
+    return ctl
 
 
 @kernel

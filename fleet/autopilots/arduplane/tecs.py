@@ -72,9 +72,13 @@ def _slowest(par: np.ndarray, phi: float) -> float:
 
 @kernel
 def _demand_speed(ctl: np.ndarray, par: np.ndarray, va_c: float, phi: float, dt: float) -> float:
-    """Move the speed demand at half the energy rate there is; give its rate above its slow part [m/s2]."""
+    """Move the speed demand as power and drag allow; give its rate above its slow part [m/s2].
+
+    Up with half the climb power, down with 0.9 of the drag, which is SINK_MIN at cruise and grows with V^2.
+    """
     V = ctl[S.V_HAT]
-    fastest, slowest = 0.5 * par[P.CLIMB_MAX] * ctl[S.UP] * G / V, -0.5 * par[P.SINK_MIN] * G / V
+    fastest = 0.5 * par[P.CLIMB_MAX] * ctl[S.UP] * G / V
+    slowest = -0.9 * par[P.SINK_MIN] * G * V * V / (par[P.VA_CRUISE] * par[P.EAS2TAS]) ** 3
     low, high = _slowest(par, phi), par[P.VA_MAX] * par[P.EAS2TAS]
     if ctl[S.THR_SAT] > 0.0:  # no power left: wind the ceiling down
         ctl[S.V_TOP] = max(ctl[S.V_TOP] + slowest * dt, min(par[P.VA_CRUISE] * par[P.EAS2TAS], high))
