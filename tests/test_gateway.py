@@ -1,0 +1,407 @@
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from conftest import ROOT, unused_port
+from pymavlink.dialects.v20 import ardupilotmega as mav
+from talker import T0, Talker, of
+
+from fleet.bus import MemoryBus, connect, open_router
+from fleet.contract import Account, Item, Mission, Params, Sample, Status
+from fleet.pretend.mavlink import Voice
+from fleet.telemetry.decode import Decoder
+from fleet.telemetry.intake import Intake
+from fleet.telemetry.recordings import replay_messages
+from gateway.link import Batch, Udp
+from gateway.onboard import Onboard
+from gateway.pump import Pump
+from gateway.recorded import Replay
+from gateway.spec import read_spec
+
+PATIENCE_S = 30.0  # an upper bound; every wait ends with its condition
+ITEMS = tuple(Item(seq=i, command=16, lat_e7=470_000_000 + i, lon_e7=80_000_000, alt_m=50.0 + i) for i in range(12))
+
+
+class Ear:
+    """Collect from a bus and wake whoever waits for a condition."""
+
+    def __init__(self, bus):
+        self.news = []
+        self._changed = threading.Condition()
+        for kind in (Sample, Status, Mission, Params, Account):
+            bus.subscribe(kind, self._hear)
+
+    def _hear(self, message, _stamp):
+        with self._changed:
+            self.news.append(message)
+            self._changed.notify_all()
+
+    def of(self, kind, uav=None):
+        return [m for m in list(self.news) if isinstance(m, kind) and uav in (None, getattr(m, "uav", None))]
+
+    def wait(self, condition):
+        with self._changed:
+            assert self._changed.wait_for(lambda: condition(self), PATIENCE_S), "waited in vain"
+
+
+# ---- links
+
+
+def test_a_link_is_read():
+    spec = read_spec("udpin:0.0.0.0:14550#offset=-1")
+    assert (spec.kind, spec.where, spec.port, spec.offset) == ("udpin", "0.0.0.0", 14550, -1)
+    assert read_spec("udpin::14550", 3)[2:] == ("127.0.0.1", 14550, 1.0, 3)
+    assert read_spec("replay:/a b/c.tlog.xz?speed=max")[1:5] == ("replay", "/a b/c.tlog.xz", 0, float("inf"))
+    assert read_spec("replay:c.tlog?speed=4").speed == 4
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "udpin:",
+        "udpin:14550:x",
+        "udpin:h:0",
+        "udpin:h:99999",
+        "tcp:h:1",
+        "replay:x.csv",
+        "udpin:h:1#offset=x",
+        "udpin:h:1#a=1",
+    ],
+)
+def test_what_is_no_link_stops_at_start(text):
+    with pytest.raises(ValueError, match="expected udpin:HOST:PORT"):
+        read_spec(text)
+
+
+@pytest.mark.parametrize("speed", ["0", "-1", "nan", "fast"])
+def test_what_is_no_speed_stops_at_start(speed):
+    with pytest.raises(ValueError, match="found .*, expected"):
+        read_spec(f"replay:x.tlog?speed={speed}")
+
+
+def test_a_busy_port_is_one_sentence():
+    link = Udp(read_spec(f"udpin:127.0.0.1:{unused_port()}"))
+    try:
+        with pytest.raises(OSError, match=r"^link udpin:\S+:\d+: .*; stop what holds the port or name another$"):
+            Udp(read_spec(link.spec.text))
+    finally:
+        link.close()
+
+
+# ---- questions
+
+
+class Aircraft:
+    """A pretend aircraft's voice on a radio that loses a share of everything, both ways."""
+
+    def __init__(self, loss, silent=(), system=7):
+        self.voice = Voice(system, ITEMS, {f"P{i:03d}": float(i) for i in range(300)})
+        self.talker = Talker(system)
+        self._loss, self._silent = loss, silent
+        self._rng = np.random.default_rng(4)
+        self.asked: list = []
+        self._ears = Decoder()
+
+    def hear(self, data: bytes, t: float) -> list[bytes]:
+        if self._rng.random() < self._loss:
+            return []
+        (question,) = self._ears.feed(data)
+        self.asked.append((t, question))
+        if question.get_type() in self._silent:
+            return []
+        return self._lossy(self.voice.hear(data, t))
+
+    def stream(self) -> list[bytes]:
+        return self._lossy(self.voice.stream(20))
+
+    def _lossy(self, frames: list[bytes]) -> list[bytes]:
+        return [frame for frame in frames if self._rng.random() >= self._loss]
+
+    def names(self) -> list[str]:
+        return [question.get_type() for _, question in self.asked]
+
+
+def fly(aircraft, seconds, tick=0.1):
+    """Let intake and questions talk with an aircraft for a while of pretended time."""
+    intake, onboard, news = Intake(), Onboard(), []
+    for step in range(round(seconds / tick)):
+        t = T0 + step * tick
+        if step % 10 == 0:
+            intake.hear(t, aircraft.talker.heartbeat(), "air")
+        for frame in aircraft.stream():
+            intake.hear(t, frame, "air")
+        news += intake.flush(t)
+        for where, data in onboard.tick(t, intake.crafts.values()):
+            assert where == "air"
+            for frame in aircraft.hear(data, t):
+                intake.hear(t, frame, "air")
+    return news, intake
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_mission_and_parameters_are_fetched_whatever_the_radio_loses(loss):
+    aircraft = Aircraft(loss)
+    news, _ = fly(aircraft, 60.0)
+    mission, params = of(Mission, news)[-1], of(Params, news)[-1]
+    assert mission.complete
+    assert mission.items == ITEMS
+    assert params.complete
+    assert params.values == {f"P{i:03d}": float(i) for i in range(300)}
+    if not loss:
+        names = aircraft.names()
+        assert (
+            names.count("PARAM_REQUEST_LIST") == names.count("MISSION_REQUEST_LIST") == names.count("MISSION_ACK") == 1
+        )
+        assert names.count("MISSION_REQUEST_INT") <= len(ITEMS) + 5
+
+
+def test_who_does_not_answer_is_asked_ever_less():
+    silent = ("MISSION_REQUEST_LIST", "PARAM_REQUEST_LIST", "COMMAND_LONG")
+    aircraft = Aircraft(0.0, silent)
+    fly(aircraft, 300.0)
+    names = aircraft.names()
+    assert 5 <= names.count("MISSION_REQUEST_LIST") <= 12
+    assert 4 <= names.count("PARAM_REQUEST_LIST") <= 9
+    assert 295 <= names.count("HEARTBEAT") <= 301
+    rates = [question for _, question in aircraft.asked if question.get_type() == "COMMAND_LONG"]
+    assert len(rates) == 3 * 6  # three tries, then it is left in peace
+    assert {(int(q.param1), q.param2) for q in rates} >= {(30, 40_000.0), (33, 100_000.0)}
+
+
+def test_rates_that_are_high_enough_are_left_alone():
+    intake, onboard, talker = Intake(), Onboard(), Talker()
+    asked = []
+    for step in range(1500):
+        t = T0 + step * 0.02
+        if step % 50 == 0:
+            intake.hear(t, talker.heartbeat(), "air")
+        intake.hear(t, talker.attitude(step * 0.02), "air")
+        if step % 5 == 0:
+            intake.flush(t)
+            asked += [m for _, d in onboard.tick(t, intake.crafts.values()) for m in Decoder().feed(d)]
+    ids = {int(m.param1) for m in asked if m.get_type() == "COMMAND_LONG"}
+    assert ids
+    assert mav.MAVLINK_MSG_ID_ATTITUDE not in ids
+
+
+def test_a_lost_aircraft_is_not_spoken_to():
+    intake, onboard = Intake(), Onboard()
+    intake.hear(T0, Talker().heartbeat(), "air")
+    assert onboard.tick(T0, intake.crafts.values())
+    intake.flush(T0 + 10)
+    assert onboard.tick(T0 + 10, intake.crafts.values()) == []
+
+
+# ---- pump and publisher
+
+
+class Fake:
+    """A link without a thread, remembering what was sent."""
+
+    def __init__(self, offset=0):
+        self.spec = read_spec(f"udpin:127.0.0.1:1#offset={offset}")
+        self.dropped, self.sent = 0, []
+
+    def start(self, number, out, stop):
+        out.put(Batch(number, [], ended=True))
+
+    def send(self, where, data):
+        self.sent.append((where, data))
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize("listen_only", [False, True])
+def test_latest_news_answer_and_only_listening_sends_nothing(listen_only):
+    bus, link, talker = MemoryBus(), Fake(offset=-1), Talker()
+    pump, ear = Pump([link], bus, listen_only), Ear(bus)
+    data = talker.heartbeat() + talker.attitude(1.0) + talker.mission(talker.item(0)) + talker.param("A", 2.0, 0, 1)
+    pump.take(Batch(0, [(time.time(), "air", data)]))
+    pump._tick(0.0)
+    pump.run(threading.Event())
+    assert {type(m) for m in ear.news} == {Sample, Status, Mission, Params, Account}
+    ((mission, _),) = bus.ask(Mission)
+    assert (mission.uav, len(mission.items)) == (6, 1)
+    assert bus.ask(Params, 6)[0][0].values == {"A": 2.0}
+    assert bus.ask(Status, 5) == []
+    ((account, _),) = bus.ask(Account)
+    assert (account.uavs, account.datagrams, account.messages, account.bad_bytes) == ((6,), 1, 5, 0)
+    assert account.bytes_in == len(data)
+    assert bool(link.sent) is not listen_only
+
+
+def test_mission_and_parameters_are_said_again():
+    bus, talker = MemoryBus(), Talker()
+    pump, ear = Pump([Fake()], bus), Ear(bus)
+    pump.take(Batch(0, [(time.time(), "air", talker.heartbeat() + talker.mission(talker.item(0)))]))
+    for mono in (0.0, 5.0, 11.0, 12.0, 22.0):
+        pump._tick(mono)
+    assert len(ear.of(Mission)) == 3
+
+
+def flight(seconds=20.0, system=7):
+    """Write a short recording's bytes."""
+    talker, out = Talker(system), b""
+    for step in range(round(seconds * 20)):
+        frames = [talker.attitude(step * 0.05)] + ([talker.heartbeat()] if step % 20 == 0 else [])
+        for frame in frames:
+            out += round((T0 + step * 0.05) * 1e6).to_bytes(8, "big") + frame
+    return out
+
+
+def test_a_recording_played_live_says_what_it_says_offline(tmp_path):
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(flight())
+    bus = MemoryBus()
+    ear = Ear(bus)
+    Pump([Replay(read_spec(f"replay:{path}?speed=max"))], bus).run(threading.Event())
+    live = [m for m in ear.news if not isinstance(m, Account)]
+    assert live == list(replay_messages(path))
+    assert len(live) > 200
+    assert ear.of(Account)[-1].t == pytest.approx(T0 + 20, abs=0.2)
+
+
+def test_a_recording_keeps_its_pace(tmp_path):
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(flight(10.0))
+    began = time.monotonic()
+    Pump([Replay(read_spec(f"replay:{path}?speed=20"))], MemoryBus()).run(threading.Event())
+    assert 0.45 <= time.monotonic() - began < 5.0
+
+
+# ---- end to end
+
+
+@pytest.fixture(scope="module")
+def router():
+    where = f"tcp/127.0.0.1:{unused_port()}"
+    session = open_router(where)
+    yield where
+    session.close()
+
+
+def udp_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+def test_udp_to_zenoh_through_a_megabyte_of_noise(router):
+    stop = threading.Event()
+    with connect(router) as bus, connect(router) as mine:
+        link, ear = Udp(read_spec(f"udpin:127.0.0.1:{udp_port()}")), Ear(mine)
+        thread = threading.Thread(target=Pump([link], bus).run, args=(stop,))
+        thread.start()
+        try:
+            with Radio(link.port) as radio:
+                ear.wait(lambda e: e.of(Sample, 7) and any(p.complete for p in e.of(Params, 7)))
+                ear.wait(lambda e: any(m.complete and m.items == ITEMS for m in e.of(Mission, 7)))
+                noise = np.random.default_rng(1).bytes(1_000_000)
+                before = len(ear.of(Sample, 7))
+                for start in range(0, len(noise), 1000):
+                    radio.noise(noise[start : start + 1000])
+                ear.wait(lambda e: e.of(Account) and e.of(Account)[-1].bad_bytes > 100_000)
+                ear.wait(lambda e: len(e.of(Sample, 7)) > before + 5)
+                assert [m.uav for m, _ in mine.ask(Status)] == [7]
+                assert mine.ask(Mission, 7)[0][0].items == ITEMS
+                assert ear.of(Account)[-1].uavs == (7,)
+                assert abs(ear.of(Sample, 7)[-1].t - time.time()) < 5
+        finally:
+            stop.set()
+            thread.join(PATIENCE_S)
+        assert not thread.is_alive()
+
+
+class Radio:
+    """A pretend aircraft on a socket, in a thread of its own."""
+
+    def __init__(self, port):
+        self._socket, self._noise = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+        self._to = ("127.0.0.1", port)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def noise(self, data):
+        self._noise.sendto(data, self._to)
+
+    def _run(self):
+        aircraft, began = Aircraft(0.0), time.monotonic()
+        self._socket.settimeout(0.02)
+        while not self._stop.is_set():
+            now = time.monotonic() - began
+            frames = [aircraft.talker.heartbeat(), aircraft.talker.attitude(now), *aircraft.stream()]
+            with contextlib.suppress(OSError):
+                frames += aircraft.hear(self._socket.recv(4096), now)
+            for frame in frames:
+                self._socket.sendto(frame, self._to)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._stop.set()
+        self._thread.join()
+        self._socket.close()
+        self._noise.close()
+
+
+def start(*arguments):
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_the_gateway_stops_cleanly(router, number):
+    child = start("-m", "gateway", "--router", router, "--link", f"udpin:127.0.0.1:{udp_port()}")
+    with child:
+        assert child.stdout.readline().startswith("gateway: udpin")
+        child.send_signal(number)
+        _, errors = child.communicate(timeout=PATIENCE_S)
+    assert (child.returncode, errors) == (0, "")
+
+
+def test_a_port_in_use_and_a_missing_router_end_with_a_sentence(router):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
+        held.bind(("127.0.0.1", 0))
+        with start("-m", "gateway", "--router", router, "--link", f"udpin:127.0.0.1:{held.getsockname()[1]}") as child:
+            _, errors = child.communicate(timeout=PATIENCE_S)
+    assert child.returncode == 2
+    assert errors.startswith("gateway: link udpin:")
+    assert errors.count("\n") == 1
+    with start("-m", "gateway", "--router", f"tcp/127.0.0.1:{unused_port()}") as child:
+        _, errors = child.communicate(timeout=PATIENCE_S)
+    assert child.returncode == 2
+    assert "nobody answers" in errors
+
+
+def test_fleet_replay_joins_a_running_fleet(router, tmp_path):
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(flight(system=9))
+    with connect(router) as mine:
+        ear = Ear(mine)
+        with start(
+            "-m", "fleet.cli", "replay", str(path), "--speed", "20", "--offset", "-1", "--router", router
+        ) as child:
+            _, errors = child.communicate(timeout=PATIENCE_S)
+        assert (child.returncode, errors) == (0, "")
+        ear.wait(lambda e: sum(len(s.attitude.t.numpy()) for s in e.of(Sample, 8)) > 350)
+    with start("-m", "fleet.cli", "replay", str(tmp_path / "none.tlog"), "--router", router) as child:
+        _, errors = child.communicate(timeout=PATIENCE_S)
+    assert child.returncode == 2
+    assert "found no such file" in errors
