@@ -1,0 +1,418 @@
+"""The pretend aircraft: it trims, flies, is blown about, and speaks MAVLink as ArduPlane does."""
+
+import socket
+import struct
+from collections import Counter
+from math import degrees, hypot, pi
+from threading import Event
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from fleet.cli import main
+from fleet.contract import Item
+from fleet.frames import to_geodetic, to_ned
+from fleet.pretend import drive
+from fleet.pretend.jsbsim import CRUISE, DT, Aircraft
+from fleet.pretend.link import Link
+from fleet.pretend.mavlink import AUTO, TELEMETRY, Voice
+from fleet.pretend.missions import DO_CHANGE_SPEED, DO_JUMP, HOME, LOITER_TURNS, WAYPOINT, mission
+from fleet.pretend.sensors import Sensors, Servos
+from fleet.pretend.tuning import tuned
+from fleet.pretend.uav import PretendUav
+from fleet.pretend.weather import GaussMarkov, Wind, turbulence_level
+
+ALOFT = np.array([100.0, -200.0, -120.0])
+
+
+def trimmed(seed: int = 3, wind: tuple[float, float] = (0.0, 0.0), turbulence: int = 0) -> tuple[Aircraft, float]:
+    aircraft = Aircraft(HOME, seed, turbulence)
+    _, delta_e, delta_t = aircraft.start(ALOFT, 1.0, CRUISE, wind)
+    aircraft.drive(0.0, delta_e, 0.0, delta_t)
+    return aircraft, delta_t
+
+
+def glide(aircraft: Aircraft, seconds: float) -> None:
+    for _ in range(round(seconds / DT)):
+        aircraft.step()
+
+
+def heard(frames: list[bytes]) -> list:
+    ear = mav.MAVLink(None)
+    return [message for frame in frames for message in (ear.parse_buffer(frame) or [])]
+
+
+def ask(message: mav.MAVLink_message) -> bytes:
+    return bytes(message.pack(mav.MAVLink(None, srcSystem=255, srcComponent=190)))
+
+
+@pytest.fixture(scope="module")
+def flown() -> tuple[PretendUav, list]:
+    """Forty seconds of one aircraft, and everything it said."""
+    uav = PretendUav(4, seed=11, wind=3.0, turbulence=2)
+    frames = [frame for k in range(4_000) for frame in uav.step((k + 1) * DT)]
+    return uav, heard(frames)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_trim_holds_level_flight(seed: int) -> None:
+    aircraft, delta_t = trimmed(seed)
+    assert 0.2 < delta_t < 0.7
+    glide(aircraft, 2.0)
+    x = aircraft.truth()
+    assert abs(x.p[2] - ALOFT[2]) < 0.5
+    assert abs(x.Va - CRUISE) < 0.3
+    assert abs(degrees(x.euler[0])) < 10  # hand-built askew, stick fixed: rolls slowly
+    assert abs(degrees(x.alpha) - 4) < 4
+
+
+def test_start_is_where_it_was_put() -> None:
+    x = trimmed(wind=(3.0, -2.0))[0].truth()
+    assert np.abs(x.p - ALOFT).max() < 0.05
+    assert x.euler[2] == pytest.approx(1.0, abs=1e-6)
+    assert x.Va == pytest.approx(CRUISE, abs=1e-3)
+    assert x.v[:2] == pytest.approx([CRUISE * np.cos(1.0) + 3.0, CRUISE * np.sin(1.0) - 2.0], abs=1e-3)
+    assert x.force[2] == pytest.approx(-9.8, abs=0.1)  # specific force of level flight, FRD
+
+
+def test_wind_carries_the_aircraft() -> None:
+    still, blown = trimmed()[0], trimmed(wind=(5.0, 0.0))[0]
+    glide(still, 2.0)
+    glide(blown, 2.0)
+    carried = blown.truth().p - still.truth().p
+    assert carried[0] == pytest.approx(10.0, abs=0.5)
+    assert abs(carried[1]) < 0.5
+
+
+def test_turbulence_shakes_more_the_stronger_it_is() -> None:
+    def shake(level: int) -> float:
+        aircraft = trimmed(turbulence=level)[0]
+        felt = []
+        for _ in range(300):
+            aircraft.step()
+            felt.append(aircraft.truth().force[2])
+        return float(np.std(felt))
+
+    assert shake(0) < 0.1 < shake(2) < shake(6)
+
+
+@pytest.mark.parametrize(("surface", "rate", "sign"), [(0, 0, 1), (1, 1, 1), (2, 2, 1)])
+def test_positive_commands_roll_right_pitch_up_yaw_right(surface: int, rate: int, sign: int) -> None:
+    aircraft = Aircraft(HOME, 3)
+    _, delta_e, delta_t = aircraft.start(ALOFT, 1.0, CRUISE, (0.0, 0.0))
+    deltas = [0.0, delta_e, 0.0, delta_t]
+    deltas[surface] += 0.2
+    aircraft.drive(*deltas)
+    glide(aircraft, 0.4)
+    assert sign * degrees(aircraft.truth().rates[rate]) > 3
+
+
+def test_servos_lag() -> None:
+    aircraft, delta_t = trimmed()
+    aircraft.drive(1.0, 0.0, 0.0, delta_t)
+    aircraft.step()
+    early = aircraft["fcs/aileron-rad"]
+    glide(aircraft, 0.5)
+    assert 0 < early < 0.5 * aircraft["fcs/aileron-rad"]
+    assert aircraft["fcs/aileron-rad"] == pytest.approx(np.radians(25), rel=0.01)
+
+
+def test_aircraft_of_two_seeds_differ() -> None:
+    one, two = trimmed(1)[0], trimmed(2)[0]
+    assert one.payload_kg != two.payload_kg
+    assert one["vary/C_m_alpha"] != two["vary/C_m_alpha"]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_missions_have_everything_and_stay_near(seed: int) -> None:
+    items, start = mission(seed, CRUISE)
+    commands = [item.command for item in items]
+    assert [item.seq for item in items] == list(range(len(items)))
+    assert {WAYPOINT, LOITER_TURNS, DO_CHANGE_SPEED} <= set(commands[1:])
+    assert (items[0].lat_e7, items[0].lon_e7, items[-1].command) == (HOME.lat_e7, HOME.lon_e7, DO_JUMP)
+    placed = [item for item in items[1:] if item.command in (WAYPOINT, LOITER_TURNS)]
+    ned = to_ned(HOME, *np.array([[i.lat_e7, i.lon_e7, HOME.alt_mm] for i in placed]).T)
+    assert np.hypot(ned[:, 0], ned[:, 1]).max() < 2_000
+    assert all(80 <= item.alt_m <= 200 for item in placed)
+    assert hypot(*start.p[:2]) < 2_000
+    assert items[start.seq].command == WAYPOINT
+
+
+def test_it_flies_its_mission_and_turns_at_once(flown: tuple[PretendUav, list]) -> None:
+    uav, said = flown
+    rolls = [abs(degrees(m.roll)) for m in said if m.get_type() == "ATTITUDE"]
+    assert max(rolls[: 15 * 25]) > 20
+    assert max(rolls) < 65
+    assert not uav.down
+    assert len({m.seq for m in said if m.get_type() == "MISSION_CURRENT"}) > 1
+
+
+@pytest.mark.parametrize("uav_id", range(3))
+def test_the_autopilot_holds_height_speed_and_bank(uav_id: int) -> None:
+    uav = PretendUav(uav_id, seed=21, wind=4.0, turbulence=2)
+    rows = []
+    for k in range(1, 900):
+        uav.step(k * 0.1)
+        f, x = uav._flight(), uav.aircraft.truth()
+        rows.append((f.alt_error, f.Va_error, degrees(f.phi_c - x.euler[0]), degrees(f.theta_c - x.euler[1])))
+    alt, Va, phi, theta = np.sqrt(np.mean(np.square(rows), axis=0))
+    assert not uav.down
+    assert alt < 12
+    assert Va < 2.5
+    assert phi < 8  # most of it in the second after a turn begins
+    assert np.median(np.abs(np.array(rows)[:, 2])) < 2.5
+    assert theta < 4
+
+
+def test_frames_come_at_their_rates(flown: tuple[PretendUav, list]) -> None:
+    uav, said = flown
+    assert {(m.get_srcSystem(), m.get_srcComponent()) for m in said} == {(uav.uav_id + 1, 1)}
+    counts = Counter(m.get_type() for m in said)
+    wanted = {
+        **{"ATTITUDE": 25, "HIGHRES_IMU": 25, "SERVO_OUTPUT_RAW": 20, "GLOBAL_POSITION_INT": 10, "VFR_HUD": 10},
+        **{"NAV_CONTROLLER_OUTPUT": 5, "MISSION_CURRENT": 1, "HEARTBEAT": 1, "SYS_STATUS": 1},
+    }
+    assert counts == {name: rate * 40 for name, rate in wanted.items()}
+    assert len(TELEMETRY) == len(wanted)
+
+
+def test_sequence_numbers_count_and_clocks_run(flown: tuple[PretendUav, list]) -> None:
+    _, said = flown
+    assert {(b.get_seq() - a.get_seq()) % 256 for a, b in zip(said, said[1:], strict=False)} == {1}
+    boots = np.array([m.time_boot_ms for m in said if m.get_type() == "ATTITUDE"])
+    assert set(np.diff(boots)) == {40}
+    assert 60_000 <= boots[0] <= 601_000
+
+
+def test_what_it_says_agrees_with_where_it_is(flown: tuple[PretendUav, list]) -> None:
+    uav, said = flown
+    x = uav.aircraft.truth()
+    last = {m.get_type(): m for m in said}
+    place = last["GLOBAL_POSITION_INT"]
+    ned = to_ned(uav.origin, *np.array([[place.lat, place.lon, place.alt]]).T)[0]
+    assert np.abs(ned - x.p).max() < 6
+    assert place.relative_alt * 1e-3 == pytest.approx(-ned[2], abs=0.01)
+    assert [place.vx / 100, place.vy / 100, place.vz / 100] == pytest.approx(x.v, abs=1.5)
+    assert abs((last["ATTITUDE"].yaw - x.euler[2] + pi) % (2 * pi) - pi) < 0.1
+    assert last["VFR_HUD"].airspeed == pytest.approx(x.Va * np.sqrt(x.rho / 1.225), abs=3)
+    assert last["HIGHRES_IMU"].zacc == pytest.approx(x.force[2], abs=8)
+    beat = last["HEARTBEAT"]
+    assert (beat.type, beat.autopilot, beat.custom_mode) == (1, 3, AUTO)
+    assert beat.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED
+
+
+def test_one_seed_one_flight_two_seeds_two() -> None:
+    def bytes_of(uav_id: int, seed: int) -> bytes:
+        return b"".join(PretendUav(uav_id, seed).step(3.0))
+
+    assert bytes_of(0, 5) == bytes_of(0, 5)
+    assert bytes_of(0, 5) != bytes_of(0, 6)
+    assert bytes_of(0, 5)[50:] != bytes_of(1, 5)[50:]
+
+
+def test_aircraft_of_one_fleet_share_the_mean_wind() -> None:
+    drawn = [PretendUav(i, 5, wind=6.0, turbulence=0)._wind.step(100.0) for i in range(3)]
+    assert np.std(drawn, axis=0).max() < 2.0
+    assert np.mean(np.hypot(*np.transpose(drawn))) == pytest.approx(6.0, abs=2.0)
+
+
+def test_mission_protocol(flown: tuple[PretendUav, list]) -> None:
+    uav, _ = flown
+    (count,) = heard(uav.hear(ask(mav.MAVLink_mission_request_list_message(5, 1))))
+    assert (count.get_type(), count.count, count.target_system) == ("MISSION_COUNT", len(uav.items), 255)
+    for item in uav.items:
+        (sent,) = heard(uav.hear(ask(mav.MAVLink_mission_request_int_message(5, 1, item.seq))))
+        assert (sent.seq, sent.command, sent.frame, sent.x, sent.y) == (
+            *(item.seq, item.command, item.frame),
+            *(item.lat_e7, item.lon_e7),
+        )
+        assert [sent.param1, sent.param2, sent.param3, sent.z] == pytest.approx(
+            [item.param1, item.param2, item.param3, item.alt_m], rel=1e-5
+        )
+    (old,) = heard(uav.hear(ask(mav.MAVLink_mission_request_message(5, 1, 1))))
+    assert (old.get_type(), old.x) == ("MISSION_ITEM", pytest.approx(uav.items[1].lat_e7 * 1e-7, abs=1e-5))
+    (refused,) = heard(uav.hear(ask(mav.MAVLink_mission_request_int_message(5, 1, 999))))
+    assert (refused.get_type(), refused.type) == ("MISSION_ACK", mav.MAV_MISSION_INVALID_SEQUENCE)
+
+
+def test_parameter_protocol() -> None:
+    params = tuned(3)
+    voice = Voice(7, (), params)
+    assert voice.hear(ask(mav.MAVLink_param_request_list_message(7, 1)), 1.0) == []
+    sent = heard(voice.stream(10_000))
+    assert {m.param_id: m.param_value for m in sent} == {k: np.float32(v) for k, v in params.items()}
+    assert [m.param_index for m in sent] == list(range(len(params)))
+    assert {m.param_count for m in sent} == {len(params)}
+    (named,) = heard(voice.hear(ask(mav.MAVLink_param_request_read_message(7, 1, b"WP_RADIUS", -1)), 1.0))
+    assert (named.param_id, named.param_value) == ("WP_RADIUS", params["WP_RADIUS"])
+    (third,) = heard(voice.hear(ask(mav.MAVLink_param_request_read_message(7, 1, b"", 3)), 1.0))
+    assert (third.param_index, third.param_id) == (3, sorted(params)[3])
+    for index, name in ((9_999, b""), (-1, b"NO_SUCH")):
+        assert voice.hear(ask(mav.MAVLink_param_request_read_message(7, 1, name, index)), 1.0) == []
+
+
+def test_parameters_are_streamed_while_it_flies() -> None:
+    uav = PretendUav(0, 5)
+    uav.hear(ask(mav.MAVLink_param_request_list_message(1, 1)))
+    counts = Counter(m.get_type() for m in heard(uav.step(1.0)))
+    assert counts["PARAM_VALUE"] == len(uav.params)
+    assert counts["ATTITUDE"] == 25
+
+
+def test_servo_parameters_say_what_is_wired_where() -> None:
+    params = tuned(0)
+    assert [params[f"SERVO{i}_FUNCTION"] for i in (1, 2, 3, 4)] == [4, 19, 70, 21]
+    assert Servos.pulses(-1.0, 0.5, 2.0, 0.25) == (1100, 1700, 1250, 1900)
+    assert Servos.commands((1100, 1700, 1250, 1900)) == (-1.0, 0.5, 1.0, 0.25)
+    assert tuned(0) == params
+    assert tuned(1) != params
+
+
+def test_version_and_unknown_commands_are_answered_politely() -> None:
+    voice = Voice(7, (), {})
+    asked = mav.MAVLink_command_long_message(7, 1, mav.MAV_CMD_REQUEST_MESSAGE, 0, 148, 0, 0, 0, 0, 0, 0)
+    ack, version = heard(voice.hear(ask(asked), 1.0))
+    assert (ack.result, version.get_type()) == (mav.MAV_RESULT_ACCEPTED, "AUTOPILOT_VERSION")
+    assert version.capabilities & mav.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+    unknown = mav.MAVLink_command_long_message(7, 1, mav.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 0, 0)
+    assert [m.result for m in heard(voice.hear(ask(unknown), 1.0))] == [mav.MAV_RESULT_UNSUPPORTED]
+    for_another = mav.MAVLink_mission_request_list_message(8, 1)
+    assert voice.hear(ask(for_another), 1.0) == []
+
+
+def test_noise_is_passed_over() -> None:
+    voice = Voice(7, (), {"A": 1.0})
+    rng = np.random.default_rng(1)
+    assert voice.hear(rng.bytes(5_000), 1.0) == []
+    voice.hear(b"\x00" * 300, 1.0)
+    assert heard(voice.hear(ask(mav.MAVLink_param_request_read_message(7, 1, b"A", -1)), 1.0))[0].param_value == 1.0
+
+
+def test_gauss_markov_has_its_deviation_and_memory() -> None:
+    process = GaussMarkov(np.random.default_rng(2), np.full(500, 2.0), np.full(500, 1.0), 0.1)
+    first = process.x
+    for _ in range(10):
+        last = process.step()
+    assert np.std(last) == pytest.approx(2.0, rel=0.1)
+    assert np.corrcoef(first, last)[0, 1] == pytest.approx(np.exp(-1), abs=0.12)
+
+
+def test_wind_grows_with_height_and_can_be_calm() -> None:
+    wind = Wind(8.0, np.random.default_rng(3), 0.1, towards=0.0)
+    assert wind.step(300.0)[0] > wind.step(20.0)[0] > 2
+    assert Wind(0.0, np.random.default_rng(3), 0.1).step(100.0) == (0.0, 0.0)
+
+
+def test_sensor_errors_are_small_but_there() -> None:
+    truth = trimmed()[0].truth()
+    seen = [Sensors(np.random.default_rng(seed), 0.02).measure(truth) for seed in range(200)]
+    assert np.std([e.p - truth.p for e in seen]) == pytest.approx(0.5, rel=0.15)
+    assert np.std([e.euler - truth.euler for e in seen]) == pytest.approx(np.radians(0.25), rel=0.15)
+    assert np.std([e.Va for e in seen]) == pytest.approx(hypot(0.02 * CRUISE, 0.25), rel=0.2)
+
+
+def test_the_link_loses_delays_and_keeps_order() -> None:
+    link = Link(np.random.default_rng(4), 0.2)
+    for k in range(1_000):
+        link.send(k * 0.01, [struct.pack("<I", k)])
+    arrived = link.receive(100.0)
+    assert 700 < len(arrived) < 900
+    numbers = [struct.unpack("<I", frame)[0] for _, frame in arrived]
+    assert numbers == sorted(numbers)
+    assert all(t > n * 0.01 for (t, _), n in zip(arrived, numbers, strict=True))
+    assert link.receive(100.0) == []
+
+
+def test_a_recording_stands_by_itself(tmp_path) -> None:
+    path = tmp_path / "two.tlog"
+    uavs = [PretendUav(i, 5) for i in (0, 1)]
+    written = drive.to_tlog(path, uavs, seconds=2, loss=0.0, seed=5)
+    data, at, stamps, frames = path.read_bytes(), 0, [], []
+    while at < len(data):
+        length = data[at + 9] + 12  # MAVLink 2, unsigned
+        stamps.append(struct.unpack_from(">Q", data, at)[0])
+        frames.append(data[at + 8 : at + 8 + length])
+        at += 8 + length
+    said = heard(frames)
+    assert written == len(frames) == len(said)
+    assert stamps == sorted(stamps)
+    assert stamps[-1] - stamps[0] == pytest.approx(2e6, abs=3e4)
+    for uav in uavs:
+        own = Counter(m.get_type() for m in said if m.get_srcSystem() == uav.uav_id + 1)
+        assert own["PARAM_VALUE"] == len(uav.params)
+        assert own["MISSION_ITEM_INT"] == len(uav.items)
+        assert own["ATTITUDE"] == pytest.approx(50, abs=1)
+
+
+def test_it_flies_over_udp_and_answers() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ground:
+        ground.bind(("127.0.0.1", 0))
+        ground.settimeout(10)
+        uavs = [PretendUav(i, 5) for i in (0, 1)]
+        asked, said, stop = set(), [], Event()
+
+        class Answering(Event):
+            """Stands for the pause between two rounds: here the ground reads and asks."""
+
+            def wait(self, timeout: float | None = None) -> bool:
+                ground.setblocking(False)
+                try:
+                    while True:
+                        data, sender = ground.recvfrom(4_096)
+                        said.extend(heard([data]))
+                        if sender not in asked:
+                            asked.add(sender)
+                            system = said[-1].get_srcSystem()
+                            ground.sendto(ask(mav.MAVLink_mission_request_list_message(system, 1)), sender)
+                except BlockingIOError:
+                    pass
+                if sum(m.get_type() == "MISSION_COUNT" for m in said) == 2:
+                    self.set()
+                return super().wait(0.001)
+
+        stop = Answering()
+        drive.to_udp(uavs, ground.getsockname(), seconds=20, loss=0.0, seed=5, stop=stop)
+    assert stop.is_set()
+    assert {m.get_srcSystem() for m in said} == {1, 2}
+    assert len(asked) == 2  # one socket each
+
+
+def test_an_endless_mission_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fleet.pretend.uav._LEGS_AHEAD", 4)
+    uav = PretendUav(2, seed=9, wind=2.0, turbulence=0)
+    seen = []
+    for k in range(1, 90):
+        uav.step(float(k) * 2)
+        seen.append(uav._flight().seq)
+    order = [a for a, b in zip(seen, [None, *seen], strict=False) if a != b]
+    assert len(order) > 5
+    assert not uav.down
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--uavs", "249-250"], "fly fewer aircraft"),
+        (["--loss", "1.5"], "write e.g. 0.02"),
+        (["--turbulence", "wild"], "choose one"),
+        (["--to", "nowhere"], "--to"),
+        (["--wind", "40"], "--wind"),
+        (["--for", "-1"], "--for"),
+    ],
+)
+def test_bad_options_stop_with_a_sentence(words: list[str], said: str, capsys: pytest.CaptureFixture) -> None:
+    assert main(["fly", "--for", "1", *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_turbulence_words() -> None:
+    assert [turbulence_level(word) for word in ("none", "light", "moderate", "severe", "7")] == [0, 3, 4, 6, 7]
+
+
+def test_items_carry_their_places() -> None:
+    items, start = mission(3, CRUISE)
+    assert isinstance(items[1], Item)
+    lat, lon, _ = to_geodetic(HOME, start.p)
+    assert abs(lat - HOME.lat_e7) < 200_000
+    assert abs(lon - HOME.lon_e7) < 300_000
