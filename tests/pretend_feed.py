@@ -162,6 +162,10 @@ class PretendUav:
             sentence=self.text,
         )
 
+    def alert(self, t: float) -> Alert | None:
+        text = "horizon 4 s is shorter than the 10 s to the next leg"
+        return Alert(uav=6, t=t, kind=AlertKind.SHORT_HORIZON, sentence=text) if self.uav == 6 else None
+
     def row(self) -> FleetRow:
         return FleetRow(
             uav=self.uav, state=self.state, verdict=self.text, worker="000000000000abcd", epoch=1, t10_s=17.5, t10_n=9
@@ -183,6 +187,7 @@ class PretendFleet:
             Status: lambda uav: uav.status(self._t),
             Model: lambda uav: uav.model(self._t),
             Prediction: lambda uav: uav.prediction(self._t, 0.0),
+            Alert: lambda uav: uav.alert(self._t),
         }.items():
             bus.answer(kind, self._reply(make))
 
@@ -216,9 +221,8 @@ class PretendFleet:
         if first:
             for one in self.uavs:
                 self._bus.publish(one.mission(t))
-            if len(self.uavs) > 6:
-                text = "Horizon 4 s is shorter than the 10 s to the next leg"
-                self._bus.publish(Alert(uav=6, t=t, kind=AlertKind.SHORT_HORIZON, sentence=text))
+                if (alert := one.alert(t)) is not None:
+                    self._bus.publish(alert)
         self._bus.publish(FleetState(t=t, rows=tuple(one.row() for one in self.uavs)), STAMP)
 
 

@@ -304,7 +304,7 @@ def test_what_comes_over_the_bus_is_escaped_everywhere(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 2, hostile=0)
     bus.publish(Alert(uav=0, t=T, kind=AlertKind.GROUND, sentence=HOSTILE))
     page = about(feed.vehicles[0], DARK, clock.now) + summary(feed.all(), feed, DARK, clock.now)
-    page += table(feed.all(), 2, DARK, clock.now, "{}", 0)
+    page += table(feed.all(), DARK, clock.now, total=2, pick="{}", selected=0)
     assert "<img" not in page and page.count("&lt;img") >= 4
 
 
@@ -333,7 +333,7 @@ def test_an_empty_page_says_what_it_listens_to(clock: Clock) -> None:
 def test_the_worst_and_shortest_stand_first(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 8)
     bus.publish(Alert(uav=4, t=T, kind=AlertKind.CONFLICT, sentence="x"))
-    page = table(feed.all(), 8, DARK, clock.now, "{}", None)
+    page = table(feed.all(), DARK, clock.now, total=8, pick="{}", selected=None)
     order = [int(part.split('"')[0]) for part in page.split('data-uav="')[1:]]
     assert set(order[:2]) == {4, 6} and order[2:4] == [5, 1]
     horizons = [

@@ -183,7 +183,8 @@ def _put(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None) -> None:
         part.visible = data is not None
     if data is None:
         return
-    scales = {"x": {"time": False}, "y": {"range": scale(np.concatenate(data[1:]))}}
+    x0, x1 = np.floor(data[0][0] / 10) * 10, np.ceil(data[0][-1] / 10) * 10
+    scales = {"x": {"time": False, "range": (float(x0), float(x1))}, "y": {"range": scale(np.concatenate(data[1:]))}}
     if chart[1].scales != scales:  # a new scale builds the chart anew: rarely, please
         chart[1].scales = scales
     chart[1].data = data
@@ -203,9 +204,9 @@ def _band(vehicle: Vehicle | None) -> tuple[np.ndarray, ...] | None:
     """Give half-axes against look-ahead, and an upright line at the horizon: x, along, cross, vertical, horizon."""
     if vehicle is None or (told := vehicle.forecast) is None:
         return None
-    x = np.sort(np.concatenate([np.linspace(0, told.ahead[-1], 60), [told.until, told.until]]))
+    x = np.sort(np.concatenate([np.linspace(0, told.ahead[-1], 60), [told.until, told.until + 1e-3]]))
     axes = told.width(x) * UNIT_M
-    at = np.flatnonzero(x == told.until)[:2]
+    at = np.searchsorted(x, [told.until, told.until + 1e-3])
     upright = np.full(len(x), np.nan)
     upright[at] = [0.0, axes[:, :2].max()]
     return x, axes[:, 0], axes[:, 1], axes[:, 2], upright

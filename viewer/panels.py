@@ -81,7 +81,9 @@ class Panels:
         else:
             self._summary.content = summary(fleet, feed, self._palette, now)
             kept = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
-            self._table.content = table(kept, len(fleet), self._palette, now, self._handler(), selected)
+            self._table.content = table(
+                kept, self._palette, now, total=len(fleet), pick=self._handler(), selected=selected
+            )
         self._alerts.content = alerts(feed, self._palette)
         nobody = '<div class="uav soft">Nobody is selected: click a row or an aircraft, or press Ctrl+K.</div>'
         self._about.content = about(chosen, self._palette, now) if chosen is not None else nobody

@@ -73,11 +73,11 @@ def _fleet_coverage(fleet: list[Vehicle]) -> str:
     return f" · cov. {sum(p.held * p.held_n for p in told) / n * 100:.0f}/{told[0].quantile * 100:.0f} %"
 
 
-def table(fleet: list[Vehicle], total: int, palette: Palette, now: float, pick: str, selected: int | None) -> str:
+def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pick: str, selected: int | None) -> str:
     """List the worst up to 50 of those that pass the filter; `pick` is the handler of a row, `{}` its UAV."""
     worst = sorted(fleet, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
     longest = max((horizon_s(vehicle) for vehicle in worst), default=0.0) or 1.0
-    rows = "".join(_row(vehicle, palette, now, pick, vehicle.uav == selected, longest) for vehicle in worst)
+    rows = "".join(_row(vehicle, palette, now, pick, on=vehicle.uav == selected, longest=longest) for vehicle in worst)
     return (
         '<div class="uav list"><table><tr><th></th><th>UAV</th><th>status</th><th class="num">fit %</th>'
         f'<th class="num">horizon</th></tr>{rows}</table>'
@@ -85,7 +85,7 @@ def table(fleet: list[Vehicle], total: int, palette: Palette, now: float, pick: 
     )
 
 
-def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, on: bool, longest: float) -> str:
+def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, *, on: bool, longest: float) -> str:
     state, horizon, mean = vehicle.state(now), horizon_s(vehicle), fit(vehicle)
     colour = palette.mismatch if vehicle.alerts else palette.state(state)
     glyph = "▲" if vehicle.alerts else GLYPH[state]

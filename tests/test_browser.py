@@ -1,0 +1,237 @@
+"""The page in a real browser: it draws, it selects, it survives hostile words and its own restart."""
+
+import io
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from pretend_feed import HOSTILE, PretendFleet
+
+from fleet.bus import connect, open_router
+
+pytestmark = pytest.mark.browser
+UAVS, EVIL = 20, 3
+ARGS = (
+    "--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-background-networking "
+    "--disable-component-update --no-first-run"
+).split()
+IN_SCENE = "window.__viserMutable && window.__viserMutable.nodeRefFromName['/fleet/vehicles']"
+NODES = "Object.keys(window.__viserMutable.nodeRefFromName).length"
+PROJECT = (
+    """() => {
+  const m = window.__viserMutable; let batch = null;
+  m.nodeRefFromName['/fleet/vehicles'].traverse(o => { if (!batch && o.getPositionAt) batch = o; });
+  const V = m.camera.position.constructor, r = m.canvas.getBoundingClientRect(), found = [];
+  for (let i = 0; i < %d; i++) {
+    const p = batch.getPositionAt(i), v = new V(p.x, p.y, p.z);
+    batch.localToWorld(v); v.project(m.camera);
+    found.push([i, r.x + (v.x + 1) / 2 * r.width, r.y + (1 - v.y) / 2 * r.height]);
+  }
+  return found;
+}"""
+    % UAVS
+)
+
+
+class Viewer:
+    """The viewer process under test."""
+
+    def __init__(self, port: int, router: str) -> None:
+        self.port, self._router = port, router
+        self.start()
+
+    def start(self) -> None:
+        command = [sys.executable, "-W", "error", "-m", "viewer", "--port", str(self.port), "--router", self._router]
+        env = {**os.environ, "PYTHONPATH": str(ROOT)}
+        self.process = subprocess.Popen(command, cwd=ROOT, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        line = self.process.stdout.readline().decode()
+        assert line == f"viewer: http://127.0.0.1:{self.port}\n", line + self.process.stdout.read().decode()
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.communicate(timeout=10)
+
+
+def a_free_port() -> int:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+@pytest.fixture(scope="module")
+def router() -> Iterator[str]:
+    """A router with a pretend fleet on it: its aircraft lie still between beats, so that a click can hit them."""
+    address, stop = f"tcp/127.0.0.1:{a_free_port()}", threading.Event()
+    session = open_router(address)
+    with connect(address) as bus:
+        fleet = PretendFleet(bus, UAVS, hostile=EVIL)
+
+        def publish() -> None:
+            while not stop.wait(0.1):
+                fleet.advance(time.time())
+
+        feeder = threading.Thread(target=publish)
+        feeder.start()
+        yield address
+        stop.set()
+        feeder.join()
+    session.close()
+
+
+@pytest.fixture(scope="module")
+def viewer(router: str) -> Iterator[Viewer]:
+    one = Viewer(a_free_port(), router)
+    yield one
+    one.kill()
+
+
+@pytest.fixture(scope="module")
+def errors() -> list[str]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def page(chromium: str, viewer: Viewer, errors: list[str], tmp_path_factory: pytest.TempPathFactory) -> Iterator:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        context = playwright.chromium.launch_persistent_context(
+            str(tmp_path_factory.mktemp("profile")),
+            executable_path=chromium,
+            headless=True,
+            args=ARGS,
+            viewport={"width": 1280, "height": 720},
+        )
+        one = context.pages[0]
+        one.on("pageerror", lambda error: errors.append(str(error)))
+        one.goto(f"http://127.0.0.1:{viewer.port}/?fixedDpr=0.5")
+        one.wait_for_function(IN_SCENE, timeout=30_000)
+        yield one
+        context.close()
+
+
+def colours(page) -> int:
+    from PIL import Image
+
+    clip = {"x": 380, "y": 150, "width": 500, "height": 500}
+    pixels = np.asarray(Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")).reshape(-1, 3)
+    return len(np.unique(pixels // 16, axis=0))
+
+
+def selected(page, name: str) -> None:
+    """Wait until the right panel shows a UAV."""
+    page.wait_for_function(
+        "name => [...document.querySelectorAll('.uav .head h1')].some(e => e.textContent === name)",
+        arg=name,
+        timeout=8_000,
+    )
+
+
+def test_the_page_draws_the_fleet(page, errors: list[str]) -> None:
+    assert page.evaluate("document.createElement('canvas').getContext('webgl2') !== null")
+    page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=10_000)
+    for _ in range(20):  # the first frames of a software renderer take their time
+        if (found := colours(page)) > 6:
+            break
+    assert found > 6
+    assert errors == []
+
+
+def test_few_nodes_whatever_the_fleet(page) -> None:
+    page.wait_for_function(f"{NODES} > 25", timeout=10_000)
+    assert page.evaluate(NODES) <= 40
+
+
+def test_a_row_click_selects(page) -> None:
+    page.locator('tr[data-uav="7"]').click()
+    selected(page, "UAV-007")
+
+
+def test_a_click_in_3d_selects_the_same_uav(page) -> None:
+    page.locator('tr[data-uav="12"]').click()  # the camera turns to it
+    selected(page, "UAV-012")
+    page.locator('tr[data-uav="8"]').dispatch_event("pointerdown")
+    selected(page, "UAV-008")
+    for _ in range(15):  # aircraft fly on while the mouse travels: aim again
+        inside = [(i, x, y) for i, x, y in page.evaluate(PROJECT) if i != 8 and 400 < x < 880 and 60 < y < 660]
+        if not inside:
+            continue
+        i, x, y = min(inside, key=lambda one: np.hypot(one[1] - 640, one[2] - 360))
+        page.mouse.move(x, y)
+        page.mouse.click(x, y)
+        try:
+            page.wait_for_function(
+                "name => [...document.querySelectorAll('.uav .head h1')].some(e => e.textContent === name)",
+                arg=f"UAV-{i:03d}",
+                timeout=1_500,
+            )
+        except Exception as error:
+            assert "Timeout" in str(error)
+            continue
+        return
+    pytest.fail("no click on a projected aircraft selected it")
+
+
+def test_hostile_words_stay_words(page, errors: list[str]) -> None:
+    page.locator(f'tr[data-uav="{EVIL}"]').click()
+    selected(page, f"UAV-{EVIL:03d}")
+    page.locator(".uav .say", has_text=HOSTILE).first.wait_for(timeout=8_000)
+    assert page.locator("img[src='x']").count() == 0
+    assert page.evaluate("window.pwned") is None
+    assert errors == []
+
+
+def test_a_killed_server_is_announced_and_comes_back(page, viewer: Viewer) -> None:
+    viewer.kill()
+    page.wait_for_function(
+        "[...document.querySelectorAll('.stale')].some(e => getComputedStyle(e).visibility === 'visible')",
+        timeout=12_000,
+    )
+    viewer.start()
+    page.bring_to_front()
+    page.wait_for_function(
+        "[...document.querySelectorAll('.stale')].every(e => getComputedStyle(e).visibility === 'hidden')",
+        timeout=20_000,
+    )
+    page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=10_000)
+    page.locator('tr[data-uav="9"]').dispatch_event("pointerdown")
+    selected(page, "UAV-009")
+
+
+def test_an_empty_page_says_what_it_waits_for(page) -> None:
+    """Open a second viewer on a router without a fleet, and stop it as an operator would."""
+    address = f"tcp/127.0.0.1:{a_free_port()}"
+    session = open_router(address)
+    other = Viewer(a_free_port(), address)
+    try:
+        tab = page.context.new_page()
+        tab.goto(f"http://127.0.0.1:{other.port}/?fixedDpr=0.5")
+        tab.get_by_text("No vehicles yet").wait_for(timeout=15_000)
+        assert "parauav/*/sample" in tab.inner_text("body")
+        tab.close()
+    finally:
+        other.process.send_signal(signal.SIGTERM)
+        rest, _ = other.process.communicate(timeout=15)
+        session.close()
+    assert (other.process.returncode, rest) == (0, b"")
+
+
+def test_a_taken_port_is_a_sentence(router: str, free_port: int) -> None:
+    with socket.socket() as held:
+        held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        held.bind(("127.0.0.1", free_port))
+        held.listen()
+        command = [sys.executable, "-m", "viewer", "--port", str(free_port), "--router", router]
+        env = {**os.environ, "PYTHONPATH": str(Path(ROOT))}
+        ended = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=30, check=False)
+    assert ended.returncode == 2 and ended.stdout == ""
+    assert ended.stderr.startswith(f"viewer: --port: found {free_port} taken")
