@@ -5,11 +5,14 @@ import math
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.contract import COLUMNS, Mission, Params, Sample
+from fleet.contract import COLUMNS, Item, Mission, Params, Sample
+from fleet.pretend.mavlink import Voice
+from fleet.telemetry.decode import Decoder
 
 T0 = 1_700_000_000.0  # fleet time at which the tests begin [s since 1970]
 PLANE, ARDU = mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA
 AUTO = 10
+ITEMS = tuple(Item(seq=i, command=16, lat_e7=470_000_000 + i, lon_e7=80_000_000, alt_m=50.0 + i) for i in range(12))
 
 
 class Talker:
@@ -65,3 +68,33 @@ def assert_finite(news):
     elif isinstance(news, Mission):
         for i in news.items:
             assert all(map(math.isfinite, (i.param1, i.param2, i.param3, i.param4, i.alt_m)))
+
+
+class Aircraft:
+    """A pretend aircraft's voice on a radio that loses a share of everything, both ways."""
+
+    def __init__(self, loss, silent=(), system=7):
+        self.voice = Voice(system, ITEMS, {f"P{i:03d}": float(i) for i in range(300)})
+        self.talker = Talker(system)
+        self._loss, self._silent = loss, silent
+        self._rng = np.random.default_rng(4)
+        self.asked: list = []
+        self._ears = Decoder()
+
+    def hear(self, data: bytes, t: float) -> list[bytes]:
+        if self._rng.random() < self._loss:
+            return []
+        (question,) = self._ears.feed(data)
+        self.asked.append((t, question))
+        if question.get_type() in self._silent:
+            return []
+        return self._lossy(self.voice.hear(data, t))
+
+    def stream(self) -> list[bytes]:
+        return self._lossy(self.voice.stream(20))
+
+    def _lossy(self, frames: list[bytes]) -> list[bytes]:
+        return [frame for frame in frames if self._rng.random() >= self._loss]
+
+    def names(self) -> list[str]:
+        return [question.get_type() for _, question in self.asked]

@@ -1,0 +1,79 @@
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
+from talker import ITEMS, T0, Aircraft, Talker, of
+
+from fleet.contract import Mission, Params
+from fleet.telemetry.decode import Decoder
+from fleet.telemetry.intake import Intake
+from gateway.onboard import Onboard
+
+
+def fly(aircraft, seconds, tick=0.1):
+    """Let intake and questions talk with an aircraft for a while of pretended time."""
+    intake, onboard, news = Intake(), Onboard(), []
+    for step in range(round(seconds / tick)):
+        t = T0 + step * tick
+        if step % 10 == 0:
+            intake.hear(t, aircraft.talker.heartbeat(), "air")
+        for frame in aircraft.stream():
+            intake.hear(t, frame, "air")
+        news += intake.flush(t)
+        for where, data in onboard.tick(t, intake.crafts.values()):
+            assert where == "air"
+            for frame in aircraft.hear(data, t):
+                intake.hear(t, frame, "air")
+    return news, intake
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_mission_and_parameters_are_fetched_whatever_the_radio_loses(loss):
+    aircraft = Aircraft(loss)
+    news, _ = fly(aircraft, 60.0)
+    mission, params = of(Mission, news)[-1], of(Params, news)[-1]
+    assert mission.complete
+    assert mission.items == ITEMS
+    assert params.complete
+    assert params.values == {f"P{i:03d}": float(i) for i in range(300)}
+    if not loss:
+        names = aircraft.names()
+        assert (
+            names.count("PARAM_REQUEST_LIST") == names.count("MISSION_REQUEST_LIST") == names.count("MISSION_ACK") == 1
+        )
+        assert names.count("MISSION_REQUEST_INT") <= len(ITEMS) + 5
+
+
+def test_who_does_not_answer_is_asked_ever_less():
+    silent = ("MISSION_REQUEST_LIST", "PARAM_REQUEST_LIST", "COMMAND_LONG")
+    aircraft = Aircraft(0.0, silent)
+    fly(aircraft, 300.0)
+    names = aircraft.names()
+    assert 5 <= names.count("MISSION_REQUEST_LIST") <= 12
+    assert 4 <= names.count("PARAM_REQUEST_LIST") <= 9
+    assert 295 <= names.count("HEARTBEAT") <= 301
+    rates = [question for _, question in aircraft.asked if question.get_type() == "COMMAND_LONG"]
+    assert len(rates) == 3 * 6  # three tries, then it is left in peace
+    assert {(int(q.param1), q.param2) for q in rates} >= {(30, 40_000.0), (33, 100_000.0)}
+
+
+def test_rates_that_are_high_enough_are_left_alone():
+    intake, onboard, talker = Intake(), Onboard(), Talker()
+    asked = []
+    for step in range(1500):
+        t = T0 + step * 0.02
+        if step % 50 == 0:
+            intake.hear(t, talker.heartbeat(), "air")
+        intake.hear(t, talker.attitude(step * 0.02), "air")
+        if step % 5 == 0:
+            intake.flush(t)
+            asked += [m for _, d in onboard.tick(t, intake.crafts.values()) for m in Decoder().feed(d)]
+    ids = {int(m.param1) for m in asked if m.get_type() == "COMMAND_LONG"}
+    assert ids
+    assert mav.MAVLINK_MSG_ID_ATTITUDE not in ids
+
+
+def test_a_lost_aircraft_is_not_spoken_to():
+    intake, onboard = Intake(), Onboard()
+    intake.hear(T0, Talker().heartbeat(), "air")
+    assert onboard.tick(T0, intake.crafts.values())
+    intake.flush(T0 + 10)
+    assert onboard.tick(T0 + 10, intake.crafts.values()) == []
