@@ -1,11 +1,12 @@
 """The ArduPlane law against known answers, on a point mass with lags."""
 
-from math import atan2, cos, hypot, pi, radians, sin, tan
+from math import atan2, hypot, pi, radians, sin, tan
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from point_mass import HERE, PAR, PLANE, TRIM_ALPHA, TRIM_THR, Plane, begin, fly, leg, route
 
 from fleet import mission as m
 from fleet.autopilots import arduplane as ap
@@ -13,71 +14,6 @@ from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.arduplane import state as S
 from fleet.frames import G
-
-HERE = np.full(3, np.nan)
-PLANE = {"AIRSPEED_CRUISE": 20, "AIRSPEED_MIN": 12, "AIRSPEED_MAX": 28, "SCALING_SPEED": 20, "WP_RADIUS": 50}
-PAR, _ = ap.parameters(PLANE)
-TRIM_ALPHA, TRIM_THR = 0.06, 0.5
-
-
-def leg(kind=m.WAYPOINT, n=0.0, e=0.0, h=100.0, **more) -> list[float]:
-    row = np.zeros(m.N_COLUMNS)
-    row[m.KIND], row[m.P_N], row[m.P_E], row[m.P_D] = kind, n, e, -h
-    for name, value in more.items():
-        row[getattr(m, name.upper())] = value
-    return list(row)
-
-
-def route(*rows) -> np.ndarray:
-    out = np.array(rows)
-    out[:, m.SEQ] = np.arange(1, len(out) + 1)
-    return out
-
-
-class Plane:
-    """A point mass: roll, pitch and flight path follow with lags, thrust and drag change the speed."""
-
-    def __init__(self, p=(0.0, 0.0, -100.0), Va=20.0, psi=0.0, wind=(0.0, 0.0)):
-        self.p, self.Va, self.psi, self.gamma, self.phi, self.wind = np.array(p), Va, psi, 0.0, 0.0, wind
-        self.theta = TRIM_ALPHA
-
-    @property
-    def v(self):
-        ground = self.Va * cos(self.gamma)
-        n, e = ground * cos(self.psi) + self.wind[0], ground * sin(self.psi) + self.wind[1]
-        return np.array([n, e, -self.Va * sin(self.gamma)])
-
-    @property
-    def euler(self):
-        return np.array([self.phi, self.theta, (self.psi + pi) % (2 * pi) - pi])
-
-    def step(self, phi_c, theta_c, delta_t, dt):
-        self.p = self.p + self.v * dt
-        load = 1 / cos(self.phi) ** 2 - 1
-        pull = 8 * (delta_t - TRIM_THR) - 0.1 * (self.Va - 20) - 0.3 * load - G * sin(self.gamma)
-        self.Va = max(self.Va + pull * dt, 5.0)
-        self.phi += (phi_c - self.phi) * dt / 0.4
-        self.theta += (theta_c - self.theta) * dt / 0.4
-        self.gamma += (self.theta - TRIM_ALPHA - self.gamma) * dt / 0.6
-        self.psi += G * tan(self.phi) / self.Va * dt
-
-
-def begin(legs, plane, par=PAR, start=HERE):
-    return ap.init(par, legs, 0, np.array(start, float), plane.p, plane.v, plane.euler, plane.Va, TRIM_ALPHA, TRIM_THR)
-
-
-def fly(legs, plane, seconds, par=PAR, start=HERE, dt=0.1, sensor=True, ctl=None):
-    """Fly a plane along legs and record t, p, v, euler, Va, phi_c, theta_c, delta_t, leg, each row one step."""
-    ctl = begin(legs, plane, par, start) if ctl is None else ctl
-    rows = []
-    for k in range(round(seconds / dt)):
-        p, v, euler, Va = plane.p.copy(), plane.v, plane.euler, plane.Va
-        seq = legs[int(ctl[ap.LEG]), m.SEQ]
-        out = ap.guide(ctl, par, legs, p, v, euler, Va if sensor else np.nan, np.nan, dt)
-        rows.append([k * dt, *p, *v, *euler, Va, *out, seq])
-        for _ in range(4):
-            plane.step(*out, dt / 4)
-    return np.array(rows), ctl
 
 
 def crosstrack(rows, a, b):
@@ -139,7 +75,7 @@ def test_turns_are_counted_and_the_exit_points_to_the_next_leg():
 
 def test_loiter_time_and_loiter_to_altitude_end():
     rows, _ = fly(route(leg(m.LOITER_TIME, n=300.0, radius=70.0, turns=30.0), leg(n=1500.0)), Plane(), 90)
-    inside = rows[np.hypot(rows[:, 1] - 300, rows[:, 2]) < 151]  # heading for the centre, the circle law takes over here
+    inside = rows[np.hypot(rows[:, 1] - 300, rows[:, 2]) < 151]  # here the circle law takes over
     left = rows[rows[:, 14] == 2][0, 0]
     assert 30 <= left - inside[0, 0] < 55
     legs = route(leg(m.LOITER_TO_ALT, n=300.0, radius=70.0, h=150.0), leg(n=1500.0, h=150.0))
@@ -322,124 +258,6 @@ def test_rate_loops_hold_an_attitude(dt):
         euler = euler + np.array([rates[0], rates[1] - q_turn, 0]) * dt
     assert euler[0] == pytest.approx(0.5, abs=0.02)
     assert euler[1] == pytest.approx(0.1, abs=0.03)
-
-
-LAP = [(800.0, 0.0, 100.0), (800.0, 700.0, 130.0), (0.0, 700.0, 130.0), (0.0, 0.0, 90.0), (800.0, 0.0, 100.0)]
-
-
-def recorded(seconds):
-    """Fly a lap with guidance and rate loops; give the record, surfaces, rates and the controller's end state."""
-    legs, plane = route(*(leg(n=n, e=e, h=h) for n, e, h in LAP)), Plane(wind=(3.0, -2.0))
-    ctl = begin(legs, plane, start=(0, 0, -100))
-    rows, deltas = [], []
-    for _ in range(round(seconds * 10)):
-        row, ctl = fly(legs, plane, 0.1, ctl=ctl)
-        row[0, 0] = len(rows) * 0.1
-        surfaces = ap.stabilise(ctl, PAR, row[0, 11], row[0, 12], row[0, 7:10], np.zeros(3), row[0, 10], 0.1)
-        rows.append(row[0])
-        deltas.append([*surfaces, row[0, 13]])
-    return legs, plane, np.array(rows), np.array(deltas), ctl
-
-
-def shadowed(legs, rows, deltas, begin_s, start=HERE, **changed):
-    part = rows[:, 0] >= begin_s - 1e-9
-    r, d = rows[part], deltas[part]
-    columns = {"phi_c": r[:, 11].copy(), "theta_c": r[:, 12].copy(), "delta": d.copy(), "p": r[:, 1:4].copy()} | changed
-    ahead = legs[int(np.argmax(legs[:, m.SEQ] == r[0, 14])) :]
-    ctl, rms = ap.shadow(
-        PAR, ahead, np.array(start, float), r[:, 0].copy(), columns["p"], r[:, 4:7].copy(), r[:, 7:10].copy(),
-        np.zeros((len(r), 3)), r[:, 10].copy(), columns["phi_c"], columns["theta_c"], columns["delta"], r[:, 14].copy(),
-    )  # fmt: skip
-    return ahead, ctl, rms
-
-
-@pytest.mark.parametrize("seconds", [95.0, 110.0, 125.0])
-def test_the_shadow_run_recovers_the_controller(seconds):
-    legs, plane, rows, deltas, true = recorded(seconds)
-    ahead, ctl, rms = shadowed(legs, rows, deltas, seconds - 60)
-    assert rms < radians(2)
-    assert ahead[int(ctl[ap.LEG]), m.SEQ] == rows[-1, 14]
-    for _ in range(100):
-        at = (plane.p, plane.v, plane.euler, plane.Va, np.nan, 0.1)
-        a, b = ap.guide(true, PAR, legs, *at), ap.guide(ctl, PAR, ahead, *at)
-        assert b[0] == pytest.approx(a[0], abs=radians(2.5))
-        assert b[1] == pytest.approx(a[1], abs=radians(1))
-        assert b[2] == pytest.approx(a[2], abs=0.04)
-        s, u = (ap.stabilise(c, PAR, *a[:2], plane.euler, np.zeros(3), plane.Va, 0.1) for c in (true, ctl))
-        np.testing.assert_allclose(s, u, atol=0.03)
-        plane.step(*a, 0.1)
-
-
-def test_the_shadow_run_follows_the_reported_item_not_its_own_opinion():
-    legs, _, rows, deltas, _ = recorded(60)
-    behind = rows.copy()
-    behind[:, 14] = 1  # the aircraft says it still flies item 1
-    ahead, ctl, _ = shadowed(legs, behind, deltas, 0)
-    assert ahead[int(ctl[ap.LEG]), m.SEQ] == 1
-    early = rows.copy()
-    early[300:, 14] = 3  # it was sent ahead
-    ahead, ctl, _ = shadowed(legs, early, deltas, 0)
-    assert ahead[int(ctl[ap.LEG]), m.SEQ] == 3
-    unknown = rows.copy()
-    unknown[:, 14] = 50
-    _, ctl, _ = shadowed(legs, unknown, deltas, 0)
-    assert np.isfinite(ctl).all()
-
-
-def test_the_shadow_run_passes_over_what_is_missing():
-    legs, _, rows, deltas, _ = recorded(60)
-    rng = np.random.default_rng(5)
-    lost = rng.random(len(rows)) < 0.3
-    holes = {"phi_c": rows[:, 11], "theta_c": rows[:, 12], "delta": deltas, "p": rows[:, 1:4]}
-    holes = {name: column.copy() for name, column in holes.items()}
-    for column in holes.values():
-        column[lost] = np.nan
-    _, whole, _ = shadowed(legs, rows, deltas, 0)
-    _, ctl, rms = shadowed(legs, rows, deltas, 0, **holes)
-    assert np.isfinite(ctl).all() and np.isfinite(rms)
-    assert ctl[S.I_SEB] == pytest.approx(whole[S.I_SEB], abs=3.0)  # 3 m2/s3: about 1 deg of pitch
-    empty = {name: np.full_like(column, np.nan) for name, column in holes.items()}
-    _, ctl, rms = shadowed(legs, rows, deltas, 0, **empty)
-    assert np.isfinite(ctl).all() and np.isnan(rms)
-
-
-def test_old_names_are_read():
-    old = {"LIM_ROLL_CD": 5500, "TRIM_ARSPD_CM": 1800, "ARSPD_FBW_MIN": 11, "ARSPD_FBW_MAX": 27, "LIM_PITCH_MAX": 2200}
-    old |= {"LIM_PITCH_MIN": -1800, "TRIM_PITCH_CD": 150, "GLIDE_SLOPE_MIN": 12, "TRIM_THROTTLE": 40, "THR_MAX": 90}
-    par, absent = ap.parameters(old)
-    expect = {P.ROLL_LIMIT: radians(55), P.VA_CRUISE: 18, P.VA_MIN: 11, P.VA_MAX: 27, P.PITCH_HIGH: radians(22)}
-    expect |= {P.PITCH_LOW: radians(-18), P.PITCH_TRIM: radians(1.5), P.SLOPE_MIN: 12, P.THR_TRIM: 0.4, P.THR_MAX: 0.9}
-    for i, value in expect.items():
-        assert par[i] == pytest.approx(value), P.NAMES[i]
-    assert not {P.NAMES[i] for i in expect} & set(absent)
-    new, _ = ap.parameters({**old, "ROLL_LIMIT_DEG": 60})
-    assert new[P.ROLL_LIMIT] == pytest.approx(radians(60))  # the current name wins
-
-
-def test_old_angle_gains_become_rate_gains():
-    old = {"RLL2SRV_P": 1.2, "RLL2SRV_I": 0.2, "RLL2SRV_D": 0.06, "RLL2SRV_IMAX": 2250, "RLL2SRV_TCONST": 0.4}
-    par, absent = ap.parameters(old)
-    ff = (1.2 - 0.2 * 0.4) * 0.4 - 0.06
-    np.testing.assert_allclose(par[[P.ROLL_FF, P.ROLL_P, P.ROLL_I, P.ROLL_IMAX]], [ff, 0.06, 0.08, 0.5])
-    assert "RLL_RATE_P" not in absent and "PTCH_RATE_P" in absent
-
-
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -1.0, 1e12])
-def test_absurd_parameters_count_as_absent(bad):
-    par, absent = ap.parameters(dict.fromkeys(ap.NAMES, bad))
-    assert np.isfinite(par).all()
-    assert "NAVL1_PERIOD" in absent and "AIRSPEED_CRUISE" in absent
-    assert par[P.PERIOD] == ap.DEFAULTS["NAVL1_PERIOD"]
-
-
-def test_contradictions_fall_back_and_defaults_are_complete():
-    par, absent = ap.parameters({**ap.DEFAULTS, "AIRSPEED_MIN": 30, "AIRSPEED_MAX": 20})
-    assert par[P.VA_MIN] < par[P.VA_MAX] and "AIRSPEED_MIN" in absent
-    par, absent = ap.parameters(ap.DEFAULTS, 2000.0)
-    assert absent == ()
-    assert par.shape == (ap.N_PAR,)
-    assert par[P.EAS2TAS] == pytest.approx(1.1028, abs=1e-3)  # ISA: density ratio 0.8217 at 2 km
-    assert ap.LAW == "arduplane: L1 + TECS"
 
 
 anything = st.floats(-1e6, 1e6)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleet.autopilots.arduplane import l1, tecs
+from fleet.autopilots.arduplane import demand, l1, tecs
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.arduplane import state as S
@@ -54,7 +54,7 @@ def fly(
     a_lat, over = leg_rules.steer(ctl, par, legs, p, v, euler, dt)
     phi_c = l1.to_roll(par, a_lat, euler[1])
     h_sp = leg_rules.height_demand(ctl, par, legs, p)
-    tecs.update_speed(ctl, par, v, euler, Va, Va_dot, dt)
+    demand.update_speed(ctl, par, v, euler, Va, Va_dot, dt)
     va_c, blind = speed(ctl, par, legs), not np.isfinite(Va)
     theta_c, delta_t = tecs.update(ctl, par, h_sp, va_c, -p[2], -v[2], euler[0], blind, dt)
     return phi_c, theta_c, delta_t, over

@@ -62,9 +62,8 @@ def shadow(
     """
     n = t.shape[0]
     ctl = np.zeros(S.N_CTL)
-    missed = np.zeros(4)  # reported minus replayed: theta_c, delta_t, delta_a, delta_e
-    count = np.zeros(4)
-    square, rows, last = 0.0, 0, -1
+    miss = np.full((n, 5), nan)  # reported minus replayed: theta_c, delta_t, delta_a, delta_e, phi_c
+    last = -1
     for k in range(n):
         if not _usable(p[k], v[k], euler[k]):
             continue
@@ -77,21 +76,29 @@ def shadow(
         if not dt > 0.0:
             continue
         phi_k, theta_k, thr_k, _ = fly(ctl, par, legs, p[k], v[k], euler[k], Va[k], nan, dt)
-        if np.isfinite(phi_c[k]):
-            square += wrap(phi_c[k] - phi_k) ** 2
-            rows += 1
-        recent = t[n - 1] - t[k] <= _MEAN_OVER
-        _note(missed, count, 0, theta_c[k] - theta_k, recent)
-        _note(missed, count, 1, delta[k, 3] - thr_k, recent)
+        miss[k, 0], miss[k, 1], miss[k, 4] = theta_c[k] - theta_k, delta[k, 3] - thr_k, wrap(phi_c[k] - phi_k)
         if np.all(np.isfinite(rates[k])):
             roll = phi_c[k] if np.isfinite(phi_c[k]) else phi_k
             pitch = theta_c[k] if np.isfinite(theta_c[k]) else theta_k
             delta_a, delta_e, _ = stabilise(ctl, par, roll, pitch, euler[k], rates[k], Va[k], dt)
-            _note(missed, count, 2, delta[k, 0] - delta_a, recent)
-            _note(missed, count, 3, delta[k, 1] - delta_e, recent)
+            miss[k, 2], miss[k, 3] = delta[k, 0] - delta_a, delta[k, 1] - delta_e
     if last >= 0:
-        _shift(ctl, par, missed / np.maximum(count, 1.0), theta_c, delta[:, 3])
-    return ctl, (sqrt(square / rows) if rows > 0 else nan)
+        _shift(ctl, par, miss[t >= t[n - 1] - _MEAN_OVER], theta_c[n - 1], delta[n - 1, 3])
+    return ctl, sqrt(_mean(miss[:, 4] ** 2, nan))
+
+
+@kernel
+def _mean(values: np.ndarray, otherwise: float) -> float:
+    """Give the mean of what is finite."""
+    kept = values[np.isfinite(values)]
+    return np.mean(kept) if kept.size else otherwise
+
+
+@kernel
+def _median(values: np.ndarray, otherwise: float) -> float:
+    """Give the median of what is finite; a surface's short kick at a misdated command leaves it alone."""
+    kept = values[np.isfinite(values)]
+    return np.median(kept) if kept.size else otherwise
 
 
 @kernel
@@ -118,23 +125,14 @@ def _force(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, seq: float, p: np
 
 
 @kernel
-def _note(missed: np.ndarray, count: np.ndarray, i: int, miss: float, recent: bool) -> None:
-    if recent and np.isfinite(miss):
-        missed[i] += miss
-        count[i] += 1.0
-
-
-@kernel
-def _shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, theta_c: np.ndarray, delta_t: np.ndarray) -> None:
-    """Shift the integrators by the mean misses, and put the slewed outputs where the reported ones are."""
+def _shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, theta_c: float, delta_t: float) -> None:
+    """Shift the integrators by what the outputs missed, and put the slewed outputs where the reported ones are."""
     room = 0.5 * (par[P.THR_MAX] - par[P.THR_MIN])
-    ctl[S.I_SEB] += miss[0] * ctl[S.V_HAT] * G
-    ctl[S.THETA] += miss[0]
-    ctl[S.I_THR] = min(max(ctl[S.I_THR] + miss[1], -room), room)
-    ctl[S.I_A] += miss[2] * FULL
-    ctl[S.I_E] += miss[3] * FULL
-    n = theta_c.shape[0]
-    if np.isfinite(theta_c[n - 1]):
-        ctl[S.THETA] = theta_c[n - 1]
-    if np.isfinite(delta_t[n - 1]):
-        ctl[S.THR] = delta_t[n - 1] - ctl[S.I_THR]
+    d_theta = _mean(miss[:, 0], 0.0)
+    ctl[S.I_SEB] += d_theta * ctl[S.V_HAT] * G
+    ctl[S.THETA] = theta_c if np.isfinite(theta_c) else ctl[S.THETA] + d_theta
+    ctl[S.I_THR] = min(max(ctl[S.I_THR] + _mean(miss[:, 1], 0.0), -room), room)
+    if np.isfinite(delta_t):
+        ctl[S.THR] = delta_t - ctl[S.I_THR]
+    ctl[S.I_A] += _median(miss[:, 2], 0.0) * FULL
+    ctl[S.I_E] += _median(miss[:, 3], 0.0) * FULL

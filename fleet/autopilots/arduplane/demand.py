@@ -1,0 +1,112 @@
+"""What TECS starts from: the airspeed as filtered, and the speed and height it is to aim at just now.
+
+Inside, speeds are true airspeeds and heights are up.
+Source: ArduPlane TECS; the braking law read off flights of ArduPlane 4.7.
+"""
+
+from math import cos, sin, sqrt
+
+import numpy as np
+
+from fleet.autopilots.arduplane import params as P
+from fleet.autopilots.arduplane import state as S
+from fleet.autopilots.arduplane.l1 import clip
+from fleet.autopilots.arduplane.state import kernel
+from fleet.frames import G
+
+_W = 2.0  # bandwidth of the airspeed filter [rad/s]
+SLOWEST = 3.0  # the airspeed filter goes no lower [m/s]
+_SMOOTH = 0.2  # lag on the acceleration taken from velocity differences [s]
+
+
+@kernel
+def update_speed(
+    ctl: np.ndarray, par: np.ndarray, v: np.ndarray, euler: np.ndarray, Va: float, Va_dot: float, dt: float
+) -> None:
+    """Filter airspeed and forward acceleration: second-order complementary filter of 2 rad/s.
+
+    Args:
+        ctl, par: controller state, parameters
+        v: ground velocity, NED, (3,) [m/s]
+        euler: phi, theta, psi (3,) [rad]
+        Va: equivalent airspeed; nan: no sensor, cruise is assumed [m/s]
+        Va_dot: forward acceleration; nan: taken from the change of `v` [m/s2]
+        dt: step [s]
+    """
+    if np.isfinite(Va_dot):
+        ctl[S.ACCEL] = Va_dot
+    elif ctl[S.SEEN] > 0.0 and dt > 0.0:
+        ct, st = cos(euler[1]), sin(euler[1])
+        d_n, d_e, d_d = v[0] - ctl[S.V_N], v[1] - ctl[S.V_E], v[2] - ctl[S.V_E + 1]
+        forward = (d_n * ct * cos(euler[2]) + d_e * ct * sin(euler[2]) - d_d * st) / dt
+        ctl[S.ACCEL] += dt / (dt + _SMOOTH) * (clip(forward, -30.0, 30.0) - ctl[S.ACCEL])
+    for j in range(3):
+        ctl[S.V_N + j] = v[j]
+    ctl[S.SEEN] = 1.0
+    ctl[S.ACCEL_LP] += dt / (dt + par[P.TIME_CONST]) * (ctl[S.ACCEL] - ctl[S.ACCEL_LP])
+    if not np.isfinite(Va):
+        ctl[S.V_HAT], ctl[S.V_DOT_HAT] = par[P.VA_CRUISE] * par[P.EAS2TAS], 0.0
+        return
+    error = Va * par[P.EAS2TAS] - ctl[S.V_HAT]
+    ctl[S.V_DOT_HAT] += error * _W * _W * dt
+    ctl[S.V_HAT] += (ctl[S.V_DOT_HAT] + ctl[S.ACCEL] + error * _W * sqrt(2.0)) * dt
+    if ctl[S.V_HAT] < SLOWEST:
+        ctl[S.V_HAT], ctl[S.V_DOT_HAT] = SLOWEST, max(ctl[S.V_DOT_HAT], 0.0)
+
+
+@kernel
+def slowest(par: np.ndarray, phi: float) -> float:
+    """Give the least true airspeed, raised with the load factor of the bank [m/s]."""
+    return par[P.VA_MIN] * par[P.EAS2TAS] / sqrt(max(cos(phi), 0.2))
+
+
+@kernel
+def demand_speed(ctl: np.ndarray, par: np.ndarray, va_c: float, phi: float, dt: float) -> float:
+    """Move the speed demand as power and drag allow; give its rate above its slow part [m/s2].
+
+    Up with half the climb power, down with 0.9 of the drag, which is SINK_MIN at cruise and grows with V^2.
+    """
+    V = ctl[S.V_HAT]
+    fastest = 0.5 * par[P.CLIMB_MAX] * ctl[S.UP] * G / V
+    braking = -0.9 * par[P.SINK_MIN] * G * V * V / (par[P.VA_CRUISE] * par[P.EAS2TAS]) ** 3
+    low, high = slowest(par, phi), par[P.VA_MAX] * par[P.EAS2TAS]
+    if ctl[S.THR_SAT] > 0.0:  # no power left: wind the ceiling down
+        ctl[S.V_TOP] = max(ctl[S.V_TOP] + braking * dt, min(par[P.VA_CRUISE] * par[P.EAS2TAS], high))
+    else:
+        ctl[S.V_TOP] = min(ctl[S.V_TOP] + max(fastest, 0.0) * dt, high)
+    wanted = low if ctl[S.SINKING] > 0.0 or ctl[S.SLOW] > 0.0 else va_c * par[P.EAS2TAS]
+    wanted = max(min(wanted, ctl[S.V_TOP]), low)
+    step = clip(wanted - ctl[S.V_DEM], braking * dt, fastest * dt)
+    ctl[S.V_DEM] += step
+    rate = step / dt
+    ctl[S.V_DEM_LP] += dt / (dt + par[P.TIME_CONST]) * (rate - ctl[S.V_DEM_LP])
+    return rate - ctl[S.V_DEM_LP]
+
+
+@kernel
+def demand_height(ctl: np.ndarray, par: np.ndarray, h_sp: float, dt: float) -> float:
+    """Rate-limit and lag the height demand; give the climb rate demand [m/s]."""
+    mean = 0.5 * (h_sp + ctl[S.H_IN])
+    ctl[S.H_IN] = h_sp
+    down, up = par[P.SINK_MAX] * ctl[S.DOWN] * dt, par[P.CLIMB_MAX] * ctl[S.UP] * dt
+    ctl[S.H_LIMITED] += clip(mean - ctl[S.H_LIMITED], -down, up)
+    tau = max(par[P.H_TIME], dt)
+    h_dot = (ctl[S.H_LIMITED] - ctl[S.H_DEM]) / tau
+    ctl[S.H_DEM] += dt / (dt + tau) * (ctl[S.H_LIMITED] - ctl[S.H_DEM])
+    _yield(ctl, dt / (dt + tau))
+    return h_dot
+
+
+@kernel
+def _yield(ctl: np.ndarray, share: float) -> None:
+    """Let the height demand wait for an aircraft whose throttle or pitch is at its limit."""
+    up = ctl[S.THETA_SAT] > 0.0 or ctl[S.THR_SAT] > 0.0
+    down = ctl[S.THETA_SAT] < 0.0 or ctl[S.THR_SAT] < 0.0
+    if up and ctl[S.H_DEM] > ctl[S.H_LAST]:
+        ctl[S.UP] *= 1.0 - share
+    elif down and ctl[S.H_DEM] < ctl[S.H_LAST]:
+        ctl[S.DOWN] *= 1.0 - share
+    else:
+        ctl[S.UP] += share * (1.0 - ctl[S.UP])
+        ctl[S.DOWN] += share * (1.0 - ctl[S.DOWN])
+    ctl[S.H_LAST] = ctl[S.H_DEM]
