@@ -14,6 +14,7 @@ from gateway.onboard import Onboard
 from gateway.publish import Publisher
 
 TICK_S = 0.1
+NAP_S = 0.02
 ACCOUNT_S = 1.0
 
 
@@ -46,7 +47,7 @@ class Pump:
         try:
             tick = account = time.monotonic()
             while self._open and not stop.is_set():
-                self._drain(tick)
+                self._drain(tick, stop)
                 mono = time.monotonic()
                 if mono >= tick:
                     self._tick(mono)
@@ -72,15 +73,13 @@ class Pump:
         if batch.ended:
             self._open.discard(batch.link)
 
-    def _drain(self, until: float) -> None:
+    def _drain(self, until: float, stop: threading.Event) -> None:
         """Work through the queue until the next tick is due; `until` is on the monotonic clock [s]."""
-        while (left := until - time.monotonic()) > 0:
+        while (left := until - time.monotonic()) > 0 and self._open:
             try:
-                self.take(self._queue.get(timeout=left))
+                self.take(self._queue.get_nowait())
             except queue.Empty:
-                return
-            if not self._open:
-                return
+                stop.wait(min(left, NAP_S))  # waking up for every datagram would cost more than decoding it
 
     def _tick(self, mono: float) -> None:
         for number in self._live:
