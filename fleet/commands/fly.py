@@ -1,9 +1,15 @@
 """Fly pretend aircraft: fixed-wing UAVs on JSBSim that speak MAVLink 2 over UDP, or into a recording."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING
 
 from fleet.cli import id_range, stop_on_signal
+
+if TYPE_CHECKING:
+    from fleet.pretend.uav import PretendUav
 
 EXAMPLES = """
   fleet fly --uavs 0-7
@@ -33,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         ValueError: when an option makes no sense; the sentence says which.
     """
-    from fleet.pretend import drive  # loads JSBSim and compiles: not for --help
+    from fleet.pretend import drive  # loads JSBSim and the compiler: not for --help
     from fleet.pretend.uav import PretendUav
     from fleet.pretend.weather import turbulence_level
 
@@ -42,12 +48,14 @@ def run(args: argparse.Namespace) -> int:
     level = turbulence_level(args.turbulence)
     host, port = _address(args.to)
     uavs = [PretendUav(i, args.seed, wind=args.wind, turbulence=level) for i in args.uavs]
+    print("fly: compiling the autopilot, once", flush=True)
+    PretendUav(args.uavs[0], args.seed).step(0.2)
     if args.tlog is not None:
-        _record(drive, uavs, args, stop)
+        _record(uavs, args, stop)
         return 0
     print(f"fly: {len(uavs)} aircraft in the air, talking to {host}:{port}", flush=True)
     worst = drive.to_udp(uavs, (host, port), seconds=args.seconds, loss=args.loss, seed=args.seed, stop=stop)
-    print(f"fly: landed nowhere, stopped; at worst {worst * 1e3:.0f} ms behind real time", flush=True)
+    print(f"fly: stopped; at worst {worst * 1e3:.0f} ms behind real time", flush=True)
     return 0
 
 
@@ -74,9 +82,11 @@ def _address(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def _record(drive, uavs, args, stop) -> None:  # type: ignore[no-untyped-def]
+def _record(uavs: "Sequence[PretendUav]", args: argparse.Namespace, stop: Event) -> None:
     """Write the recording under a progress bar."""
     from rich.progress import Progress
+
+    from fleet.pretend import drive
 
     seconds = args.seconds or _RECORDED_S
     with Progress(transient=True) as bar:

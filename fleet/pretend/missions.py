@@ -106,6 +106,7 @@ def _item(
     command: int,
     origin: Origin,
     ned: tuple[float, float, float] | None = None,
+    *,
     params: tuple[float, ...] = (),
     frame: int = RELATIVE_ALT,
 ) -> Item:
