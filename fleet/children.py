@@ -45,9 +45,9 @@ class Children(AbstractContextManager):
         return [words[-1] for words in self._words.values() if words]
 
     def dead(self) -> list[str]:
-        """Say which children ended on their own, and their last words."""
+        """Say which children failed, and their last words; one that ended with 0 was done."""
         ended = [(name, child.poll()) for name, child in self._running.items()]
-        return [f"{name} ended with {code}: {' | '.join(self._words[name])}" for name, code in ended if code is not None]
+        return [f"{name} ended with {code}: {' | '.join(self._words[name])}" for name, code in ended if code]
 
     def stop(self) -> None:
         """Ask all to stop, newest first, then insist."""

@@ -1,10 +1,11 @@
 """The last minutes of one aircraft's telemetry, as it came."""
 
-from collections import deque
-
 import numpy as np
 
 from fleet.contract import COLUMNS, Rows, Sample
+
+
+_CHUNKS = 40  # chunks of one kind before they are joined
 
 
 class History:
@@ -13,7 +14,7 @@ class History:
     def __init__(self, keep_s: float = 150.0) -> None:
         self.keep_s = keep_s
         self.newest = -np.inf
-        self._chunks: dict[str, deque[tuple[np.ndarray, np.ndarray]]] = {name: deque() for name in COLUMNS}
+        self._chunks: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in COLUMNS}
 
     def add(self, sample: Sample) -> int:
         """Take one message; give how many of its kinds did not fit the contract."""
@@ -32,25 +33,31 @@ class History:
                 continue
             self._chunks[name].append((t, x))
             self.newest = max(self.newest, float(t[-1]))
-        self._forget()
+        self._join()
         return bad
 
-    def _forget(self) -> None:
-        oldest = self.newest - self.keep_s
+    def _join(self) -> None:
+        """Join many small chunks to one, and forget what is too old."""
         for chunks in self._chunks.values():
-            while chunks and chunks[0][0][-1] < oldest:
-                chunks.popleft()
+            if len(chunks) > _CHUNKS:
+                t, x = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+                young = t >= self.newest - self.keep_s
+                chunks.clear()
+                chunks.append((t[young], x[young]))
 
     def rows(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
         """Give times (n,) and values (n, k) of one kind from `since` on, rising in time, finite, without repeats."""
-        found = [chunk for chunk in self._chunks[name] if chunk[0][-1] >= since]
+        found = [chunk for chunk in self._chunks[name] if len(chunk[0]) and chunk[0][-1] >= since]
         if not found:
             return np.empty(0), np.empty((0, len(COLUMNS[name])))
         t = np.concatenate([chunk[0] for chunk in found])
         x = np.concatenate([chunk[1] for chunk in found]).astype(float)
         good = (t >= since) & np.isfinite(t) & np.isfinite(x).all(axis=1)
-        t, first = np.unique(t[good], return_index=True)
-        return t, x[good][first]
+        t, x = t[good], x[good]
+        if (np.diff(t) > 0).all():
+            return t, x
+        t, first = np.unique(t, return_index=True)
+        return t, x[first]
 
     def clear(self) -> None:
         """Forget everything, as after a jump of the clock."""

@@ -5,18 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.contract import Array, Linear
-from fleet.frames import G
 from fleet.window import Window
+from twin_worker.prior import INPUTS, STATES, prior
 from twin_worker.refine import refine
 from twin_worker.subspace import subspace
 
-AXES = {
-    "longitudinal": (("u", "w", "q", "theta"), ("delta_e", "delta_t", "bank")),
-    "lateral": (("phi", "psi", "p", "r", "v"), ("delta_a", "delta_r")),
-}
-KINEMATIC = ("theta", "phi", "psi")
-_RATE = 4.0  # prior standard deviation of a scaled derivative [1/s]
-_RATE_KINEMATIC = 0.15  # the same in the rows that kinematics already knows [1/s]
+AXES = tuple(STATES)
+_FIRM = 0.5  # doubt about a verified model, as a share of the doubt about any small fixed wing [-]
 
 
 @dataclass(frozen=True)
@@ -71,40 +66,6 @@ class Axis:
         )
 
 
-def kinematic_prior(axis: str, U0: float, W0: float, dt: float) -> np.ndarray:
-    """Give what holds for every aircraft: rotations integrate rates, gravity tilts, nothing depends on heading.
-
-    theta' = q, phi' = p, psi' = r;  u' = -g theta - W0 q, w' = U0 q, v' = g phi - U0 r + W0 p.
-    Source: Beard & McLain 2012, section 5.5. Units are unscaled, (n, n + m + 1).
-    """
-    states, inputs = AXES[axis]
-    n = len(states)
-    rate, known = np.zeros((n, n)), np.zeros((n, len(inputs) + 1))
-    at = states.index
-    if axis == "longitudinal":
-        rate[at("theta"), at("q")] = 1.0
-        rate[at("u"), at("theta")], rate[at("u"), at("q")] = -G, -W0
-        rate[at("w"), at("q")] = U0
-        known[at("theta"), inputs.index("bank")] = -G / U0
-        known[at("w"), inputs.index("bank")] = -G / 2
-    else:
-        rate[at("phi"), at("p")] = rate[at("psi"), at("r")] = 1.0
-        rate[at("v"), at("phi")], rate[at("v"), at("r")], rate[at("v"), at("p")] = G, -U0, W0
-    return np.hstack([np.eye(n) + dt * rate, dt * known])
-
-
-def _precision(axis: str, dt: float) -> np.ndarray:
-    states, inputs = AXES[axis]
-    n, m = len(states), len(inputs)
-    sigma = np.full((n, n + m + 1), _RATE * dt)
-    for name in KINEMATIC:
-        if name in states:
-            sigma[states.index(name)] = _RATE_KINEMATIC * dt
-    if "psi" in states:
-        sigma[:, states.index("psi")] = 1e-6  # no force knows where north is
-    return sigma**-2.0
-
-
 def identify_axis(axis: str, window: Window, length_s: float, last: Axis | None = None) -> tuple[Axis, Axis]:
     """Identify one axis of one window in two steps.
 
@@ -118,7 +79,7 @@ def identify_axis(axis: str, window: Window, length_s: float, last: Axis | None 
     Raises:
         ValueError: when the window is too broken for the subspace step.
     """
-    states, inputs = AXES[axis]
+    states, inputs = STATES[axis], INPUTS[axis]
     y, u, ok = window.columns(states), window.columns(inputs), window.ok
     y_mean, u_mean = y[ok].mean(axis=0), u[ok].mean(axis=0)
     y_scale, u_scale = np.maximum(y[ok].std(axis=0), 1e-3), np.maximum(u[ok].std(axis=0), 1e-2)
@@ -126,23 +87,24 @@ def identify_axis(axis: str, window: Window, length_s: float, last: Axis | None 
     y, u = frame.scaled(window)
     right = np.concatenate([y_scale, u_scale, [1.0]])
     speed = window.columns(("u", "w"))[ok].mean(axis=0)
-    prior = kinematic_prior(axis, speed[0], speed[1], window.dt) * right / y_scale[:, None]
+    mean, sigma = prior(axis, speed[0], speed[1], window.dt)
     if last is not None:
-        prior = last.physical() * right / y_scale[:, None]
-        prior[:, -1] = 0.0
+        mean, sigma = last.physical(), _FIRM * sigma
+        mean[:, -1], sigma[:, -1] = 0.0, sigma[:, -1] / _FIRM
+    mean, sigma = mean * right / y_scale[:, None], sigma * right / y_scale[:, None]
     A, B = subspace(y, u, ok)
     first = np.hstack([A, B, np.zeros((len(A), 1))])
-    first = _tame(first, prior)
+    first = _tame(first, mean)
     length = max(int(length_s / window.dt), 10)
-    refined = refine(first, y, u, ok, prior=prior, precision=_precision(axis, window.dt), length=length)
+    refined = refine(first, y, u, ok, prior=mean, precision=sigma**-2.0, length=length)
     return tuple(  # type: ignore[return-value]
         Axis(states, inputs, D, y_mean, y_scale, u_mean, u_scale, window.dt) for D in (first, refined)
     )
 
 
-def _tame(D: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """Start from the prior where the first step is not finite or explodes within a free run."""
+def _tame(D: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Start from the prior mean where the first step is not finite or explodes within a free run."""
     n = len(D)
     if np.isfinite(D).all() and np.abs(np.linalg.eigvals(D[:, :n])).max() < 1.02:
         return D
-    return prior.copy()
+    return mean.copy()

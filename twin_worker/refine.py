@@ -89,7 +89,7 @@ def refine(
     prior: np.ndarray,
     precision: np.ndarray,
     length: int,
-    discount: float = 0.05,
+    discount: float = 0.2,
     steps: int = 8,
 ) -> np.ndarray:
     """Refine [A B c] by damped Gauss-Newton on the prediction error of free runs.

@@ -38,8 +38,10 @@ def subspace(y: np.ndarray, u: np.ndarray, ok: np.ndarray, ridge: float = 1e-3) 
     # block row i of the observability matrix times the reachability matrix: the same coefficients, i steps later
     k = n + m
     shifted = [np.hstack([markov[:, i * k :], np.zeros((n, i * k))]) for i in range(FUTURE)]
-    _, s, vt = np.linalg.svd(np.vstack(shifted) @ z.T, full_matrices=False)
-    x = np.sqrt(s[:n, None]) * vt[:n]  # states, (n, N')
+    product = np.vstack(shifted)
+    squared, left = np.linalg.eigh(product @ (z.T @ z) @ product.T)  # of (product z')(product z')', a small matrix
+    weight = np.maximum(squared[::-1][:n], 1e-12) ** -0.25
+    x = weight[:, None] * (left[:, ::-1][:, :n].T @ product @ z.T)  # sqrt(S) V', the states, (n, N')
     C = np.linalg.lstsq(x.T, target, rcond=None)[0].T
     e = target - (C @ x).T
     follows = np.flatnonzero(np.diff(np.flatnonzero(whole)) == 1)

@@ -40,6 +40,7 @@ LEAST_S = 30.0  # shortest stretch worth identifying [s]
 WINDOW_S = 80.0  # longest stretch used [s]
 HOP_S = 4.0  # between identifications [s]
 PREDICT_S = 1.0  # between predictions [s]
+SLOW = 6.0  # air-relative forward speed below which nothing flies on its wings [m/s]
 LOST_S = 3.0  # without a sample: link lost [s]
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 _FREE_RUN_S = (4.0, 2.0, 4.0, 8.0)  # free-run length of the n-th try [s]
@@ -169,7 +170,9 @@ def _watch_link(twin: Twin, now: float) -> list[Message]:
 
 
 def _blow(twin: Twin) -> None:
-    """Feed the wind filter, at most five rows a second."""
+    """Feed the wind filter once a second, five rows a second."""
+    if twin.history.newest - twin.wind_t < 1.0:
+        return
     since = max(twin.wind_t, twin.history.newest - 10.0)
     t_v, v = twin.history.rows("velocity", since)
     t_air, air = twin.history.rows("air", since - 1.0)
@@ -204,9 +207,9 @@ def _window(twin: Twin, seconds: float) -> Window | None:
 
 
 def _identify(twin: Twin) -> list[Message]:
-    window = _window(twin, WINDOW_S)
-    if window is None or window.ok.sum() * DT < LEAST_S:
-        have = 0.0 if window is None else float(window.ok.sum() * DT)
+    window = _airborne(_window(twin, WINDOW_S))
+    have = 0.0 if window is None else float(window.ok.sum() * DT)
+    if window is None or have < LEAST_S:
         if twin.axes is None:
             sentence = f"{twin.name}: {have:.0f} s of whole data, {LEAST_S:.0f} s are needed; {_missing(twin)}"
             twin.verdict, twin.state = Verdict(outcome=Outcome.STARVED, sentence=sentence), State.WAITING
@@ -231,6 +234,15 @@ def _identify(twin: Twin) -> list[Message]:
         twin.axes, twin.tries = axes, 0  # type: ignore[assignment]
     twin.verdict = verdict
     return [_model(twin, axes, verdict, window)]  # type: ignore[arg-type]
+
+
+def _airborne(window: Window | None) -> Window | None:
+    """Keep what was flown: from the last row that was too slow to fly."""
+    if window is None:
+        return None
+    slow = np.flatnonzero(window.ok & (window.columns(("u",))[:, 0] < SLOW))
+    start = int(slow[-1]) + 1 if len(slow) else 0
+    return window.part(start, len(window)) if len(window) - start > 1 else None
 
 
 def _missing(twin: Twin) -> str:
@@ -305,7 +317,7 @@ def _imm_path(window: Window, ahead: np.ndarray) -> np.ndarray | None:
     rows = slice((len(window) - 1) % every, None, every)
     ok = window.ok[rows]
     start = int(np.flatnonzero(~ok)[-1]) + 1 if not ok.all() else 0
-    p, v = window.p[rows][start:][-60:], window.v[rows][start:][-60:]
+    p, v = window.p[rows][start:][-24:], window.v[rows][start:][-24:]
     return imm(p, v, ahead) if len(p) >= 4 else None
 
 

@@ -12,9 +12,11 @@ from fleet.telemetry.route import MESSAGES
 
 MOST_UAVS = 250
 SECOND = "second sender for a live id"
+MOST_EARLY = 4096  # messages of one system kept until its first heartbeat; a recording may begin anywhere
 MOST_SENDERS = 512  # addresses with a decoder of their own on one link
 
 News = Sample | Status | Mission | Params
+EARLY = MESSAGES | {"PARAM_VALUE"}  # said once, so worth keeping; rows come again
 Claims = dict[int, Craft]
 """Which aircraft holds a UAV id, over all links of a gateway."""
 
@@ -34,6 +36,7 @@ class Intake:
         self._claims: Claims = {} if claims is None else claims
         self._decoders: OrderedDict[Hashable, Decoder] = OrderedDict()
         self._rivals: set[int] = set()  # systems whose UAV id another link holds
+        self._early: dict[int, list[tuple[float, Any]]] = {}  # before the first heartbeat, by system id
         self._gone: Counter[str] = Counter()  # counters of decoders no longer kept
 
     def hear(self, arrival: float, data: bytes, source: Hashable = None) -> None:
@@ -95,6 +98,9 @@ class Intake:
             craft = Craft(uav, system, message.get_srcComponent(), source)
             self.crafts[system] = self._claims[uav] = craft
             craft.hear(arrival, message)
+            for when, early in self._early.pop(system, ()):
+                if early.get_srcComponent() == craft.component:
+                    craft.hear(when, early)
 
     def _may_speak(self, craft: Craft, source: Hashable, arrival: float) -> bool:
         """Tell whether this is the one sender of its id; another takes over once that one is silent."""
@@ -125,6 +131,14 @@ class Intake:
             self.refused[SECOND] += 1
         elif message.get_srcSystem() in self.crafts:
             self.refused["not an autopilot"] += 1
+        else:
+            self._keep_early(arrival, message)
+
+    def _keep_early(self, arrival: float, message: Any) -> None:
+        """Keep what a system says before it says what it is, in case it turns out to be an aircraft."""
+        kept = self._early.setdefault(message.get_srcSystem(), [])
+        if len(kept) < MOST_EARLY and message.get_type() in EARLY:
+            kept.append((arrival, message))
         else:
             self.refused["no aircraft heartbeat yet"] += 1
 
