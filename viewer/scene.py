@@ -49,7 +49,7 @@ class Scene:
         w = (np.linspace(0, 1, 256) ** 1.2)[:, None, None]
         scene.set_background_image(np.repeat(top * (1 - w) + bottom * w, 2, axis=1).astype(np.uint8), format="png")
         scene.configure_default_lights(True, cast_shadow=False)
-        scene.configure_fog(near=500.0, far=1800.0, color=triple(p.sky[1]))
+        # No fog: with it the client fails to draw the outline of an aircraft under the mouse, and then the whole frame.
         node = scene.add_frame("/env", show_axes=False)
         scene.add_grid(
             "/env/grid",
