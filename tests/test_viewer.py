@@ -6,10 +6,27 @@ from pretend_feed import HOME, HOSTILE, STAMP, PretendFleet, PretendUav
 
 from fleet.bus import MemoryBus
 from fleet.codec import Stamp
-from fleet.contract import Alert, AlertKind, Array, Item, Link, Mission, Prediction, Rows, Sample, State, Status
+from fleet.contract import (
+    Alert,
+    AlertKind,
+    Array,
+    FleetRow,
+    FleetState,
+    Item,
+    Link,
+    Mission,
+    Model,
+    Outcome,
+    Prediction,
+    Rows,
+    Sample,
+    State,
+    Status,
+    Verdict,
+)
 from fleet.frames import Origin, body_to_ned, to_geodetic
 from viewer.camera import FOV, frame
-from viewer.detail import about, why
+from viewer.detail import about, band, scale, why
 from viewer.feed import GIVE_UP_S, Feed
 from viewer.palette import DARK, LIGHT, line_colour, rgb, shown_line
 from viewer.place import UNIT_M, Place, scene_quat
@@ -321,6 +338,39 @@ def test_who_has_no_prediction_is_told_why(clock: Clock) -> None:
 def test_the_panel_says_measured_coverage(clock: Clock) -> None:
     feed, _, _ = feed_of(clock, 1)
     assert "90 % tube held 91 %, n = 412" in about(feed.vehicles[0], DARK, clock.now)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 1e300])
+def test_wild_numbers_in_good_messages_do_not_stop_the_page(clock: Clock, value: float) -> None:
+    feed, _, bus = feed_of(clock, 2)
+    one = PretendUav(0)
+    told = {**_fields(one.prediction(T + 1, 0.0)), "horizon_s": value, "held": value, "coast_s": value}
+    bus.publish(Prediction(**told), STAMP)
+    bus.publish(Prediction(**{**told, "t": T + 2, "tube": Array.of(np.full((81, 3), value), "<f8")}), STAMP)
+    verdict = Verdict(
+        outcome=Outcome.DIVERGED, sentence="", fit={"u": value, "w": 50.0}, threshold=value, horizon_s=value
+    )
+    bus.publish(Model(uav=0, t=T + 2, method="paper", verdict=verdict), STAMP)
+    row = FleetRow(uav=0, state=State.VERIFIED, verdict="", horizon_s=value, t10_s=value, fit={"u": value}, epoch=1)
+    bus.publish(FleetState(t=value, rows=(row,)), STAMP)
+    vehicle = feed.vehicles[0]
+    assert vehicle.model.verdict is not None and vehicle.row.epoch == 1 and vehicle.forecast.t == T + 2
+    assert np.isfinite(vehicle.forecast.until) and np.isfinite(vehicle.forecast.tube).all()
+    assert "UAV-000" in about(vehicle, DARK, clock.now) and "2 UAVs" in summary(feed.all(), feed, DARK, clock.now)
+    assert "UAV-000" in table(feed.all(), DARK, clock.now, total=2, pick="{}", selected=0)
+    assert all(np.isfinite(part).all() for part in band(vehicle)[:4])
+
+
+def test_a_chart_keeps_its_scale_while_its_values_stay_within() -> None:
+    wave = np.sin(np.linspace(0, 6, 50))
+    assert scale(600 + 40 * wave) == scale(601 + 40.5 * wave)
+    for y in (wave, wave * 0, 1e5 + wave, np.array([np.nan, 3.0])):
+        low, high = scale(y)
+        assert (
+            low <= np.nanmin(y)
+            and high > np.nanmax(y)
+            and high - low < 3 * max(np.nanmax(y) - np.nanmin(y), 0.03 * abs(np.nanmax(y)), 0.01)
+        )
 
 
 def test_an_empty_page_says_what_it_listens_to(clock: Clock) -> None:

@@ -10,6 +10,7 @@ import viser
 from viser import _messages
 
 from fleet.bus import Bus
+from viewer.callouts import Callouts
 from viewer.camera import Cameras
 from viewer.feed import Feed
 from viewer.palette import DARK, LIGHT
@@ -21,6 +22,7 @@ from viewer.selected import Selection
 from viewer.vehicle import Vehicle
 
 TICK_S = 0.1
+NEAR_M = 800.0  # items of the route within this are shown with an aircraft one turns to
 SLOW_S = 10.0  # how often what is missing is asked for again
 
 
@@ -54,7 +56,7 @@ class App:
         self.feed, self._server = Feed(bus), server
         self.scene, self.selection = Scene(server, palette), Selection(server, palette)
         self.panels = Panels(server, palette, self.visit)
-        self.cameras = Cameras(server)
+        self.cameras, self.callouts = Cameras(server), Callouts(server)
         self.scene.on_click(self.choose)
         self.selected: int | None = None
         self._dirty = threading.Event()
@@ -74,7 +76,9 @@ class App:
         if vehicle is None or place is None or (at := vehicle.where(time.monotonic())) is None:
             return
         told = [vehicle.forecast.path] if vehicle.forecast is not None else []
-        self.cameras.fly_to(np.vstack([at, *told]))
+        around = route(vehicle.mission, place, self.scene.ground).points[1:]
+        near = around[np.linalg.norm(around - at, axis=1) < NEAR_M / UNIT_M]
+        self.cameras.fly_to(np.vstack([at, *told, near]))
 
     def run(self, stop: threading.Event) -> None:
         """Draw until told to stop."""
@@ -100,6 +104,8 @@ class App:
 
     def tick(self, tick: int) -> None:
         """Draw what is due at this tick; selection changes are drawn at once."""
+        if tick % 10 and not self._server.get_clients():
+            return  # nobody looks: once a second keeps the trails
         now, fleet = time.monotonic(), self.feed.all()
         changed = self._dirty.is_set()
         self._dirty.clear()
@@ -117,6 +123,8 @@ class App:
             self.scene.heads([where[uav] for uav in self.scene.uavs])
             if self.panels.stems.value:
                 self.scene.draw_stems(fleet, now)
+        if tick % 2 == 0:
+            self.callouts.draw(fleet, now, selected=self.selected, size=self.scene.glyph)
         chosen = self._chosen(fleet)
         if chosen is not None and (tick % 2 == 0 or changed):
             self.selection.draw(chosen, self.feed, now, ground=self.scene.ground, size=self.scene.glyph)

@@ -72,7 +72,7 @@ class Cameras:
     def fly_to(self, points: np.ndarray) -> None:
         """Turn every camera to some points (n, 3) [10 m], no farther off than it takes to see them all."""
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        enough = 1.6 * float(np.linalg.norm(points - middle, axis=1).max()) / np.tan(FOV / 2) + 12.0
+        enough = 1.6 * float(np.linalg.norm(points - middle, axis=1).max()) / np.tan(FOV / 2) + 30.0
         for client in self._server.get_clients().values():
             away = client.camera.position - client.camera.look_at
             length = float(np.linalg.norm(away)) or 1.0

@@ -171,7 +171,7 @@ class Charts:
     def draw(self, vehicle: Vehicle | None, feed: Feed, now: float) -> None:
         """Replace the data; a chart without any is hidden."""
         trail = feed.trail(vehicle) if vehicle is not None else np.zeros((0, 5))
-        _put(self._tube, _band(vehicle))
+        _put(self._tube, band(vehicle))
         _put(self._fit, _history(feed.fits(vehicle), 1) if vehicle is not None else None)
         _put(self._va, _history(trail[np.isfinite(trail[:, 4])], 4))
         _put(self._alt, _altitude(vehicle, trail, now))
@@ -200,7 +200,7 @@ def scale(y: np.ndarray) -> tuple[float, float]:
     return float(np.floor(low / step) * step), float((np.floor(high / step) + 1) * step)
 
 
-def _band(vehicle: Vehicle | None) -> tuple[np.ndarray, ...] | None:
+def band(vehicle: Vehicle | None) -> tuple[np.ndarray, ...] | None:
     """Give half-axes against look-ahead, and an upright line at the horizon: x, along, cross, vertical, horizon."""
     if vehicle is None or (told := vehicle.forecast) is None:
         return None

@@ -13,7 +13,7 @@ from viewer.place import UNIT_M, Place
 TRAIL_ROWS = 900  # about 90 s at 10 Hz
 SILENT_S = 3.0  # without a sample for this long the link counts as lost, whatever was last said
 JUMP_S = 5.0  # a step back in time by more than this is another flight: start afresh
-MAX_STEPS = 5_000  # look-ahead steps accepted from outside
+MAX_STEPS, MAX_AHEAD_S = 5_000, 3_600.0  # look-ahead accepted from outside: steps, and time [s]
 
 
 class Forecast(NamedTuple):
@@ -53,8 +53,11 @@ def forecast(message: Prediction, place: Place, heard: float) -> Forecast | None
         return None
     if not 2 <= n <= MAX_STEPS or path.shape != (n, 3) or tube.shape != (n, 3):
         raise ValueError(f"uav-{message.uav}: prediction has shapes {ahead.shape} {path.shape} {tube.shape}; resend")
-    if not (np.isfinite(ahead).all() and np.isfinite(message.t) and (np.diff(ahead) > 0).all()):
-        raise ValueError(f"uav-{message.uav}: prediction has times that do not rise; resend")
+    if (
+        not (np.isfinite(ahead).all() and np.isfinite(message.t) and (np.diff(ahead) > 0).all())
+        or np.abs(ahead).max() > MAX_AHEAD_S
+    ):
+        raise ValueError(f"uav-{message.uav}: prediction has times that do not rise within an hour; resend")
     tube = np.clip(np.nan_to_num(tube / UNIT_M), 0.0, 1e4)
     return Forecast(message.t, heard, ahead, place.local(Origin(*message.origin), path), tube, message)
 

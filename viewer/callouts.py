@@ -1,0 +1,44 @@
+"""Three labels in 3-D for those who need an eye: supervision is by exception."""
+
+from typing import Any
+
+import numpy as np
+
+from fleet.contract import State
+from viewer.palette import GLYPH
+from viewer.vehicle import Vehicle
+from viewer.words import ago, severity
+
+LABELS = 3  # labels do not make room for each other: few are readable
+
+
+class Callouts:
+    """The worst few of the fleet, named where they fly."""
+
+    def __init__(self, server: Any) -> None:
+        self._labels = [
+            server.scene.add_label(
+                f"/fleet/callout{k}", "", font_screen_scale=0.8, anchor="bottom-center", depth_test=False, visible=False
+            )
+            for k in range(LABELS)
+        ]
+
+    def draw(self, fleet: list[Vehicle], now: float, *, selected: int | None, size: float) -> None:
+        """Name alerts and lost links; `size` is the drawn span of an aircraft [10 m]."""
+        worst = [v for v in fleet if v.uav != selected and (v.alerts or v.state(now) is State.LINK_LOST)]
+        worst = [v for v in sorted(worst, key=lambda v: severity(v, now)) if v.where(now) is not None][:LABELS]
+        for label, vehicle in zip(self._labels, worst, strict=False):
+            at = vehicle.where(now)
+            label.text, label.visible = caption(vehicle, now), True
+            if at is not None:
+                label.position = tuple(float(x) for x in at + np.array([0.0, 0.0, 0.7 * size]))
+        for label in self._labels[len(worst) :]:
+            label.visible = False
+
+
+def caption(vehicle: Vehicle, now: float) -> str:
+    """Say in few words what is wrong with a UAV."""
+    if vehicle.state(now) is State.LINK_LOST:
+        return f"{GLYPH[State.LINK_LOST]} {vehicle.name} link lost {ago(vehicle.age(now))}"
+    kinds = ", ".join(kind.value.replace("_", " ") for kind in list(vehicle.alerts))
+    return f"▲ {vehicle.name} {kinds}"
