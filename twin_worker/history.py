@@ -11,7 +11,7 @@ _CHUNKS = 40  # chunks of one kind before they are joined
 class History:
     """Rows of every kind over the last `keep_s` seconds; out-of-order and repeated rows are sorted out on reading."""
 
-    def __init__(self, keep_s: float = 150.0) -> None:
+    def __init__(self, keep_s: float = 160.0) -> None:
         self.keep_s = keep_s
         self.newest = -np.inf
         self._chunks: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in COLUMNS}

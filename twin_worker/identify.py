@@ -11,7 +11,7 @@ from twin_worker.refine import refine
 from twin_worker.subspace import subspace
 
 AXES = tuple(STATES)
-_FIRM = 0.5  # doubt about a verified model, as a share of the doubt about any small fixed wing [-]
+_FIRM = 0.3  # doubt about a verified model, as a share of the doubt about any small fixed wing [-]
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from twin_worker.identify import Axis
 from twin_worker.wind import WindFilter
 
 SHADOW_S = 60.0  # telemetry the controller twin is synchronised on [s]
+SETTLE_S = 40.0  # telemetry whose mean the model must meet [s]
 _SHADOW_STEP = 2  # window rows per shadow step
 _REFUSED = {TAKEOFF: "take-off", LAND: "landing"}
 
@@ -143,5 +144,15 @@ def _simulate(good: Window, history: History, axes, wind: WindFilter, controller
     assert INPUTS[3] == "delta_t"
     matrices = []
     for axis in (lon, lat):
-        matrices += [axis.physical(), np.concatenate([axis.y_mean, axis.u_mean])]
+        matrices += [_settled(axis, good), np.concatenate([axis.y_mean, axis.u_mean])]
     return int(simulate(*controller, *matrices, state, command, air, good.dt, out))
+
+
+def _settled(axis: Axis, good: Window) -> np.ndarray:
+    """Give the model's [A B c] with c moved by its mean one-step miss of late, so that it starts without drift."""
+    recent = good.part(max(len(good) - int(SETTLE_S / good.dt), 0), len(good))
+    D = axis.physical()
+    y = recent.columns(axis.states) - axis.y_mean
+    z = np.column_stack([y, recent.columns(axis.inputs) - axis.u_mean, np.ones(len(y))])
+    D[:, -1] += (y[1:] - z[:-1] @ D.T).mean(axis=0)
+    return D

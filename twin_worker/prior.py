@@ -35,7 +35,7 @@ _AERODYNAMICS = (
     ("v", "v", -1.0, 0.0),
 )
 _FLOOR = {"u": 0.3, "w": 0.6, "q": 1.0, "p": 1.5, "r": 1.0, "v": 0.5}  # doubt of an entry not in the table [1/s]
-_SHARE = 0.7  # doubt of an entry in the table, as a share of it [-]
+_SHARE = 0.4  # doubt of an entry in the table, as a share of it [-]
 _KINEMATIC = {"theta": 0.05, "phi": 0.05, "psi": 0.05}  # doubt of the rows that kinematics knows [1/s]
 _OFFSET = {"u": 2.0, "w": 3.0, "q": 3.0, "p": 3.0, "r": 2.0, "v": 2.0, "theta": 0.05, "phi": 0.05, "psi": 0.05}
 

@@ -37,7 +37,7 @@ from twin_worker.verify import OMEGA, verify
 from twin_worker.wind import WindFilter
 
 LEAST_S = 30.0  # shortest stretch worth identifying [s]
-WINDOW_S = 80.0  # longest stretch used [s]
+WINDOW_S = 140.0  # longest stretch used [s]
 HOP_S = 4.0  # between identifications [s]
 PREDICT_S = 1.0  # between predictions [s]
 SLOW = 6.0  # air-relative forward speed below which nothing flies on its wings [m/s]

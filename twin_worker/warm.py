@@ -1,0 +1,45 @@
+"""Compile the twin's physics before the first aircraft needs it, on a made-up straight flight."""
+
+import numpy as np
+
+from fleet.autopilots import arduplane
+from fleet.contract import Item
+from fleet.frames import Origin
+from fleet.mission import route
+from fleet.simulate import N_STATE, simulate
+from fleet.window import Window
+from twin_worker.identify import AXES, identify_axis
+
+_SPEED = 22.0  # [m/s]
+_ITEMS = tuple(Item(seq=k, command=16, lat_e7=470_000_000 + 90_000 * k, lon_e7=80_000_000, alt_m=100.0) for k in range(3))
+
+
+def warm_up() -> None:
+    """Run every compiled function of the worker once; from the disk cache this takes about a second."""
+    window = _flight()
+    axes = [identify_axis(axis, window, 2.0)[1] for axis in AXES]
+    origin = Origin(470_000_000, 80_000_000, 100_000)
+    par, _ = arduplane.parameters({})
+    legs = route(_ITEMS, seq=1, origin=origin, params={}).legs
+    n = len(window)
+    euler, rates = np.ascontiguousarray(window.x[:, 6:]), np.ascontiguousarray(window.x[:, 3:6])
+    told = [np.full(n, _SPEED), np.zeros(n), np.zeros(n), window.u, np.ones(n, np.int64)]
+    rows = [window.t - window.t[0], window.p, window.v, euler, rates, *told]
+    ctl, _ = arduplane.shadow(par, legs, window.p[0], *rows)
+    state = np.concatenate([window.p[-1], window.x[-1]])
+    matrices = [part for axis in axes for part in (axis.physical(), np.concatenate([axis.y_mean, axis.u_mean]))]
+    air = np.array([0.0, 0.0, 1.0])
+    simulate(ctl, par, legs, *matrices, state, np.zeros(2), air, window.dt, np.empty((50, N_STATE)))
+
+
+def _flight(seconds: float = 20.0, dt: float = 0.04) -> Window:
+    """Make up a flight due north with a little of everything in every channel."""
+    n = int(seconds / dt)
+    rng = np.random.default_rng(0)
+    t = dt * np.arange(n)
+    x = 0.05 * rng.standard_normal((n, 9))
+    x[:, 0] += _SPEED
+    u = 0.05 * rng.standard_normal((n, 4))
+    u[:, 3] += 0.5
+    v = np.tile([_SPEED, 0.0, 0.0], (n, 1))
+    return Window(t, x, u, v * t[:, None], v, np.ones(n, bool), np.zeros(n, bool))
