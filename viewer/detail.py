@@ -143,7 +143,7 @@ class Charts:
         self._gui, p = gui, palette
         two = np.array([0.0, 1.0])
         self._tube = self._chart(
-            "Band against look-ahead, m",
+            "Band, m",
             (("along", p.predicting), ("cross", p.verified), ("vertical", p.identifying), ("horizon", p.horizon)),
             (two,) * 5,
         )

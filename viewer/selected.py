@@ -35,6 +35,7 @@ class Selection:
         self._horizon = Strokes(self._scene, "/selected/horizon", 3.6)
         self._labels = {name: self._label(name) for name in LABELS}
         self.tube = True
+        self._clear_of = 0.0  # room round a label [10 m]
 
     def _sheet(self, name: str, vertices: np.ndarray, faces: np.ndarray, opacity: float, colour: str) -> Any:
         return self._scene.add_mesh_simple(
@@ -84,6 +85,7 @@ class Selection:
         flown = trail[:, 1:4]
         if len(flown) > 1:
             bold.add(chain(np.vstack([flown[::2], flown[-1:]])), rgb(p.flown))
+        self._clear_of = 1.4 * size
         self._draw_forecast(vehicle.forecast, vehicle.clock(now), ground, thin, bold)
         self._draw_hindcast(feed.past(vehicle), trail, vehicle.clock(now), thin)
         self._thin.draw(*thin.all())
@@ -110,12 +112,20 @@ class Selection:
         hoop = rings(told.at(np.array([0.0, *steps, until])), told.width(np.array([0.0, *steps, until])))[1:]
         thin.add(closed(hoop[:-1]).reshape(-1, 2, 3), mix(p.tube, p.ground, 0.85))
         self._horizon.draw(closed(hoop[-1]), rgb(p.horizon))
-        for k in range(4):
-            low = hoop[k][np.argmin(hoop[k][:, 2])] if k < len(steps) else None
-            self.say(f"m{k}", f"+{steps[k]:g} s" if k < len(steps) else "", low)
+        self._say_marks(steps, hoop)
         said = "below 10 % to the end" if told.message.horizon_open else "error reaches 10 %"
         self.say("horizon", f"{until:.0f} s: {said}", hoop[-1][np.argmax(hoop[-1][:, 2])] + [0, 0, 0.3])
         thin.add(self._beyond(told, until), rgb(p.muted))
+
+    def _say_marks(self, steps: list[float], hoop: np.ndarray) -> None:
+        """Label the time rings (k + 1, sides, 3), the last is the horizon; one too near to another stays bare."""
+        taken = [hoop[-1].mean(axis=0)]
+        for k in range(4):
+            low = hoop[k][np.argmin(hoop[k][:, 2])] if k < len(steps) else None
+            if low is not None and min(np.linalg.norm(low - other) for other in taken) < self._clear_of:
+                low = None
+            self.say(f"m{k}", f"+{steps[k]:g} s" if low is not None else "", low)
+            taken += [low] if low is not None else []
 
     def _no_tube(self, told: Forecast | None, start: float, thin: "_Sheaf") -> None:
         """Claim nothing: no band, no horizon; a path without a horizon is grey dashes."""
