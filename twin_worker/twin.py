@@ -288,7 +288,7 @@ def _predict(twin: Twin, now: float) -> list[Message]:
     prediction = _trusted(twin, path, ahead, window, method)
     said = " ".join(part for part in (f"link lost {coast:.0f} s ago" if twin.lost else "", sentence) if part)
     law = arduplane.LAW if method == "paper" else "none: turn rate only"
-    twin.prediction = msgspec.structs.replace(prediction, t=t0 + ahead[0], seq=seq, sentence=said, coast_s=coast, law=law)
+    twin.prediction = msgspec.structs.replace(prediction, t=t0 + float(ahead[0]), seq=seq, sentence=said, coast_s=coast, law=law)
     if not twin.lost:
         speed = float(np.hypot(*window.v[-1, :2]))
         twin.record.keep(Made(t0, method, path, twin.prediction.tube.numpy().astype(float), speed))
