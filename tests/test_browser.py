@@ -173,6 +173,14 @@ def test_a_row_click_selects(page) -> None:
         selected(page, f"UAV-{uav:03d}")
 
 
+def test_ctrl_k_finds_and_selects(page) -> None:
+    page.keyboard.press("Control+k")
+    page.get_by_placeholder("Search commands...").fill("UAV-015")
+    page.locator(".mantine-Spotlight-action[data-selected]", has_text="UAV-015").wait_for(timeout=8_000)
+    page.keyboard.press("Enter")
+    selected(page, "UAV-015")
+
+
 def test_hostile_words_stay_words(page, errors: list[str]) -> None:
     page.locator(f'tr[data-uav="{EVIL}"]').click()
     selected(page, f"UAV-{EVIL:03d}")
