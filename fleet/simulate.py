@@ -1,4 +1,4 @@
-"""The only loop of the twin: route -> autopilot -> surfaces -> linear model -> position, one aircraft, one flight ahead."""
+"""The only loop of the twin: route -> autopilot -> surfaces -> linear model -> position."""
 
 from math import cos, sin, sqrt
 

@@ -44,7 +44,9 @@ class Window:
         return len(self.t)
 
     def __str__(self) -> str:
-        return f"{self.seconds:.1f} s at {1 / self.dt:.0f} Hz, {self.ok.mean():.0%} good, {self.filled.mean():.1%} filled"
+        return (
+            f"{self.seconds:.1f} s at {1 / self.dt:.0f} Hz, {self.ok.mean():.0%} good, {self.filled.mean():.1%} filled"
+        )
 
     def columns(self, names: tuple[str, ...]) -> np.ndarray:
         """Pick states or inputs by name, (n, k)."""

@@ -35,10 +35,12 @@ def _run(args: argparse.Namespace) -> int:
 def main(argv: list[str] | None = None) -> int:
     """Run the worker until it is told to stop."""
     parser = parser_for("twin_worker", "Identify, verify and predict each UAV of a range.", EXAMPLES)
-    parser.add_argument("--uavs", type=id_range, default=range(0, 50), metavar="LO-HI", help="ids to hold (0-49)")
+    parser.add_argument("--uavs", type=id_range, default=range(50), metavar="LO-HI", help="ids to hold (0-49)")
     parser.add_argument("--router", default=ROUTER, help=f"Zenoh router ({ROUTER})")
     parser.add_argument("--method", choices=("paper",), default="paper", help="prediction method (paper)")
-    parser.add_argument("--omega", type=float, default=0.0, help="least mean fit of a verified model, %% (0, as in the paper)")
+    parser.add_argument(
+        "--omega", type=float, default=0.0, help="least mean fit of a verified model, %% (0, as in the paper)"
+    )
     args = parser.parse_args(argv)
     return guarded("twin_worker", _run, args)
 

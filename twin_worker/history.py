@@ -4,7 +4,6 @@ import numpy as np
 
 from fleet.contract import COLUMNS, Rows, Sample
 
-
 _CHUNKS = 40  # chunks of one kind before they are joined
 
 

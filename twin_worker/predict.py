@@ -10,10 +10,10 @@ import numpy as np
 
 from fleet.autopilots import arduplane
 from fleet.contract import Item
-from fleet.frames import Origin
-from fleet.mission import LAND, TAKEOFF, route
+from fleet.frames import Origin, wrap
+from fleet.mission import KIND, LAND, TAKEOFF, route
 from fleet.simulate import N_STATE, simulate
-from fleet.window import INPUTS, STATES, Window
+from fleet.window import Window
 from twin_worker.history import History
 from twin_worker.identify import Axis
 from twin_worker.wind import WindFilter
@@ -50,6 +50,25 @@ class Onboard:
     since: float  # when route, mode and parameters last changed [s since 1970]
 
 
+@dataclass(frozen=True)
+class Situation:
+    """Everything a prediction starts from.
+
+    Attributes:
+        window: newest telemetry on the grid, at least `SHADOW_S` where there is as much
+        history: telemetry as it came
+        onboard: route and parameters in force
+        wind: wind filter, up to date
+        origin: origin of the twin's NED frame
+    """
+
+    window: Window
+    history: History
+    onboard: Onboard
+    wind: WindFilter
+    origin: Origin
+
+
 def held(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float) -> np.ndarray:
     """Hold each row until the next, nan before the first and after `longest` seconds, (len(at), k)."""
     if not len(t):
@@ -60,92 +79,70 @@ def held(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float) -> np.nda
     return out
 
 
-def fly_ahead(
-    window: Window,
-    history: History,
-    onboard: Onboard,
-    axes: tuple[Axis, Axis],
-    wind: WindFilter,
-    origin: Origin,
-    ahead: np.ndarray,
-) -> Flown:
+def fly_ahead(now: Situation, axes: tuple[Axis, Axis], ahead: np.ndarray) -> Flown:
     """Predict with the identified linear model and the controller twin in closed loop (`--method paper`).
 
     Args:
-        window: newest telemetry on the grid, at least `SHADOW_S` where there is as much
-        history: telemetry as it came
-        onboard: route and parameters in force
+        now: where the prediction starts, the end of its window
         axes: longitudinal and lateral model
-        wind: wind filter, up to date
-        origin: origin of the twin's NED frame
-        ahead: wanted look-ahead times from the window's end, rising, (k,) [s]
+        ahead: wanted look-ahead times from there, rising, (k,) [s]
     """
-    rows = slice(max(int(np.searchsorted(window.t, onboard.since)), len(window) - int(SHADOW_S / window.dt)), None)
-    good = window.part(rows.start, len(window))
-    good = good.part(_last_break(good.ok), len(good))
-    if len(good) < 5.0 / window.dt:
-        return Flown(None, -1, np.nan, f"{good.seconds if len(good) > 1 else 0:.0f} s on this route; 5 s are needed")
+    good = _on_this_route(now.window, now.onboard.since)
+    if len(good) < 5.0 / good.dt:
+        return Flown(None, -1, np.nan, f"{good.seconds:.0f} s on this route, 5 s are needed; wait")
     at = good.t[(len(good) - 1) % _SHADOW_STEP :: _SHADOW_STEP]
-    seq = held(*history.rows("leg"), at, 15.0)[:, 0]
+    seq = held(*now.history.rows("leg"), at, 15.0)[:, 0]
     if not np.isfinite(seq[-1]):
         return Flown(None, -1, np.nan, "the mission item in force is not reported (MISSION_CURRENT)")
     seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
-    altitude = origin.alt_mm * 1e-3 - float(good.p[-1, 2])
-    par, absent = arduplane.parameters(onboard.params, altitude)
-    way = route(onboard.items, seq=int(seq[0]), origin=origin, params=onboard.params)
+    par, absent = arduplane.parameters(now.onboard.params, now.origin.alt_mm * 1e-3 - float(good.p[-1, 2]))
+    way = route(now.onboard.items, seq=int(seq[0]), origin=now.origin, params=now.onboard.params)
     if not len(way.legs):
         return Flown(None, int(seq[-1]), np.nan, " ".join(way.sentences) or "the mission has no legs to fly")
-    ctl, rms = _synchronise(good, at, history, way, par, seq)
-    leg = way.legs[int(ctl[arduplane.LEG])]
-    if int(leg[0]) in _REFUSED:
-        return Flown(None, int(seq[-1]), rms, f"{_REFUSED[int(leg[0])]} is not modelled: no route-aware prediction")
+    start = way.start if np.isfinite(way.start).all() else good.p[0]
+    ctl, rms = arduplane.shadow(par, way.legs, start, *_telemetry(good, at, now.history), seq)
+    kind = int(way.legs[int(ctl[arduplane.LEG]), KIND])
+    if kind in _REFUSED:
+        return Flown(None, int(seq[-1]), rms, f"{_REFUSED[kind]} is not modelled: no route-aware prediction")
     out = np.empty((int(ahead[-1] / good.dt) + 2, N_STATE))
-    done = _simulate(good, history, axes, wind, (ctl, par, way.legs), out)
+    done = simulate(ctl, par, way.legs, *_model(axes, good), *_start(now, good), good.dt, out)
     if done <= ahead[-1] / good.dt:
         return Flown(None, int(seq[-1]), rms, f"the twin leaves its flight envelope {done * good.dt:.0f} s ahead")
-    t = good.dt * np.arange(done)
-    path = np.column_stack([np.interp(ahead, t, column) for column in out[:done, :3].T])
+    path = np.column_stack([np.interp(ahead, good.dt * np.arange(done), column) for column in out[:done, :3].T])
     said = list(way.sentences)
     if absent:
         said.append(f"{len(absent)} autopilot parameters not received, defaults assumed ({', '.join(absent[:3])} …)")
     return Flown(path, int(seq[-1]), rms, " ".join(said))
 
 
-def _last_break(ok: np.ndarray) -> int:
-    """Give the first row after the last unmeasured one, never past the end."""
-    bad = np.flatnonzero(~ok)
-    return min(int(bad[-1]) + 1, len(ok) - 1) if len(bad) else 0
+def _on_this_route(window: Window, since: float) -> Window:
+    """Cut what was flown on the present route, unbroken, at most `SHADOW_S`."""
+    start = max(int(np.searchsorted(window.t, since)), len(window) - int(SHADOW_S / window.dt))
+    bad = np.flatnonzero(~window.ok)
+    start = max(start, int(bad[-1]) + 1 if len(bad) else 0)
+    return window.part(min(start, len(window) - 2), len(window))
 
 
-def _synchronise(good: Window, at: np.ndarray, history: History, way, par, seq) -> tuple[np.ndarray, float]:  # type: ignore[no-untyped-def]
-    """Run the controller twin over telemetry, so that its integrators and leg are those of the aircraft."""
+def _telemetry(good: Window, at: np.ndarray, history: History) -> list[np.ndarray]:
+    """Give what the controller twin is synchronised on: t p v euler rates Va phi_c theta_c delta, rows at times `at`."""
     k = np.searchsorted(good.t, at)
-    command = held(*history.rows("command"), at, 1.0)
-    Va = held(*history.rows("air"), at, 1.0)[:, 0]
-    start = way.start if np.isfinite(way.start).all() else good.p[0]
-    x = good.x[k]
-    euler = x[:, [STATES.index(name) for name in ("phi", "theta", "psi")]].copy()
-    euler[:, 2] = (euler[:, 2] + np.pi) % (2 * np.pi) - np.pi
-    rates = x[:, [STATES.index(name) for name in "pqr"]]
-    rows = (good.p[k], good.v[k], euler, rates, Va, command[:, 0], command[:, 1], good.u[k], seq)
-    flat = [np.ascontiguousarray(row, dtype=row.dtype if row.dtype == np.int64 else float) for row in rows]
-    ctl, rms = arduplane.shadow(par, way.legs, np.asarray(start, float), at - at[0], *flat)
-    return ctl, float(rms)
+    command, Va = held(*history.rows("command"), at, 1.0), held(*history.rows("air"), at, 1.0)[:, 0]
+    euler, rates = good.x[k, 6:9], good.x[k, 3:6]
+    euler[:, 2] = wrap(euler[:, 2])
+    rows = (at - at[0], good.p[k], good.v[k], euler, rates, Va, command[:, 0], command[:, 1], good.u[k])
+    return [np.ascontiguousarray(row) for row in rows]
 
 
-def _simulate(good: Window, history: History, axes, wind: WindFilter, controller, out: np.ndarray) -> int:  # type: ignore[no-untyped-def]
-    lon, lat = axes
-    now = slice(max(len(good) - 3, 0), None)
-    state = np.concatenate([good.p[-1], good.x[now].mean(axis=0)])
-    state[9:] = good.x[-1, 6:]
-    command = held(*history.rows("command"), good.t[-1:], 1.0)[0, :2]
+def _model(axes: tuple[Axis, Axis], good: Window) -> list[np.ndarray]:
+    return [part for axis in axes for part in (_settled(axis, good), np.concatenate([axis.y_mean, axis.u_mean]))]
+
+
+def _start(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Give state (12,), commands in force (2,) and air (3,) at the end of the window."""
+    state = np.concatenate([good.p[-1], good.x[-3:, :6].mean(axis=0), good.x[-1, 6:]])
+    command = held(*now.history.rows("command"), good.t[-1:], 1.0)[0, :2]
     command = np.where(np.isfinite(command), command, good.x[-1, 6:8])
-    air = np.array([*wind.wind[:2], wind.scale])
-    assert INPUTS[3] == "delta_t"
-    matrices = []
-    for axis in (lon, lat):
-        matrices += [_settled(axis, good), np.concatenate([axis.y_mean, axis.u_mean])]
-    return int(simulate(*controller, *matrices, state, command, air, good.dt, out))
+    return state, command, np.array([*now.wind.wind[:2], now.wind.scale])
 
 
 def _settled(axis: Axis, good: Window) -> np.ndarray:

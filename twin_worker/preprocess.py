@@ -96,7 +96,7 @@ def preprocess(
     laid["position"] = fill(t_pos, to_ned(origin, *pos.T), grid, LONGEST_GAP["position"])
     u, u_ok, u_filled = _held(*rows["servo"], grid)
     euler, rates, ground = laid["attitude"][0][:, :3], laid["attitude"][0][:, 3:], laid["velocity"][0]
-    body = ned_to_body(*euler.T, ground - wind)
+    body = ned_to_body(euler[:, 0], euler[:, 1], euler[:, 2], ground - wind)
     ok = u_ok & np.logical_and.reduce([values[1] for values in laid.values()])
     filled = u_filled | np.logical_or.reduce([values[2] for values in laid.values()])
     x = np.hstack([body, rates, euler])

@@ -12,6 +12,8 @@ from twin_worker.refine import free_run
 
 HORIZONS_S = (16.0, 8.0, 4.0)  # longest first: a model is verified at the longest its data allow
 OMEGA = 0.0  # least mean fit over the nine states [%]; the paper: "greater than 0 is acceptable"
+_LOST = -99.0  # mean fit that only a diverging run has [%]
+_QUIET_PHI, _QUIET_Q = 0.04, 0.02  # less than this is steady flight [rad, rad/s]
 _MARGIN = 5.0  # a kept model must be this much better to stay [%]
 
 
@@ -59,7 +61,8 @@ def fits_at(axes: tuple[Axis, Axis], held: Window, horizon_s: float) -> tuple[di
     """
     length = int(horizon_s / held.dt)
     whole = held.part(0, max(len(held) // length, 1) * length)
-    fit, still = {}, {}
+    fit: dict[str, float] = {}
+    still: dict[str, float] = {}
     for axis in axes:
         y, u = axis.scaled(whole)
         fit |= dict(zip(axis.states, fit_percent(y, free_runs(axis.D, y, u, whole.ok, length)).tolist(), strict=True))
@@ -72,38 +75,47 @@ def mean(fit: dict[str, float]) -> float:
     return float(np.mean(list(fit.values())))
 
 
-def verify(
-    whose: str, axes: tuple[Axis, Axis], held: Window, last: tuple[Axis, Axis] | None, *, tries: int, omega: float = OMEGA
-) -> Verdict:
+def verify(axes: tuple[Axis, Axis], held: Window, last: tuple[Axis, Axis] | None, omega: float = OMEGA) -> Verdict:
     """Judge a model on held-out data: above the threshold, better than holding still, no worse than the last one.
 
     Args:
-        whose: name for sentences, e.g. uav-7
         axes: longitudinal and lateral model
         held: data neither has seen
         last: the last verified model, or None
-        tries: identifications tried so far
         omega: threshold on the mean fit [%]
+    Returns:
+        a verdict whose sentence does not yet say whose it is
     """
-    allowed = [h for h in HORIZONS_S if h <= held.seconds + held.dt]
-    for horizon in allowed:
+    for horizon in [h for h in HORIZONS_S if h <= held.seconds + held.dt]:
         fit, still = fits_at(axes, held, horizon)
-        if mean(fit) >= omega and mean(fit) > mean(still):
+        if mean(fit) > max(omega, mean(still)):
             break
-    facts = {"fit": fit, "fit_hold": still, "horizon_s": horizon, "threshold": omega, "tries": tries}
-    found = f"{whose}: mean fit {mean(fit):.0f} % over {horizon:.0f} s"
-    if not all(np.isfinite(list(fit.values()))) or mean(fit) <= -99.0:
-        return Verdict(outcome=Outcome.DIVERGED, sentence=f"{found}, the free run diverges; trying again", **facts)
-    if mean(fit) < omega or mean(fit) <= mean(still):
-        need = max(omega, mean(still))
-        quiet = held.columns(("phi",)).std() < 0.04 and held.columns(("q",)).std() < 0.02
-        outcome = Outcome.NOT_IDENTIFIABLE if quiet else Outcome.BELOW_THRESHOLD
-        why = "steady flight excites nothing; wait for a turn or a climb" if quiet else "trying another window"
-        return Verdict(outcome=outcome, sentence=f"{found}, needs {need:.0f} %; {why}", **facts)
-    if last is not None:
-        before, _ = fits_at(last, held, horizon)
-        if mean(before) > mean(fit) + _MARGIN:
-            sentence = f"{found}, the last verified model has {mean(before):.0f} %; that one stays in force"
-            return Verdict(outcome=Outcome.WORSE_THAN_LAST, sentence=sentence, **facts)
-    sentence = f"{found} ahead, unseen data (holding still {mean(still):.0f} %, threshold {omega:.0f} %)"
-    return Verdict(outcome=Outcome.VERIFIED, sentence=sentence, **facts)
+    outcome, sentence = _judge(fit, still, held, omega)
+    if outcome is Outcome.VERIFIED and last is not None:
+        before = mean(fits_at(last, held, horizon)[0])
+        if before > mean(fit) + _MARGIN:
+            outcome = Outcome.WORSE_THAN_LAST
+            sentence = f"the last verified model has {before:.0f} % there and stays in force"
+    return Verdict(
+        outcome=outcome,
+        sentence=f"mean fit {mean(fit):.0f} % over {horizon:.0f} s of unseen data, {sentence}",
+        fit=fit,
+        fit_hold=still,
+        horizon_s=horizon,
+        threshold=omega,
+    )
+
+
+def _judge(fit: dict[str, float], still: dict[str, float], held: Window, omega: float) -> tuple[Outcome, str]:
+    if mean(fit) <= _LOST:
+        return Outcome.DIVERGED, "the free run diverges; trying again"
+    need = max(omega, mean(still))
+    if mean(fit) > need:
+        return Outcome.VERIFIED, f"above the threshold {omega:.0f} % and holding still {mean(still):.0f} %"
+    quiet = held.columns(("phi",)).std() < _QUIET_PHI and held.columns(("q",)).std() < _QUIET_Q
+    if quiet:
+        return (
+            Outcome.NOT_IDENTIFIABLE,
+            f"needs {need:.0f} %; steady flight excites nothing, wait for a turn or a climb",
+        )
+    return Outcome.BELOW_THRESHOLD, f"needs {need:.0f} %; trying another window"

@@ -11,7 +11,9 @@ from fleet.window import Window
 from twin_worker.identify import AXES, identify_axis
 
 _SPEED = 22.0  # [m/s]
-_ITEMS = tuple(Item(seq=k, command=16, lat_e7=470_000_000 + 90_000 * k, lon_e7=80_000_000, alt_m=100.0) for k in range(3))
+_ITEMS = tuple(
+    Item(seq=k, command=16, lat_e7=470_000_000 + 90_000 * k, lon_e7=80_000_000, alt_m=100.0) for k in range(3)
+)
 
 
 def warm_up() -> None:

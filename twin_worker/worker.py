@@ -157,5 +157,3 @@ def resample(prediction: Prediction, grid: np.ndarray | None) -> Prediction:
         for rows in (prediction.path, prediction.tube)
     )
     return msgspec.structs.replace(prediction, ahead=Array.of(grid), path=path, tube=tube)
-
-

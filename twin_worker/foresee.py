@@ -1,0 +1,103 @@
+"""One prediction: the route flown by the twin where that is earned, else a turn-rate guess; tube and horizon around it."""
+
+import msgspec
+import numpy as np
+
+from fleet.autopilots import arduplane
+from fleet.contract import Array, Message, Prediction, State
+from fleet.window import Window
+from twin_worker.horizon import AHEAD, LIMIT, QUANTILE, Made, path_length
+from twin_worker.imm import STEP, imm
+from twin_worker.memory import Twin
+from twin_worker.predict import Onboard, Situation, fly_ahead
+
+ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
+_LOOK_BACK_S = 62.0  # telemetry a prediction starts from [s]
+
+
+def foresee(twin: Twin, now: float) -> list[Message]:
+    """Predict from the newest telemetry, as of data time `now`; nothing while there is too little."""
+    assert twin.origin is not None
+    coast = max(now - twin.history.newest, 0.0) if twin.lost else 0.0
+    window = twin.window(_LOOK_BACK_S)
+    if window is None or not window.ok[-1]:
+        return []
+    t0 = float(window.t[-1])
+    ahead = AHEAD + round(coast)
+    path, method, seq, sentence = _route_path(twin, window, ahead)
+    if path is None:
+        path, method = _imm_path(window, ahead), "imm"
+    if path is None or not np.isfinite(path).all():
+        return []
+    twin.state = _state(twin, method)
+    prediction = _trusted(twin, path, ahead, window, method)
+    said = " ".join(part for part in (f"link lost {coast:.0f} s ago" if twin.lost else "", sentence) if part)
+    law = arduplane.LAW if method == "paper" else "none: turn rate only"
+    t = t0 + float(ahead[0])
+    twin.prediction = msgspec.structs.replace(prediction, t=t, seq=seq, sentence=said, coast_s=coast, law=law)
+    if not twin.lost:
+        speed = float(np.hypot(*window.v[-1, :2]))
+        twin.record.keep(Made(t0, method, path, twin.prediction.tube.numpy().astype(float), speed))
+    return [twin.prediction]
+
+
+def _route_path(twin: Twin, window: Window, ahead: np.ndarray) -> tuple[np.ndarray | None, str, int, str]:
+    """Fly the route where mode, mission and a verified model allow; else say why not."""
+    mode = twin.status.mode if twin.status else ""
+    if twin.axes is None:
+        return None, "", -1, twin.verdict.sentence
+    if mode not in ROUTE_MODES:
+        return None, "", -1, f"mode {mode or 'unknown'} follows no mission: turn rate only"
+    if twin.mission is None or not twin.mission.items:
+        return None, "", -1, "no mission on board: turn rate only"
+    params = twin.params.values if twin.params else {}
+    assert twin.origin is not None
+    onboard = Onboard(twin.mission.items, params, twin.since)
+    flown = fly_ahead(Situation(window, twin.history, onboard, twin.wind, twin.origin), twin.axes, ahead)
+    return flown.path, "paper", flown.seq, flown.sentence
+
+
+def _imm_path(window: Window, ahead: np.ndarray) -> np.ndarray | None:
+    every = int(STEP / window.dt)
+    rows = slice((len(window) - 1) % every, None, every)
+    ok = window.ok[rows]
+    start = int(np.flatnonzero(~ok)[-1]) + 1 if not ok.all() else 0
+    p, v = window.p[rows][start:][-24:], window.v[rows][start:][-24:]
+    return imm(p, v, ahead) if len(p) >= 4 else None
+
+
+def _state(twin: Twin, method: str) -> State:
+    if twin.lost:
+        return State.LINK_LOST
+    if method == "paper":
+        return State.PREDICTING
+    return State.IDENTIFYING if twin.axes is None else State.VERIFIED
+
+
+def _trusted(twin: Twin, path: np.ndarray, ahead: np.ndarray, window: Window, method: str) -> Prediction:
+    """Wrap the path in its tube and say up to when the 90 % error stays below 10 % of the path."""
+    tube, distance = twin.record.tube(method, np.arange(0.0, ahead[-1] + 1.0))
+    tube, distance = tube[-len(ahead) :], distance[-len(ahead) :]
+    speed = float(np.hypot(*window.v[-1, :2]))
+    start = speed * ahead[0]
+    length = np.maximum(path_length(path, speed) + start, 2.0 * max(speed, 1.0))
+    over = np.flatnonzero(distance / length > LIMIT)
+    over = over[over > 0] if len(over) and not ahead[0] else over
+    horizon = float(AHEAD[over[0] - 1] if len(over) and over[0] else AHEAD[-1] if not len(over) else 0.0)
+    held, n = twin.record.held
+    assert twin.origin is not None
+    return Prediction(
+        uav=twin.uav,
+        t=float(window.t[-1]),
+        state=twin.state,
+        method=method,
+        origin=(twin.origin.lat_e7, twin.origin.lon_e7, twin.origin.alt_mm),
+        ahead=Array.of(AHEAD),
+        path=Array.of(path),
+        tube=Array.of(tube),
+        quantile=QUANTILE,
+        horizon_s=horizon,
+        horizon_open=not len(over),
+        held=held,
+        held_n=n,
+    )

@@ -1,0 +1,81 @@
+"""One hop of learning: window, two-step identification, verification on data held out, the published model."""
+
+import msgspec
+import numpy as np
+
+from fleet.contract import Message, Model, Outcome, State, Verdict
+from fleet.window import Window
+from twin_worker.identify import AXES, Axis, identify_axis
+from twin_worker.memory import Twin
+from twin_worker.preprocess import DT
+from twin_worker.verify import verify
+
+LEAST_S = 30.0  # shortest stretch worth identifying [s]
+WINDOW_S = 140.0  # longest stretch used [s]
+SLOW = 6.0  # air-relative forward speed below which nothing flies on its wings [m/s]
+_FREE_RUN_S = (4.0, 2.0, 4.0, 8.0)  # free-run length of the n-th try [s]
+_SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the window the n-th try uses
+
+
+def learn(twin: Twin) -> list[Message]:
+    """Identify and verify once; give the model with its verdict, or nothing while data are starved."""
+    window = _airborne(twin.window(WINDOW_S))
+    have = 0.0 if window is None else float(window.ok.sum() * DT)
+    if window is None or have < LEAST_S:
+        if twin.axes is None:
+            sentence = f"{twin.name}: {have:.0f} s of whole data, {LEAST_S:.0f} s are needed; {_missing(twin)}"
+            twin.verdict, twin.state = Verdict(outcome=Outcome.STARVED, sentence=sentence), State.WAITING
+        return []
+    twin.state = State.IDENTIFYING if twin.axes is None else twin.state
+    held_n = int(np.clip(0.3 * len(window), 8.2 / DT, 20.0 / DT))
+    known, held_out = window.part(0, len(window) - held_n), window.part(len(window) - held_n, len(window))
+    attempt = twin.tries % len(_SHARE)
+    known = known.part(int(len(known) * (1 - _SHARE[attempt])), len(known))
+    twin.tries += 1
+    last = twin.axes or (None, None)
+    try:
+        axes = tuple(
+            identify_axis(axis, known, _FREE_RUN_S[attempt], before)[1] for axis, before in zip(AXES, last, strict=True)
+        )
+    except (ValueError, np.linalg.LinAlgError) as error:
+        twin.verdict = Verdict(outcome=Outcome.STARVED, sentence=f"{twin.name}: {error}", tries=twin.tries)
+        return []
+    verdict = verify(axes, held_out, twin.axes, twin.omega)  # type: ignore[arg-type]
+    verdict = msgspec.structs.replace(verdict, sentence=f"{twin.name}: {verdict.sentence}", tries=twin.tries)
+    if verdict.outcome is Outcome.VERIFIED:
+        twin.axes, twin.tries = axes, 0  # type: ignore[assignment]
+    twin.verdict = verdict
+    return [_model(twin, axes, verdict, window)]  # type: ignore[arg-type]
+
+
+def _airborne(window: Window | None) -> Window | None:
+    """Keep what was flown: from the last row that was too slow to fly."""
+    if window is None:
+        return None
+    slow = np.flatnonzero(window.ok & (window.columns(("u",))[:, 0] < SLOW))
+    start = int(slow[-1]) + 1 if len(slow) else 0
+    return window.part(start, len(window)) if len(window) - start > 1 else None
+
+
+def _missing(twin: Twin) -> str:
+    """Say which kinds of row have not come at all."""
+    needed = ("attitude", "velocity", "position", "servo", "air")
+    none = [kind for kind in needed if not len(twin.history.rows(kind)[0])]
+    return f"no {', '.join(none)} rows yet" if none else "wait"
+
+
+def _model(twin: Twin, axes: tuple[Axis, Axis], verdict: Verdict, window: Window) -> Model:
+    sound = all(np.isfinite(axis.D).all() for axis in axes)
+    return Model(
+        uav=twin.uav,
+        t=float(window.t[-1]),
+        method="paper",
+        verdict=verdict,
+        longitudinal=axes[0].linear() if sound else None,
+        lateral=axes[1].linear() if sound else None,
+        window_t0=float(window.t[0]),
+        window_s=window.seconds,
+        interpolated=float(window.filled.mean()),
+        wind_n=float(twin.wind.wind[0]),
+        wind_e=float(twin.wind.wind[1]),
+    )

@@ -1,0 +1,105 @@
+"""What one twin remembers: the telemetry, the model in force, how past predictions fared; and how it listens."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fleet.airframe import ServoMap, servo_map
+from fleet.autopilots import arduplane
+from fleet.contract import Message, Mission, Outcome, Params, Prediction, Sample, State, Status, Verdict
+from fleet.frames import Origin
+from fleet.window import Window
+from twin_worker.history import History
+from twin_worker.horizon import Record
+from twin_worker.identify import Axis
+from twin_worker.preprocess import preprocess
+from twin_worker.verify import OMEGA
+from twin_worker.wind import WindFilter
+
+
+def _unheard() -> Verdict:
+    return Verdict(outcome=Outcome.STARVED, sentence="no samples yet")
+
+
+@dataclass
+class Twin:
+    """One aircraft's twin: what was heard of it, the model in force, and how past predictions fared."""
+
+    uav: int
+    omega: float = OMEGA
+    history: History = field(default_factory=History)
+    wind: WindFilter = field(default_factory=WindFilter)
+    record: Record = field(default_factory=Record)
+    origin: Origin | None = None
+    status: Status | None = None
+    mission: Mission | None = None
+    params: Params | None = None
+    servos: ServoMap = field(default_factory=lambda: servo_map({}))
+    axes: tuple[Axis, Axis] | None = None
+    verdict: Verdict = field(default_factory=_unheard)
+    prediction: Prediction | None = None
+    state: State = State.WAITING
+    tries: int = 0
+    since: float = -np.inf  # last change of mode, mission or parameters
+    first_t: float = np.nan
+    wind_t: float = -np.inf
+    identify_t: float = -np.inf
+    predict_t: float = -np.inf
+    score_t: float = -np.inf
+    lost: bool = False
+    bad: int = 0
+
+    @property
+    def name(self) -> str:
+        """Give the name sentences use, e.g. uav-7."""
+        return f"uav-{self.uav}"
+
+    def window(self, seconds: float) -> Window | None:
+        """Give the newest `seconds` on the grid; None while a needed kind of row is missing."""
+        assert self.origin is not None
+        newest = self.history.newest
+        return preprocess(self.history, self.origin, self.servos, self.wind.wind, until=newest, seconds=seconds)
+
+
+def hear(twin: Twin, message: Message) -> None:
+    """Take one message from the gateway."""
+    if isinstance(message, Sample):
+        twin.bad += twin.history.add(message)
+        if twin.origin is None and message.position is not None:
+            lat, lon, alt = (int(value) for value in message.position.x.numpy()[0])
+            twin.origin, twin.first_t = Origin(lat, lon, alt), message.t
+    elif isinstance(message, Status):
+        _hear_status(twin, message)
+    elif isinstance(message, Mission):
+        if twin.mission is None or twin.mission.items != message.items:
+            _event(twin, message.t)
+        twin.mission = message
+    elif isinstance(message, Params):
+        if twin.params is None or _control_changed(twin.params, message):
+            _event(twin, message.t)
+        twin.params, twin.servos = message, servo_map(message.values)
+
+
+def _control_changed(before: Params, after: Params) -> bool:
+    """Tell whether any parameter of the controller twin changed, not just arrived."""
+    return any(before.values.get(n, v) != v for n, v in after.values.items() if n in arduplane.DEFAULTS)
+
+
+def _hear_status(twin: Twin, status: Status) -> None:
+    before = twin.status
+    twin.status = status
+    if before is None:
+        return
+    if status.clock_jumps != before.clock_jumps:
+        twin.history.clear()
+        twin.wind.t = -np.inf
+        _event(twin, status.t)
+    elif status.mode != before.mode:
+        _event(twin, status.t)
+
+
+def _event(twin: Twin, t: float) -> None:
+    """Invalidate the running prediction: mode, mission, parameters or clock changed."""
+    twin.since = t
+    twin.predict_t = -np.inf
+    twin.record.forget()
