@@ -18,7 +18,7 @@ Positive aileron rolls right, positive elevator pitches up, positive rudder yaws
 """
 
 from math import atan2, cos, hypot, pi, radians, sin, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -119,6 +119,6 @@ def ground_speed(v_n: float, v_e: float) -> float:
 
 
 @nb.njit(cache=True)
-def wrap(angle: float) -> float:
-    """Wrap an angle to (-pi, pi] [rad]; a non-finite angle stays non-finite."""
+def wrap(angle: Any) -> Any:
+    """Wrap an angle, or an array of them, to (-pi, pi] [rad]; a non-finite angle stays non-finite."""
     return (angle + pi) % (2 * pi) - pi

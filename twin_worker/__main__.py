@@ -38,9 +38,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--uavs", type=id_range, default=range(50), metavar="LO-HI", help="ids to hold (0-49)")
     parser.add_argument("--router", default=ROUTER, help=f"Zenoh router ({ROUTER})")
     parser.add_argument("--method", choices=("paper",), default="paper", help="prediction method (paper)")
-    parser.add_argument(
-        "--omega", type=float, default=0.0, help="least mean fit of a verified model, %% (0, as in the paper)"
-    )
+    parser.add_argument("--omega", type=float, default=0.0, help="least mean fit to verify, %% (0, as in the paper)")
     args = parser.parse_args(argv)
     return guarded("twin_worker", _run, args)
 

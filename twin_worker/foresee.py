@@ -1,4 +1,4 @@
-"""One prediction: the route flown by the twin where that is earned, else a turn-rate guess; tube and horizon around it."""
+"""One prediction: the route flown by the twin where earned, else a turn-rate guess; tube and horizon around it."""
 
 import msgspec
 import numpy as np

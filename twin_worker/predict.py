@@ -100,12 +100,12 @@ def fly_ahead(now: Situation, axes: tuple[Axis, Axis], ahead: np.ndarray) -> Flo
     if not len(way.legs):
         return Flown(None, int(seq[-1]), np.nan, " ".join(way.sentences) or "the mission has no legs to fly")
     start = way.start if np.isfinite(way.start).all() else good.p[0]
-    ctl, rms = arduplane.shadow(par, way.legs, start, *_telemetry(good, at, now.history), seq)
+    ctl, rms = arduplane.shadow(par, way.legs, start, *_telemetry(good, at, now.history), seq)  # type: ignore[call-arg]
     kind = int(way.legs[int(ctl[arduplane.LEG]), KIND])
     if kind in _REFUSED:
         return Flown(None, int(seq[-1]), rms, f"{_REFUSED[kind]} is not modelled: no route-aware prediction")
     out = np.empty((int(ahead[-1] / good.dt) + 2, N_STATE))
-    done = simulate(ctl, par, way.legs, *_model(axes, good), *_start(now, good), good.dt, out)
+    done = simulate(ctl, par, way.legs, *_model(axes, good), *_start(now, good), good.dt, out)  # type: ignore
     if done <= ahead[-1] / good.dt:
         return Flown(None, int(seq[-1]), rms, f"the twin leaves its flight envelope {done * good.dt:.0f} s ahead")
     path = np.column_stack([np.interp(ahead, good.dt * np.arange(done), column) for column in out[:done, :3].T])
@@ -123,14 +123,14 @@ def _on_this_route(window: Window, since: float) -> Window:
     return window.part(min(start, len(window) - 2), len(window))
 
 
-def _telemetry(good: Window, at: np.ndarray, history: History) -> list[np.ndarray]:
-    """Give what the controller twin is synchronised on: t p v euler rates Va phi_c theta_c delta, rows at times `at`."""
+def _telemetry(good: Window, at: np.ndarray, history: History) -> tuple[np.ndarray, ...]:
+    """Give what the controller twin is synchronised on at times `at`: t p v euler rates Va phi_c theta_c delta."""
     k = np.searchsorted(good.t, at)
     command, Va = held(*history.rows("command"), at, 1.0), held(*history.rows("air"), at, 1.0)[:, 0]
     euler, rates = good.x[k, 6:9], good.x[k, 3:6]
     euler[:, 2] = wrap(euler[:, 2])
     rows = (at - at[0], good.p[k], good.v[k], euler, rates, Va, command[:, 0], command[:, 1], good.u[k])
-    return [np.ascontiguousarray(row) for row in rows]
+    return tuple(np.ascontiguousarray(row) for row in rows)
 
 
 def _model(axes: tuple[Axis, Axis], good: Window) -> list[np.ndarray]:

@@ -1,4 +1,4 @@
-"""THE loop of one aircraft: `advance(twin, messages, now) -> results`. Data time only: no bus, no thread, no wall clock."""
+"""THE loop of one aircraft, `advance(twin, messages, now)`. Data time only: no bus, no thread, no wall clock."""
 
 from collections.abc import Iterable
 

@@ -116,6 +116,6 @@ def _judge(fit: dict[str, float], still: dict[str, float], held: Window, omega: 
     if quiet:
         return (
             Outcome.NOT_IDENTIFIABLE,
-            f"needs {need:.0f} %; steady flight excites nothing, wait for a turn or a climb",
+            f"needs {need:.0f} %; steady flight excites nothing, wait for a turn",
         )
     return Outcome.BELOW_THRESHOLD, f"needs {need:.0f} %; trying another window"

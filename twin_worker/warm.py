@@ -27,11 +27,11 @@ def warm_up() -> None:
     euler, rates = np.ascontiguousarray(window.x[:, 6:]), np.ascontiguousarray(window.x[:, 3:6])
     told = [np.full(n, _SPEED), np.zeros(n), np.zeros(n), window.u, np.ones(n, np.int64)]
     rows = [window.t - window.t[0], window.p, window.v, euler, rates, *told]
-    ctl, _ = arduplane.shadow(par, legs, window.p[0], *rows)
+    ctl, _ = arduplane.shadow(par, legs, window.p[0], *rows)  # type: ignore
     state = np.concatenate([window.p[-1], window.x[-1]])
     matrices = [part for axis in axes for part in (axis.physical(), np.concatenate([axis.y_mean, axis.u_mean]))]
     air = np.array([0.0, 0.0, 1.0])
-    simulate(ctl, par, legs, *matrices, state, np.zeros(2), air, window.dt, np.empty((50, N_STATE)))
+    simulate(ctl, par, legs, *matrices, state, np.zeros(2), air, window.dt, np.empty((50, N_STATE)))  # type: ignore
 
 
 def _flight(seconds: float = 20.0, dt: float = 0.04) -> Window:

@@ -32,9 +32,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--link", action="append", default=[], help="real aircraft instead, e.g. udpin:0.0.0.0:14550")
     parser.add_argument("--replay", action="append", default=[], metavar="FILE", help="recordings instead")
     parser.add_argument("--speed", default="1", help="replay speed, a number or max (1)")
-    parser.add_argument(
-        "--for", dest="seconds", type=float, default=0.0, help="stop this long after the first sample"
-    )
+    parser.add_argument("--for", dest="seconds", type=float, default=0.0, help="stop this long after the first sample")
     parser.add_argument("--no-viewer", action="store_true", help="without the web page")
     parser.add_argument("--port", type=int, default=8080, help="port of the web page (8080)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the simulated aircraft (1)")
@@ -45,9 +43,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Start everything, show it, stop it; exit code 1 where a part died on its own."""
     if not 1 <= args.uavs <= 250:
-        raise ValueError(
-            f"--uavs: found {args.uavs}, expected 1 to 250 aircraft; start several fleets for more"
-        )
+        raise ValueError(f"--uavs: found {args.uavs}, expected 1 to 250 aircraft; start several fleets for more")
     stop = stop_on_signal()
     router = None if reachable(args.router) else open_router(args.router)
     try:

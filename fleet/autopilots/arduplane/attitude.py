@@ -62,9 +62,7 @@ def _limited(rate: float, down: float, up: float) -> float:
 
 
 @kernel
-def rate_demands(
-    par: np.ndarray, phi_c: float, theta_c: float, euler: np.ndarray, Va: float
-) -> tuple[float, float]:
+def rate_demands(par: np.ndarray, phi_c: float, theta_c: float, euler: np.ndarray, Va: float) -> tuple[float, float]:
     """Give the roll and pitch rates wanted, the pitch rate of the turn included [rad/s]."""
     V = max(Va if np.isfinite(Va) else par[P.VA_CRUISE], par[P.VA_MIN]) * par[P.EAS2TAS]
     phi = clip(euler[0], -1.396, 1.396)
@@ -76,7 +74,13 @@ def rate_demands(
 
 @kernel
 def stabilise(
-    ctl: np.ndarray, par: np.ndarray, phi_c: float, theta_c: float, euler: np.ndarray, rates: np.ndarray, Va: float,
+    ctl: np.ndarray,
+    par: np.ndarray,
+    phi_c: float,
+    theta_c: float,
+    euler: np.ndarray,
+    rates: np.ndarray,
+    Va: float,
     dt: float,
 ) -> tuple[float, float, float]:
     """Give the surfaces for a commanded attitude. Made for 50 Hz.

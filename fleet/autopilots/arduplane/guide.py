@@ -12,8 +12,16 @@ from fleet.mission import VA_C
 
 @kernel
 def init(
-    par: np.ndarray, legs: np.ndarray, k: int, start: np.ndarray, p: np.ndarray, v: np.ndarray, euler: np.ndarray,
-    Va: float, theta_c: float, delta_t: float,
+    par: np.ndarray,
+    legs: np.ndarray,
+    k: int,
+    start: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    euler: np.ndarray,
+    Va: float,
+    theta_c: float,
+    delta_t: float,
 ) -> np.ndarray:
     """Begin on leg `k`, without a bump from the pitch and throttle in force.
 
@@ -46,8 +54,15 @@ def speed(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray) -> float:
 
 @kernel
 def fly(
-    ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray, euler: np.ndarray, Va: float,
-    Va_dot: float, dt: float,
+    ctl: np.ndarray,
+    par: np.ndarray,
+    legs: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    euler: np.ndarray,
+    Va: float,
+    Va_dot: float,
+    dt: float,
 ) -> tuple[float, float, float, bool]:
     """Fly the current leg for one step without leaving it; as `guide`, and whether the leg is over."""
     dt = max(dt, 1e-3)
@@ -62,8 +77,15 @@ def fly(
 
 @kernel
 def guide(
-    ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray, euler: np.ndarray, Va: float,
-    Va_dot: float, dt: float,
+    ctl: np.ndarray,
+    par: np.ndarray,
+    legs: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    euler: np.ndarray,
+    Va: float,
+    Va_dot: float,
+    dt: float,
 ) -> tuple[float, float, float]:
     """Fly the route for one step; goes on to the next leg by itself, holds the last. Made for 10 Hz.
 

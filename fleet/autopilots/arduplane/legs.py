@@ -56,7 +56,7 @@ def along_line(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> tuple[float, 
 @kernel
 def set_leg(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, from_p: np.ndarray) -> None:
     """Begin leg `k` (clamped to the route) on the line from `from_p`, NED (3,) [m]; not finite: from its own target."""
-    ctl[:S.N_LEG] = 0.0
+    ctl[: S.N_LEG] = 0.0
     ctl[S.READY] = -1.0
     ctl[S.LEG] = max(k, 0)
     i = current(ctl, legs)
@@ -159,9 +159,7 @@ def _count(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, around: bool, d: flo
 
 
 @kernel
-def _circled(
-    ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.ndarray, psi: float, wide: float
-) -> bool:
+def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.ndarray, psi: float, wide: float) -> bool:
     leg = legs[i]
     if i + 1 >= legs.shape[0] or int(leg[KIND]) == LOITER_UNLIMITED or ctl[S.ON] == 0.0:
         return False

@@ -39,8 +39,18 @@ def _usable(p: np.ndarray, v: np.ndarray, euler: np.ndarray) -> bool:
 
 @kernel
 def shadow(
-    par: np.ndarray, legs: np.ndarray, start: np.ndarray, t: np.ndarray, p: np.ndarray, v: np.ndarray,
-    euler: np.ndarray, rates: np.ndarray, Va: np.ndarray, phi_c: np.ndarray, theta_c: np.ndarray, delta: np.ndarray,
+    par: np.ndarray,
+    legs: np.ndarray,
+    start: np.ndarray,
+    t: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    euler: np.ndarray,
+    rates: np.ndarray,
+    Va: np.ndarray,
+    phi_c: np.ndarray,
+    theta_c: np.ndarray,
+    delta: np.ndarray,
     seq: np.ndarray,
 ) -> tuple[np.ndarray, float]:
     """Synchronise the controller with telemetry at about 10 Hz; rows with nan are passed over.
@@ -103,8 +113,15 @@ def _median(values: np.ndarray, otherwise: float) -> float:
 
 @kernel
 def _begin(
-    par: np.ndarray, legs: np.ndarray, start: np.ndarray, p: np.ndarray, v: np.ndarray, euler: np.ndarray, Va: float,
-    theta_c: float, delta_t: float,
+    par: np.ndarray,
+    legs: np.ndarray,
+    start: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    euler: np.ndarray,
+    Va: float,
+    theta_c: float,
+    delta_t: float,
 ) -> np.ndarray:
     theta = theta_c if np.isfinite(theta_c) else euler[1]
     thr = delta_t if np.isfinite(delta_t) else 0.5 * (par[P.THR_MIN] + par[P.THR_MAX])

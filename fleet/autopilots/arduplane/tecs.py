@@ -43,9 +43,7 @@ def _flags(ctl: np.ndarray, par: np.ndarray, h: float, phi: float, error: float,
 
 
 @kernel
-def _throttle(
-    ctl: np.ndarray, par: np.ndarray, h: float, h_dot: float, v_rate: float, phi: float, dt: float
-) -> float:
+def _throttle(ctl: np.ndarray, par: np.ndarray, h: float, h_dot: float, v_rate: float, phi: float, dt: float) -> float:
     """Close the loop on total energy; give the throttle 0..1."""
     idle, full = energy_rates(ctl, par)
     V, tc, span = ctl[S.V_HAT], par[P.TIME_CONST], par[P.THR_MAX] - par[P.THR_MIN]
@@ -144,7 +142,14 @@ def _integrate(ctl: np.ndarray, par: np.ndarray, demand: float, error: float, ex
 
 @kernel
 def update(
-    ctl: np.ndarray, par: np.ndarray, h_sp: float, va_c: float, h: float, h_dot: float, phi: float, blind: bool,
+    ctl: np.ndarray,
+    par: np.ndarray,
+    h_sp: float,
+    va_c: float,
+    h: float,
+    h_dot: float,
+    phi: float,
+    blind: bool,
     dt: float,
 ) -> tuple[float, float]:
     """Give pitch and throttle for a height and a speed; call `demand.update_speed` first.
