@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 
@@ -45,6 +46,7 @@ def servo_map(params: Mapping[str, float]) -> ServoMap:
 
     Source: ArduPilot, "Servo functions" (4 aileron, 19 elevator, 21 rudder, 70 throttle, 77 and 78 elevons).
     """
+    params = {name: value for name, value in params.items() if isfinite(value)}
     functions = {n: _FUNCTION.get(int(params.get(f"SERVO{n}_FUNCTION", -1))) for n in range(1, _SERVOS + 1)}
     known = {n: name for n, name in functions.items() if name}
     sentence = ""

@@ -30,8 +30,12 @@ class History:
             if x.ndim != 2 or t.shape != x.shape[:1] or x.shape[1] != len(COLUMNS[name]) or not len(t):
                 bad += 1
                 continue
-            self._chunks[name].append((t, x))
-            self.newest = max(self.newest, float(t[-1]))
+            timed = np.isfinite(t)
+            if not timed.all():
+                bad, t, x = bad + 1, t[timed], x[timed]
+            if len(t):
+                self._chunks[name].append((t, x))
+                self.newest = max(self.newest, float(t.max()))
         self._join()
         return bad
 
@@ -46,12 +50,12 @@ class History:
 
     def rows(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
         """Give times (n,) and values (n, k) of one kind from `since` on, rising in time, finite, without repeats."""
-        found = [chunk for chunk in self._chunks[name] if len(chunk[0]) and chunk[0][-1] >= since]
+        found = [chunk for chunk in self._chunks[name] if len(chunk[0]) and chunk[0].max() >= since]
         if not found:
             return np.empty(0), np.empty((0, len(COLUMNS[name])))
         t = np.concatenate([chunk[0] for chunk in found])
         x = np.concatenate([chunk[1] for chunk in found]).astype(float)
-        good = (t >= since) & np.isfinite(t) & np.isfinite(x).all(axis=1)
+        good = (t >= since) & np.isfinite(x).all(axis=1)
         t, x = t[good], x[good]
         if (np.diff(t) > 0).all():
             return t, x

@@ -66,8 +66,7 @@ def hear(twin: Twin, message: Message) -> None:
     if isinstance(message, Sample):
         twin.bad += twin.history.add(message)
         if twin.origin is None and message.position is not None:
-            lat, lon, alt = (int(value) for value in message.position.x.numpy()[0])
-            twin.origin, twin.first_t = Origin(lat, lon, alt), message.t
+            twin.origin, twin.first_t = _first_place(twin.history), message.t
     elif isinstance(message, Status):
         _hear_status(twin, message)
     elif isinstance(message, Mission):
@@ -78,6 +77,14 @@ def hear(twin: Twin, message: Message) -> None:
         if twin.params is None or _control_changed(twin.params, message):
             _event(twin, message.t)
         twin.params, twin.servos = message, servo_map(message.values)
+
+
+def _first_place(history: History) -> Origin | None:
+    """Give the first position that can be on earth; None before any."""
+    for lat, lon, alt in history.rows("position")[1]:
+        if abs(lat) <= 9e8 and abs(lon) <= 1.8e9 and abs(alt) <= 1e8:
+            return Origin(int(lat), int(lon), int(alt))
+    return None
 
 
 def _control_changed(before: Params, after: Params) -> bool:
