@@ -1,0 +1,75 @@
+"""Pulse widths to inputs: who moves what, which way, how far."""
+
+import numpy as np
+import pytest
+
+from fleet.airframe import servo_map
+
+PLANE = {"SERVO1_FUNCTION": 4, "SERVO2_FUNCTION": 19, "SERVO3_FUNCTION": 70, "SERVO4_FUNCTION": 21}
+ELEVONS = {"SERVO1_FUNCTION": 77, "SERVO2_FUNCTION": 78, "SERVO3_FUNCTION": 70}
+
+
+def inputs(params: dict[str, float], **pulses: float) -> list[float]:
+    """Inputs delta_a, delta_e, delta_r, delta_t of one row; servos not named stand at 1500."""
+    row = np.full((1, 8), 1500.0)
+    for name, pulse in pulses.items():
+        row[0, int(name[1:]) - 1] = pulse
+    return servo_map(params).inputs(row)[0].round(9).tolist()
+
+
+def test_full_throw_is_one_either_way():
+    assert inputs(PLANE, s1=1900, s2=1100, s3=1100, s4=1700) == [1.0, -1.0, 0.5, 0.0]
+
+
+def test_off_centre_trim_scales_each_side_by_itself():
+    params = PLANE | {"SERVO2_MIN": 1000.0, "SERVO2_TRIM": 1400.0, "SERVO2_MAX": 2000.0, "SERVO3_MIN": 1500.0}
+    assert inputs(params, s2=1400)[1] == 0.0
+    assert inputs(params, s2=2000)[1] == 1.0
+    assert inputs(params, s2=1000)[1] == -1.0
+    assert inputs(params, s2=1700)[1] == 0.5
+
+
+def test_reversed_servos():
+    params = PLANE | {"SERVO1_REVERSED": 1.0}
+    assert inputs(params, s1=1900)[0] == -1.0
+    assert inputs(PLANE, s1=1900)[0] == 1.0
+
+
+def test_throttle_runs_from_nothing_to_one():
+    params = PLANE | {"SERVO3_MIN": 1000.0, "SERVO3_MAX": 2000.0, "SERVO3_TRIM": 1000.0}
+    assert [inputs(params, s3=pulse)[3] for pulse in (1000, 1250, 2000)] == [0.0, 0.25, 1.0]
+    assert inputs(params, s3=800)[3] == 0.0  # disarmed
+    back = params | {"SERVO3_REVERSED": 1.0}
+    assert [inputs(back, s3=pulse)[3] for pulse in (2000, 1750, 1000)] == [0.0, 0.25, 1.0]
+
+
+def test_elevons_mix():
+    calm = {"s3": 1100.0}
+    assert inputs(ELEVONS, s1=1900, s2=1900, **calm) == [0.0, 1.0, 0.0, 0.0]  # both up: pitch
+    assert inputs(ELEVONS, s1=1100, s2=1900, **calm) == [1.0, 0.0, 0.0, 0.0]  # left down, right up: roll right
+    assert inputs(ELEVONS, s1=1500, s2=1900, **calm) == [0.5, 0.5, 0.0, 0.0]
+
+
+def test_two_ailerons_share_one_input():
+    params = PLANE | {"SERVO5_FUNCTION": 4}
+    assert inputs(params, s1=1900, s5=1900)[0] == 1.0
+    assert inputs(params, s1=1900, s5=1500)[0] == 0.5
+
+
+def test_without_functions_the_usual_order_is_assumed_and_said():
+    assert "assumed" in servo_map({}).sentence
+    assert inputs({}, s1=1900, s2=1100, s3=1500, s4=1700) == [1.0, -1.0, 0.5, 0.5]
+    assert servo_map(PLANE).sentence == ""
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e30, 0.0])
+@pytest.mark.parametrize("name", ["SERVO1_FUNCTION", "SERVO1_MIN", "SERVO1_MAX", "SERVO1_TRIM", "SERVO1_REVERSED"])
+def test_absurd_parameters_give_finite_inputs(name: str, value: float):
+    got = servo_map(PLANE | {name: value}).inputs(np.linspace(900, 2100, 40).reshape(5, 8))
+    assert np.isfinite(got).all()
+    assert (np.abs(got) <= 1.2).all()
+
+
+def test_absurd_pulses_stay_within_the_throw():
+    got = servo_map(PLANE).inputs(np.array([[0.0] * 8, [65535.0] * 8]))
+    assert np.abs(got).max() <= 1.2 and got[:, 3].min() >= 0.0
