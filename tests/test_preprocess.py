@@ -112,7 +112,7 @@ def test_fill_marks_lost_and_never_fills_the_long_gap():
     t = np.concatenate([np.arange(0, 1.95, 0.1), np.arange(2.3, 3.95, 0.1), np.arange(6.0, 8, 0.1)])
     grid = np.arange(0.01, 7.85, 0.04)
     y, ok, lost = fill(t, np.sin(t)[:, None], grid, 0.5)
-    short, long = (grid > 1.91) & (grid < 2.29), (grid > 3.91) & (grid < 5.99)
+    short, long = (grid > 1.9) & (grid < 2.3), (grid > 3.9) & (grid < 6.0)
     assert ok[short].all() and lost[short].all()
     assert not ok[long].any() and ok[~long].all()
     assert not lost[long].any() and not lost[~(short | long)].any()

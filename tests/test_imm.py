@@ -1,0 +1,69 @@
+"""Without a route: straight on when it flew straight, round when it flew round, and never anything wild."""
+
+import numpy as np
+import pytest
+
+from twin_worker.imm import STEP, imm
+
+AHEAD = np.arange(0.0, 61.0)
+N = 24
+
+
+def straight(n: int = N, v=(18.0, 9.0, 0.0)) -> tuple[np.ndarray, np.ndarray]:
+    t = STEP * np.arange(n)[:, None]
+    return np.array([100.0, 50.0, -120.0]) + t * np.array(v), np.tile(v, (n, 1))
+
+
+def circle(rate: float, at: np.ndarray, V: float = 20.0) -> tuple[np.ndarray, np.ndarray]:
+    p = V / rate * np.column_stack([np.sin(rate * at), 1 - np.cos(rate * at), 0 * at])
+    return p - [0, 0, 120.0], V * np.column_stack([np.cos(rate * at), np.sin(rate * at), 0 * at])
+
+
+def test_straight_flight_goes_straight_on():
+    p, v = straight()
+    path = imm(p, v, AHEAD)
+    want = p[-1] + AHEAD[:, None] * v[-1]
+    along = v[-1, :2] / np.linalg.norm(v[-1, :2])
+    cross = (path - want)[:, :2] @ [-along[1], along[0]]
+    assert np.allclose(path[0], p[-1], atol=0.5)
+    assert np.abs(cross).max() < 1.0  # turns to either side weigh the same
+    assert np.linalg.norm((path - want)[:6], axis=1).max() < 5.0
+    assert (np.diff(path[:30, :2] @ along) > 0).all()
+
+
+@pytest.mark.parametrize("rate", [0.3, -0.3])
+def test_a_circle_goes_on_round(rate):
+    past = STEP * np.arange(-N + 1, 1)
+    p, v = circle(rate, past)
+    path = imm(p, v, AHEAD)
+    want, _ = circle(rate, AHEAD)
+    line = p[-1] + AHEAD[:, None] * v[-1]
+    off, off_line = (np.linalg.norm(x - want, axis=1) for x in (path, line))
+    assert off[3] < 0.3 * off_line[3] and off[5] < 0.5 * off_line[5]
+    assert np.sign(path[5, 1]) == np.sign(rate)
+
+
+def test_left_mirrors_right():
+    past = STEP * np.arange(-N + 1, 1)
+    left, right = (imm(*circle(rate, past), AHEAD) for rate in (-0.2, 0.2))
+    assert np.allclose(left * [1, -1, 1], right, atol=1e-6)
+
+
+def test_a_climb_goes_on_for_a_while_and_is_bounded():
+    path = imm(*straight(v=(20.0, 0.0, -2.0)), AHEAD)
+    assert path[2, 2] - path[0, 2] == pytest.approx(-4.0, abs=1.0)
+    assert -13.0 < path[-1, 2] - path[0, 2] < -8.0
+    assert abs(imm(*straight(v=(20.0, 0.0, 90.0)), AHEAD)[-1, 2]) < 1300
+
+
+def test_later_times_than_the_usual_and_few_rows():
+    p, v = straight(4)
+    path = imm(p, v, AHEAD + 25.0)
+    assert path.shape == (61, 3) and np.isfinite(path).all()
+    assert np.allclose(path[:5], imm(p, v, np.arange(0.0, 90.0))[25:30])
+
+
+def test_a_step_in_position_gives_numbers():
+    p, v = straight()
+    p[12:] += 1e5
+    assert np.isfinite(imm(p, v, AHEAD)).all()

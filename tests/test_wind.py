@@ -1,0 +1,61 @@
+"""The wind triangle solved backwards: a circle tells wind, airspeed scale and heading bias."""
+
+from math import cos, sin
+
+import numpy as np
+import pytest
+
+from twin_worker.wind import WindFilter
+
+WIND = np.array([5.0, -3.0])
+VA, RATE = 20.0, 0.2
+
+
+def flown(seconds: float, *, rate=RATE, scale=1.0, bias=0.0, noise=0.5, spikes=0, seed=0) -> WindFilter:
+    """Feed five rows a second of a circle in wind; `rate` 0 flies straight on."""
+    rng = np.random.default_rng(seed)
+    filt = WindFilter()
+    for k in range(int(5 * seconds)):
+        psi = rate * k / 5
+        air = scale * VA * np.array([cos(psi + bias), sin(psi + bias)])
+        ground = np.array([*(air + WIND + noise * rng.standard_normal(2)), 0.0])
+        if spikes and k > 100 and k % spikes == 0:
+            ground[:2] += 80.0
+        filt.update(k / 5, ground, VA, psi)
+    return filt
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.08, 0.94])
+def test_a_circle_tells_wind_and_airspeed_scale(scale):
+    filt = flown(120.0, scale=scale)
+    assert np.allclose(filt.wind, [*WIND, 0.0], atol=0.3)
+    assert filt.scale == pytest.approx(scale, abs=0.015)
+    assert filt.heading_bias == pytest.approx(0.0, abs=0.015)
+
+
+def test_a_circle_tells_the_heading_bias():
+    assert flown(120.0, bias=0.08).heading_bias == pytest.approx(0.08, abs=0.015)
+
+
+def test_doubt_shrinks_with_turns_only():
+    straight, circle = flown(60.0, rate=0.0), flown(60.0)
+    assert circle.sigma < 0.6 * straight.sigma < WindFilter().sigma
+
+
+def test_spikes_are_gated():
+    assert np.allclose(flown(120.0, spikes=20).wind, [*WIND, 0.0], atol=0.3)
+
+
+def test_rows_that_tell_nothing_are_passed_over():
+    filt = flown(60.0)
+    before = filt.wind
+    filt.update(filt.t, np.array([99.0, 99.0, 0.0]), VA, 0.0)  # a repeat
+    filt.update(filt.t - 5.0, np.array([99.0, 99.0, 0.0]), VA, 0.0)  # a late one
+    filt.update(filt.t + 1.0, np.array([0.1, 0.1, 0.0]), 0.5, 0.0)  # standing on the ground
+    assert np.array_equal(filt.wind, before)
+
+
+def test_a_steep_dive_and_a_long_silence_stay_finite():
+    filt = flown(30.0)
+    filt.update(filt.t + 1e6, np.array([5.0, 5.0, 60.0]), VA, 1.0)
+    assert np.isfinite([*filt.wind, filt.scale, filt.sigma]).all()
