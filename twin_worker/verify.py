@@ -85,12 +85,19 @@ def verify(axes: tuple[Axis, Axis], held: Window, last: tuple[Axis, Axis] | None
         omega: threshold on the mean fit [%]
     Returns:
         a verdict whose sentence does not yet say whose it is
+    Raises:
+        ValueError: when the data are shorter than the shortest horizon; wait for more.
     """
-    for horizon in [h for h in HORIZONS_S if h <= held.seconds + held.dt]:
+    allowed = [h for h in HORIZONS_S if h <= held.seconds + held.dt]
+    if not allowed:
+        raise ValueError(f"verify: found {held.seconds:.1f} s held out, needs {HORIZONS_S[-1]:.0f} s; wait for more")
+    for horizon in allowed:
         fit, still = fits_at(axes, held, horizon)
         if mean(fit) > max(omega, mean(still)):
             break
     outcome, sentence = _judge(fit, still, held, omega)
+    if not all(np.isfinite(axis.D).all() for axis in axes):
+        outcome, sentence = Outcome.DIVERGED, "the model is not finite; trying again"
     if outcome is Outcome.VERIFIED and last is not None:
         before = mean(fits_at(last, held, horizon)[0])
         if before > mean(fit) + _MARGIN:
