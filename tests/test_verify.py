@@ -1,0 +1,141 @@
+"""Verification: the fit of equation 22 by hand, what a model must beat, and every outcome."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from flights import linear_flight, standstill, truth
+
+from fleet.contract import Outcome
+from twin_worker.verify import fit_percent, fits_at, free_runs, hold, mean, verify
+
+
+def blurred(share: float, seed: int = 0):
+    """The true model with every entry but its kinematics off by a share."""
+    rng = np.random.default_rng(seed)
+    lon, lat = truth()
+    return tuple(replace(a, D=a.D * (1 + share * rng.standard_normal(a.D.shape))) for a in (lon, lat))
+
+
+def test_fit_by_hand():
+    y = np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 3.0], [6.0, 3.0]])
+    y_hat = np.array([[1.0, 0.0], [2.0, 1.5], [3.0, 1.5], [4.0, 3.0]])
+    # mean 3: spread sqrt(4 + 1 + 0 + 9), error 2;  mean 1.5: spread 3, error sqrt(4.5)
+    want = [100 * (1 - 2 / np.sqrt(14)), 100 * (1 - np.sqrt(4.5) / 3)]
+    assert fit_percent(y, y_hat) == pytest.approx(want)
+    assert fit_percent(y, y).tolist() == [100.0, 100.0]
+    assert fit_percent(y, np.tile(y.mean(axis=0), (4, 1))) == pytest.approx([0.0, 0.0])
+
+
+def test_fit_counts_only_rows_both_have_and_is_bounded():
+    y = np.array([[0.0], [2.0], [50.0], [4.0]])
+    y_hat = np.array([[0.0], [1.0], [np.nan], [4.0]])
+    assert fit_percent(y, y_hat) == pytest.approx([100 * (1 - 1 / np.sqrt(8))])
+    assert fit_percent(y, np.full((4, 1), np.nan)).tolist() == [-100.0]
+    assert fit_percent(y, np.full((4, 1), 1e9)).tolist() == [-100.0]
+    assert fit_percent(np.ones((4, 1)), np.ones((4, 1))).tolist() == [100.0]  # nothing moved, nothing missed
+
+
+def test_hold_by_hand():
+    y, ok = np.arange(7.0)[:, None], np.ones(7, bool)
+    assert hold(y, ok, 3)[:, 0].tolist() == [0, 0, 0, 3, 3, 3, 6]
+    ok[4] = False
+    assert np.array_equal(hold(y, ok, 3)[:, 0], [0, 0, 0, 3, np.nan, 3, 6], equal_nan=True)
+    ok[3] = False  # no measured start, no baseline
+    assert np.isnan(hold(y, ok, 3)[3:6]).all()
+
+
+def test_free_runs_start_afresh_and_cross_no_hole():
+    D = np.array([[0.5, 0.0, 0.0]])
+    y, u, ok = np.full((9, 1), 8.0), np.zeros((9, 1)), np.ones(9, bool)
+    ok[4] = False
+    runs = free_runs(D, y, u, ok, 3)[:, 0]
+    assert np.array_equal(runs, [8, 4, 2, np.nan, np.nan, np.nan, 8, 4, 2], equal_nan=True)
+
+
+def test_standstill_is_holding():
+    held = linear_flight(9.0)
+    fit, still = fits_at(standstill(truth()), held, 4.0)
+    assert fit == pytest.approx(still)
+    assert set(fit) == {"u", "v", "w", "p", "q", "r", "phi", "theta", "psi"}
+
+
+def test_a_perfect_model_fits_perfectly():
+    verdict = verify(truth(), linear_flight(20.0), None)
+    assert verdict.outcome is Outcome.VERIFIED
+    assert min(verdict.fit.values()) > 99.9
+    assert mean(verdict.fit_hold) < 50.0
+    noisy = verify(truth(), linear_flight(20.0, noise=0.02), None)
+    assert 80.0 < mean(noisy.fit) < mean(verdict.fit)
+
+
+@pytest.mark.parametrize(("seconds", "longest"), [(20.0, 16.0), (16.0, 16.0), (15.0, 8.0), (9.0, 8.0), (5.0, 4.0)])
+def test_verified_at_the_longest_horizon_the_data_allow(seconds, longest):
+    verdict = verify(truth(), linear_flight(seconds), None)
+    assert verdict.horizon_s == longest
+    assert f"over {longest:.0f} s" in verdict.sentence
+
+
+def test_a_model_good_for_a_while_is_verified_for_that_while():
+    held, drifting = linear_flight(20.0, seed=2), truth(grow=0.004)
+    fits = [mean(fits_at(drifting, held, h)[0]) for h in (16.0, 8.0, 4.0)]
+    assert fits[0] < fits[1] < fits[2]
+    for horizon, between in ((8.0, fits[:2]), (4.0, fits[1:])):
+        verdict = verify(drifting, held, None, omega=sum(between) / 2)
+        assert verdict.outcome is Outcome.VERIFIED and verdict.horizon_s == horizon
+
+
+def test_the_threshold_is_a_threshold():
+    held = linear_flight(20.0)
+    fit = mean(verify(blurred(0.01), held, None).fit)
+    assert verify(blurred(0.01), held, None, omega=fit - 0.1).outcome is Outcome.VERIFIED
+    refused = verify(truth(), held, None, omega=100.0)
+    assert refused.outcome is Outcome.BELOW_THRESHOLD
+    assert refused.threshold == 100.0 and "needs 100 %" in refused.sentence
+
+
+def test_no_better_than_holding_still_is_refused_however_low_the_threshold():
+    verdict = verify(standstill(truth()), linear_flight(20.0), None, omega=-100.0)
+    assert verdict.outcome is Outcome.BELOW_THRESHOLD
+
+
+def test_steady_flight_identifies_nothing():
+    held = linear_flight(20.0, lively=0.02, noise=0.1)
+    verdict = verify(standstill(truth()), held, None)
+    assert verdict.outcome is Outcome.NOT_IDENTIFIABLE
+    assert "steady flight" in verdict.sentence
+
+
+def test_a_worse_model_does_not_replace_the_last():
+    held = linear_flight(20.0)
+    worse = blurred(0.02)
+    assert verify(worse, held, None).outcome is Outcome.VERIFIED
+    verdict = verify(worse, held, truth())
+    assert verdict.outcome is Outcome.WORSE_THAN_LAST
+    assert "last verified model has 100 %" in verdict.sentence
+    assert verify(truth(), held, worse).outcome is Outcome.VERIFIED
+    assert verify(truth(), held, truth()).outcome is Outcome.VERIFIED
+
+
+def test_a_diverging_model_is_named_so():
+    verdict = verify(truth(grow=0.5), linear_flight(20.0), None)
+    assert verdict.outcome is Outcome.DIVERGED
+    assert all(np.isfinite(fit) for fit in verdict.fit.values())
+
+
+def test_a_model_of_no_numbers_is_refused():
+    lon, lat = truth()
+    verdict = verify((replace(lon, D=np.full_like(lon.D, np.nan)), lat), linear_flight(20.0), None)
+    assert verdict.outcome is Outcome.DIVERGED
+    assert all(np.isfinite(fit) for fit in verdict.fit.values())
+
+
+def test_data_full_of_holes_verify_nothing():
+    held = linear_flight(20.0)
+    held.ok[::50] = False
+    assert verify(truth(), held, None).outcome is not Outcome.VERIFIED
+
+
+def test_data_too_short_for_any_horizon_say_so():
+    with pytest.raises(ValueError, match="needs 4 s"):
+        verify(truth(), linear_flight(3.0), None)
