@@ -1,6 +1,6 @@
 """The only loop of the twin: route -> autopilot -> surfaces -> linear model -> position."""
 
-from math import cos, sin, sqrt
+from math import cos, exp, sin, sqrt
 
 import numba as nb
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from fleet.autopilots.arduplane import guide, stabilise
 from fleet.frames import wrap
 
+GUST_S = 4.0  # time in which a gust fades [s]
 GUIDE_EVERY = 2  # model steps between guidance steps; 0.08 s on the 0.04 s grid
 N_STATE = 12  # p_n p_e p_d, u v w, p q r, phi theta psi
 
@@ -65,7 +66,8 @@ def simulate(
         lat, lat_at: the same of phi psi p r v | delta_a delta_r, (5, 8) and (7,)
         state: start, (12,): p NED [m], u v w air-relative FRD [m/s], p q r [rad/s], phi theta psi [rad]
         command: phi_c, theta_c [rad] in force at the start, (2,)
-        air: w_n, w_e wind [m/s], true over reported airspeed [-], (3,)
+        air: w_n, w_e wind [m/s], true over reported airspeed [-], gust: airspeed beyond what the mean wind explains,
+            fading with `GUST_S` [m/s], (4,)
         dt: step [s]
         out: states along the flight, filled in, (n, 12); out[0] is the start
     Returns:
@@ -77,7 +79,8 @@ def simulate(
     v = np.empty(3)
     phi_c, theta_c, delta_t = command[0], command[1], lon_at[5]
     u_lon, u_lat = np.empty(3), np.empty(2)
-    Va_last, Va_dot = sqrt(state[3] ** 2 + state[4] ** 2 + state[5] ** 2) / air[2], 0.0
+    Va_last, Va_dot = (sqrt(state[3] ** 2 + state[4] ** 2 + state[5] ** 2) + air[3]) / air[2], 0.0
+    fade, left = exp(-dt / GUST_S), 1.0
     fast = 3.0 * max(lon_at[0], 5.0)
     for k in range(len(out)):
         phi, theta, psi = x_lat[0], x_lon[3], wrap(x_lat[1])
@@ -91,7 +94,7 @@ def simulate(
         v[0], v[1], v[2] = _body_to_ned(x_lon[0], x_lat[4], x_lon[1], phi, theta, psi)
         v[0] += air[0]
         v[1] += air[1]
-        Va = V / air[2]
+        Va = (V + left * air[3]) / air[2]
         euler, rates = np.array([phi, theta, psi]), np.array([x_lat[2], x_lon[2], x_lat[3]])
         if k % GUIDE_EVERY == 0:
             Va_dot += 0.25 * ((Va - Va_last) / (GUIDE_EVERY * dt) - Va_dot)
@@ -101,6 +104,7 @@ def simulate(
         u_lon[0], u_lon[1], u_lon[2] = delta_e, delta_t, np.tan(phi) * sin(phi)
         u_lat[0], u_lat[1] = delta_a, delta_r
         x_lon, x_lat = _step(lon, lon_at, x_lon, u_lon), _step(lat, lat_at, x_lat, u_lat)
+        left *= fade
         for i in range(3):
             p[i] += v[i] * dt
     return len(out)

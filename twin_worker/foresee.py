@@ -9,9 +9,8 @@ from fleet.window import Window
 from twin_worker.horizon import AHEAD, LIMIT, QUANTILE, Made, path_length
 from twin_worker.imm import STEP, imm
 from twin_worker.memory import Twin
-from twin_worker.predict import Onboard, Situation, fly_ahead
+from twin_worker.predict import fly_ahead
 
-ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 _LOOK_BACK_S = 62.0  # telemetry a prediction starts from [s]
 
 
@@ -43,17 +42,11 @@ def foresee(twin: Twin, now: float) -> list[Message]:
 
 def _route_path(twin: Twin, window: Window, ahead: np.ndarray) -> tuple[np.ndarray | None, str, int, str]:
     """Fly the route where mode, mission and a verified model allow; else say why not."""
-    mode = twin.status.mode if twin.status else ""
     if twin.axes is None:
         return None, "", -1, twin.verdict.sentence
-    if mode not in ROUTE_MODES:
-        return None, "", -1, f"mode {mode or 'unknown'} follows no mission: turn rate only"
-    if twin.mission is None or not twin.mission.items:
-        return None, "", -1, "no mission on board: turn rate only"
-    params = twin.params.values if twin.params else {}
-    assert twin.origin is not None
-    onboard = Onboard(twin.mission.items, params, twin.since)
-    flown = fly_ahead(Situation(window, twin.history, onboard, twin.wind, twin.origin), twin.axes, ahead)
+    if why := twin.why_no_route():
+        return None, "", -1, why
+    flown = fly_ahead(twin.situation(window), twin.axes, ahead)
     return flown.path, "paper", flown.seq, flown.sentence
 
 

@@ -35,6 +35,11 @@ class Axis:
     u_scale: np.ndarray
     dt: float
 
+    @property
+    def means(self) -> np.ndarray:
+        """Give the means of states and inputs, (n + m,)."""
+        return np.concatenate([self.y_mean, self.u_mean])
+
     def scaled(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
         """Give the window's outputs (N, n) and inputs (N, m) in the model's units."""
         y = (window.columns(self.states) - self.y_mean) / self.y_scale

@@ -7,13 +7,15 @@ from fleet.contract import Message, Model, Outcome, State, Verdict
 from fleet.window import Window
 from twin_worker.identify import AXES, Axis, identify_axis
 from twin_worker.memory import Twin
+from twin_worker.predict import fly_ahead
 from twin_worker.preprocess import DT
 from twin_worker.verify import verify
 
 LEAST_S = 30.0  # shortest stretch worth identifying [s]
 WINDOW_S = 140.0  # longest stretch used [s]
 SLOW = 6.0  # air-relative forward speed below which nothing flies on its wings [m/s]
-_FREE_RUN_S = (4.0, 2.0, 4.0, 8.0)  # free-run length of the n-th try [s]
+_FREE_RUN_S = (2.0, 4.0, 2.0, 8.0)  # free-run length of the n-th try [s]
+_WORSE = 1.2  # a new model may stray this much further than the last [-]
 _SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the window the n-th try uses
 
 
@@ -40,12 +42,39 @@ def learn(twin: Twin) -> list[Message]:
     except (ValueError, np.linalg.LinAlgError) as error:
         twin.verdict = Verdict(outcome=Outcome.STARVED, sentence=f"{twin.name}: {error}", tries=twin.tries)
         return []
-    verdict = verify(axes, held_out, twin.axes, twin.omega)  # type: ignore[arg-type]
+    verdict = _fly_once_more(twin, window, held_n, axes, verify(axes, held_out, twin.axes, twin.omega))
     verdict = msgspec.structs.replace(verdict, sentence=f"{twin.name}: {verdict.sentence}", tries=twin.tries)
     if verdict.outcome is Outcome.VERIFIED:
         twin.axes, twin.tries = axes, 0  # type: ignore[assignment]
     twin.verdict = verdict
     return [_model(twin, axes, verdict, window)]  # type: ignore[arg-type]
+
+
+def _fly_once_more(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Axis], verdict: Verdict) -> Verdict:
+    """Withdraw a verdict whose model, flown in closed loop over the held-out data, strays further than the last one."""
+    if verdict.outcome is not Outcome.VERIFIED:
+        return verdict
+    miss, before = (_hindcast(twin, window, held_n, each) for each in (axes, twin.axes))
+    if np.isinf(miss) and not np.isfinite(before):
+        sentence = f"{verdict.sentence}; but on the route the twin leaves its envelope; trying again"
+        return msgspec.structs.replace(verdict, outcome=Outcome.DIVERGED, sentence=sentence)
+    if miss > _WORSE * before + 1.0:
+        sentence = f"{verdict.sentence}; but on the route it strays {miss:.0f} m, the last verified model {before:.0f} m"
+        return msgspec.structs.replace(verdict, outcome=Outcome.WORSE_THAN_LAST, sentence=sentence)
+    return verdict
+
+
+def _hindcast(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Axis] | None) -> float:
+    """Give the mean miss of a flight from the start of the held-out data [m]; inf: it diverges, nan: no route."""
+    if axes is None or twin.why_no_route():
+        return np.nan
+    start = len(window) - held_n
+    ahead = np.arange(0.0, int(held_n * DT))
+    flown = fly_ahead(twin.situation(window.part(0, start + 1)), axes, ahead)
+    if flown.path is None:
+        return np.inf if flown.diverged else np.nan
+    rows = start + np.rint(ahead / DT).astype(int)
+    return float(np.linalg.norm(flown.path - window.p[rows], axis=1).mean())
 
 
 def _airborne(window: Window | None) -> Window | None:

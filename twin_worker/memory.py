@@ -12,9 +12,12 @@ from fleet.window import Window
 from twin_worker.history import History
 from twin_worker.horizon import Record
 from twin_worker.identify import Axis
+from twin_worker.predict import Onboard, Situation
 from twin_worker.preprocess import preprocess
 from twin_worker.verify import OMEGA
 from twin_worker.wind import WindFilter
+
+ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 
 
 def _unheard() -> Verdict:
@@ -59,6 +62,22 @@ class Twin:
         assert self.origin is not None
         newest = self.history.newest
         return preprocess(self.history, self.origin, self.servos, self.wind.wind, until=newest, seconds=seconds)
+
+    def situation(self, window: Window) -> Situation:
+        """Give what a prediction from the end of `window` starts from."""
+        assert self.origin is not None
+        items = self.mission.items if self.mission else ()
+        onboard = Onboard(items, self.params.values if self.params else {}, self.since)
+        return Situation(window, self.history, onboard, self.wind, self.origin)
+
+    def why_no_route(self) -> str:
+        """Say why the aircraft follows no mission now; empty where it does."""
+        mode = self.status.mode if self.status else ""
+        if mode not in ROUTE_MODES:
+            return f"mode {mode or 'unknown'} follows no mission: turn rate only"
+        if self.mission is None or not self.mission.items:
+            return "no mission on board: turn rate only"
+        return ""
 
 
 def hear(twin: Twin, message: Message) -> None:

@@ -33,12 +33,14 @@ class Flown:
         seq: mission item it starts on
         replay_rms: how well the controller twin met the reported bank command on telemetry [rad]
         sentence: what limits it, or empty
+        diverged: the twin left its flight envelope
     """
 
     path: np.ndarray | None
     seq: int
     replay_rms: float
     sentence: str
+    diverged: bool = False
 
 
 @dataclass(frozen=True)
@@ -105,9 +107,10 @@ def fly_ahead(now: Situation, axes: tuple[Axis, Axis], ahead: np.ndarray) -> Flo
     if kind in _REFUSED:
         return Flown(None, int(seq[-1]), rms, f"{_REFUSED[kind]} is not modelled: no route-aware prediction")
     out = np.empty((int(ahead[-1] / good.dt) + 2, N_STATE))
-    done = simulate(ctl, par, way.legs, *_model(axes, good), *_start(now, good), good.dt, out)  # type: ignore
+    model = [part for axis in axes for part in (_settled(axis, good), axis.means)]
+    done = simulate(ctl, par, way.legs, *model, *_start(now, good), good.dt, out)  # type: ignore
     if done <= ahead[-1] / good.dt:
-        return Flown(None, int(seq[-1]), rms, f"the twin leaves its flight envelope {done * good.dt:.0f} s ahead")
+        return Flown(None, int(seq[-1]), rms, f"the twin leaves its envelope {done * good.dt:.0f} s ahead", True)
     path = np.column_stack([np.interp(ahead, good.dt * np.arange(done), column) for column in out[:done, :3].T])
     said = list(way.sentences)
     if absent:
@@ -133,16 +136,12 @@ def _telemetry(good: Window, at: np.ndarray, history: History) -> tuple[np.ndarr
     return tuple(np.ascontiguousarray(row) for row in rows)
 
 
-def _model(axes: tuple[Axis, Axis], good: Window) -> list[np.ndarray]:
-    return [part for axis in axes for part in (_settled(axis, good), np.concatenate([axis.y_mean, axis.u_mean]))]
-
-
 def _start(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give state (12,), commands in force (2,) and air (3,) at the end of the window."""
+    """Give state (12,), commands in force (2,) and air (4,) at the end of the window."""
     state = np.concatenate([good.p[-1], good.x[-3:, :6].mean(axis=0), good.x[-1, 6:]])
     command = held(*now.history.rows("command"), good.t[-1:], 1.0)[0, :2]
     command = np.where(np.isfinite(command), command, good.x[-1, 6:8])
-    return state, command, np.array([*now.wind.wind[:2], now.wind.scale])
+    return state, command, np.array([*now.wind.wind[:2], now.wind.scale, _gust(now, good)])
 
 
 def _settled(axis: Axis, good: Window) -> np.ndarray:
@@ -153,3 +152,13 @@ def _settled(axis: Axis, good: Window) -> np.ndarray:
     z = np.column_stack([y, recent.columns(axis.inputs) - axis.u_mean, np.ones(len(y))])
     D[:, -1] += (y[1:] - z[:-1] @ D.T).mean(axis=0)
     return D
+
+
+def _gust(now: Situation, good: Window) -> float:
+    """Give the airspeed beyond what the mean wind explains [m/s]; 0 without an airspeed sensor."""
+    t, air = now.history.rows("air", good.t[-1] - 1.0)
+    recent = air[t <= good.t[-1], 0]
+    if not len(recent) or recent.min() < 3.0:
+        return 0.0
+    n = int(1.0 / good.dt)
+    return float(recent.mean() * now.wind.scale - np.linalg.norm(good.x[-n:, :3], axis=1).mean())

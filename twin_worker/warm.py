@@ -29,8 +29,8 @@ def warm_up() -> None:
     rows = [window.t - window.t[0], window.p, window.v, euler, rates, *told]
     ctl, _ = arduplane.shadow(par, legs, window.p[0], *rows)  # type: ignore
     state = np.concatenate([window.p[-1], window.x[-1]])
-    matrices = [part for axis in axes for part in (axis.physical(), np.concatenate([axis.y_mean, axis.u_mean]))]
-    air = np.array([0.0, 0.0, 1.0])
+    matrices = [part for axis in axes for part in (axis.physical(), axis.means)]
+    air = np.array([0.0, 0.0, 1.0, 0.0])
     simulate(ctl, par, legs, *matrices, state, np.zeros(2), air, window.dt, np.empty((50, N_STATE)))  # type: ignore
 
 

@@ -26,7 +26,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=1, help="draws aircraft, missions, weather and noise (1)")
     parser.add_argument("--wind", type=float, default=4.0, metavar="M/S", help="mean wind at 100 m (4)")
     parser.add_argument(
-        "--turbulence", default="light", metavar="LEVEL", help="none, light, moderate, severe or 0..7 (light = 3)"
+        "--turbulence",
+        default="2",
+        metavar="LEVEL",
+        help="MIL-F-8785C: none, light (3), moderate (4), severe (6) or 0..7 (2: what goes with a wind of 4 m/s)",
     )
     parser.add_argument("--loss", type=float, default=0.02, metavar="SHARE", help="share of frames lost (0.02)")
     parser.add_argument("--for", dest="seconds", type=float, metavar="S", help="how long (for ever; 300 with --tlog)")

@@ -25,7 +25,7 @@ _GROUND_M = 3.0  # below this height above home the flight is over
 class PretendUav:
     """An aircraft in AUTO on its own mission; `step` makes it fly and talk, `hear` makes it answer."""
 
-    def __init__(self, uav_id: int, seed: int, *, wind: float = 4.0, turbulence: int = 3, origin: Origin = HOME):
+    def __init__(self, uav_id: int, seed: int, *, wind: float = 4.0, turbulence: int = 2, origin: Origin = HOME):
         """Put one aircraft in the air.
 
         Args:
