@@ -53,7 +53,7 @@ def test_the_relative_error_has_a_floor_of_two_seconds_of_flight():
 
 def test_errors_along_across_and_down():
     east = np.column_stack([0 * AHEAD, V * AHEAD, 0 * AHEAD])
-    error = axes_error(east, east + [3.0, 4.0, 12.0])
+    error = axes_error(east, east + np.array([3.0, 4.0, 12.0]))
     assert np.allclose(error, [4.0, 3.0, 12.0, 13.0])
     assert np.allclose(track_frame(np.zeros((4, 3))), [1.0, 0.0])  # standing still: north, not nan
 
