@@ -17,11 +17,11 @@ LIMIT = 0.10  # relative error at which trust ends [-]
 QUANTILE = 0.9
 _FLOOR_S = 2.0  # least path length, as seconds of ground speed [s]
 _PRIOR = {  # expected spread of along, cross, vertical and distance: base [m], growth [m/s^power], power
-    "paper": (np.array([1.0, 0.8, 0.6, 1.2]), np.array([0.45, 0.2, 0.1, 0.5]), 1.3),  # Huang 2021: 10 % at 16 s
+    "paper": (np.array([1.0, 0.8, 0.6, 1.2]), np.array([0.5, 0.2, 0.2, 0.5]), 1.3),
     "imm": (np.array([2.0, 2.0, 1.0, 2.5]), np.array([1.6, 1.6, 0.5, 2.2]), 1.4),
 }
 _PRIOR_WEIGHT = 6.0  # past predictions the prior counts as [-]
-_PRIOR_SCORE = 2.0  # its 90 % factor [-]
+_PRIOR_SCORE = 2.5  # its 90 % factor [-]
 _KEEP = 60  # past predictions remembered per method [-]
 EVERY_S = 5.0  # a prediction is kept for scoring this often [s]
 
@@ -76,8 +76,7 @@ class Record:
     """Past predictions of one aircraft and what came of them."""
 
     waiting: list[Made] = field(default_factory=list)
-    squares: dict[str, deque[np.ndarray]] = field(default_factory=dict)
-    scores: dict[str, deque[np.ndarray]] = field(default_factory=dict)
+    errors: dict[str, deque[np.ndarray]] = field(default_factory=dict)  # along, cross, vertical, distance, (61, 4) [m]
     passages: deque[tuple[float, bool]] = field(default_factory=lambda: deque(maxlen=200))
     inside: deque[float] = field(default_factory=lambda: deque(maxlen=_KEEP))
 
@@ -113,18 +112,16 @@ class Record:
         error = axes_error(made.path, flown)
         self.inside.append(float((error[1:, :3] <= made.tube[1:]).all(axis=1).mean()))
         self.passages.append(first_passage(error[:, 3] / path_length(flown, made.speed)))
-        spread = self.spread(made.method)
-        self.scores.setdefault(made.method, deque(maxlen=_KEEP)).append(error / spread)
-        self.squares.setdefault(made.method, deque(maxlen=_KEEP)).append(error**2)
+        self.errors.setdefault(made.method, deque(maxlen=_KEEP)).append(error)
 
     def spread(self, method: str, ahead: np.ndarray = AHEAD) -> np.ndarray:
         """Give the expected error by look-ahead: the prior, outweighed by what was measured, (n, 4) [m]."""
         base, growth, power = _PRIOR[method]
         prior = np.hypot(base, growth * ahead[:, None] ** power)
-        found = self.squares.get(method)
+        found = self.errors.get(method)
         if not found:
             return prior
-        measured = np.mean(found, axis=0)
+        measured = np.mean(np.square(found), axis=0)
         total = (_PRIOR_WEIGHT * prior[: len(measured)] ** 2 + len(found) * measured) / (_PRIOR_WEIGHT + len(found))
         spread = np.sqrt(total)
         if len(ahead) > len(spread):  # beyond what was ever scored: go on growing as the prior does
@@ -133,7 +130,8 @@ class Record:
 
     def factor(self, method: str) -> np.ndarray:
         """Give the factors on the spread that hold 90 %: jointly for the three axes, and for the distance, (2,)."""
-        found = list(self.scores.get(method, ()))
+        spread = self.spread(method)
+        found = [error / spread for error in self.errors.get(method, ())]
         joint = [float(np.quantile(score[1:, :3].max(axis=1), QUANTILE)) for score in found]
         distance = [float(np.quantile(score[1:, 3], QUANTILE)) for score in found]
         doubt = [_PRIOR_SCORE] * max(1, round(_PRIOR_WEIGHT / 2))

@@ -59,7 +59,9 @@ def _fly_once_more(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Ax
         sentence = f"{verdict.sentence}; but on the route the twin leaves its envelope; trying again"
         return msgspec.structs.replace(verdict, outcome=Outcome.DIVERGED, sentence=sentence)
     if miss > _WORSE * before + 1.0:
-        sentence = f"{verdict.sentence}; but on the route it strays {miss:.0f} m, the last verified model {before:.0f} m"
+        sentence = (
+            f"{verdict.sentence}; but on the route it strays {miss:.0f} m, the last verified model {before:.0f} m"
+        )
         return msgspec.structs.replace(verdict, outcome=Outcome.WORSE_THAN_LAST, sentence=sentence)
     return verdict
 
