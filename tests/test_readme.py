@@ -1,0 +1,119 @@
+"""The README keeps its word: the foreign tool runs, the commands parse, the links lead somewhere."""
+
+import argparse
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT, unused_port
+
+from fleet import cli
+from fleet.bus import connect, open_router
+from fleet.codec import Stamp
+from fleet.contract import Array, Prediction, State
+from gateway import __main__ as gateway
+from twin_worker import __main__ as twin_worker
+from viewer import __main__ as viewer
+
+README = (ROOT / "README.md").read_text()
+MAINS = {"fleet": cli.main, "gateway": gateway.main, "twin_worker": twin_worker.main, "viewer": viewer.main}
+
+
+def tool() -> str:
+    (code,) = re.findall(r"^```python\n(.*?)^```", README, re.M | re.S)
+    return code
+
+
+def answers(*_: object) -> Iterator[tuple[Prediction, Stamp]]:
+    """Two UAVs due north and due east; of the second also what an older owner would say."""
+    for uav, velocity, epoch in ((3, (20.0, 0.0, -1.0), 5), (7, (0.0, 15.0, 0.0), 9), (7, (99.0, 99.0, 99.0), 2)):
+        ahead = np.array([0.0, 30.0])
+        prediction = Prediction(
+            uav=uav,
+            t=1.0,
+            state=State.PREDICTING,
+            method="paper",
+            origin=(470_000_000, 80_000_000, 500_000),
+            ahead=Array.of(ahead),
+            path=Array.of(ahead[:, None] * np.array(velocity) + np.array([0.0, 0.0, -100.0])),
+            tube=Array.of(np.ones((2, 3))),
+            horizon_s=10.0 + uav,
+        )
+        yield prediction, Stamp(epoch, 1)
+
+
+def test_the_foreign_tool_prints_where_everyone_will_be(tmp_path: Path) -> None:
+    where = f"tcp/127.0.0.1:{unused_port()}"
+    script = tmp_path / "tool.py"
+    script.write_text(tool())
+    router = open_router(where)
+    try:
+        with connect(where) as bus:
+            bus.answer(Prediction, answers)
+            env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+            command = [sys.executable, "-I", "-W", "error", str(script), where]
+            done = subprocess.run(
+                command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60, check=False
+            )
+    finally:
+        router.close()
+    origin = "above [470000000, 80000000, 500000]"
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines() == [
+        f"uav 3: in 30 s 600.0 m north, 0.0 m east, 130.0 m {origin}, horizon 13.0 s",
+        f"uav 7: in 30 s 0.0 m north, 450.0 m east, 100.0 m {origin}, horizon 17.0 s",
+    ]
+
+
+def test_the_foreign_tool_needs_two_packages_and_about_ten_lines() -> None:
+    imported = re.findall(r"^import (.*)", tool(), re.M)
+    assert imported == ["struct, sys, msgpack, zenoh"]
+    assert len(tool().splitlines()) <= 12
+
+
+def commands() -> list[str]:
+    """Every call of our own commands: indented blocks, and code spans in the text."""
+    prose = re.sub(r"^```.*?^```", "", README, flags=re.M | re.S)
+    lines = re.findall(r"^    ((?:fleet|gateway|twin_worker|viewer|make) .*)", prose, re.M)
+    spans = re.findall(r"`((?:fleet|gateway|twin_worker|viewer|make) [^`]+)`", prose)
+    return sorted({line.split("#")[0].strip() for line in lines + spans if "──" not in line})
+
+
+@pytest.mark.parametrize("line", commands())
+def test_every_command_is_understood(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = shlex.split(line)
+    if words[0] == "make":
+        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.M)
+        options = [word.removeprefix("UP=") for word in words[2:]]
+        words = ["fleet", "up", *(shlex.split(options[0]) if options else [])]
+    understood: list[argparse.Namespace] = []
+
+    def note(_: str, __: object, args: argparse.Namespace) -> int:
+        understood.append(args)
+        return 0
+
+    for module in (cli, gateway, twin_worker, viewer):
+        monkeypatch.setattr(module, "guarded", note)
+    assert MAINS[words[0]](words[1:]) == 0
+    assert understood
+
+
+def test_the_readme_names_enough_commands_for_the_test_above_to_mean_something() -> None:
+    assert len(commands()) > 15
+
+
+@pytest.mark.parametrize("target", sorted(set(re.findall(r"\]\((?!https?:|#)([^)]+)\)", README))))
+def test_links_and_pictures_lead_somewhere(target: str) -> None:
+    assert (ROOT / target.split("#")[0]).is_file()
+
+
+def test_files_named_in_the_text_exist() -> None:
+    named = re.findall(r"`((?:deploy|fleet|gateway|twin_worker|viewer|tests)/[\w./-]+\.\w+)`", README)
+    assert named
+    assert [name for name in named if not (ROOT / name).is_file()] == []
