@@ -48,8 +48,11 @@ def _servo(m: Any) -> tuple[float, ...]:
     return (*raw, m.servo8_raw)
 
 
+_NO_FIX_E7 = 100_000  # a kilometre round zero, zero [1e-7 deg]
+
+
 def _has_fix(m: Any) -> bool:
-    return bool(m.lat or m.lon)  # zero, zero is how autopilots say "no position yet"
+    return max(abs(m.lat), abs(m.lon)) > _NO_FIX_E7  # without a fix autopilots say zero, zero, or drift around it
 
 
 TABLE: tuple[Row, ...] = (
