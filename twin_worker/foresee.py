@@ -12,6 +12,7 @@ from twin_worker.memory import Twin
 from twin_worker.predict import fly_ahead
 
 _LOOK_BACK_S = 62.0  # telemetry a prediction starts from [s]
+_COAST_S = 120.0  # the twin flies on alone for as long; then its last prediction ages [s]
 
 
 def foresee(twin: Twin, now: float) -> list[Message]:
@@ -19,7 +20,7 @@ def foresee(twin: Twin, now: float) -> list[Message]:
     assert twin.origin is not None
     coast = max(now - twin.history.newest, 0.0) if twin.lost else 0.0
     window = twin.window(_LOOK_BACK_S)
-    if window is None or not window.ok[-1]:
+    if window is None or not window.ok[-1] or coast > _COAST_S:
         return []
     t0 = float(window.t[-1])
     ahead = AHEAD + round(coast)

@@ -5,6 +5,8 @@ import numpy as np
 from fleet.contract import COLUMNS, Rows, Sample
 
 _CHUNKS = 40  # chunks of one kind before they are joined
+_MOST = 1e5  # values beyond are noise [m/s, rad, us, ...]
+_MOST_POSITION = 2e9  # the same [1e-7 deg, mm]
 
 
 class History:
@@ -49,13 +51,14 @@ class History:
                 chunks.append((t[young], x[young]))
 
     def rows(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
-        """Give times (n,) and values (n, k) of one kind from `since` on, rising in time, finite, without repeats."""
+        """Give times (n,) and values (n, k) of one kind from `since` on, rising in time, believable, once each."""
         found = [chunk for chunk in self._chunks[name] if len(chunk[0]) and chunk[0].max() >= since]
         if not found:
             return np.empty(0), np.empty((0, len(COLUMNS[name])))
         t = np.concatenate([chunk[0] for chunk in found])
         x = np.concatenate([chunk[1] for chunk in found]).astype(float)
-        good = (t >= since) & np.isfinite(x).all(axis=1)
+        most = _MOST_POSITION if name == "position" else _MOST
+        good = (t >= since) & (np.abs(x) < most).all(axis=1)  # nan is not
         t, x = t[good], x[good]
         if (np.diff(t) > 0).all():
             return t, x

@@ -6,7 +6,7 @@ import numpy as np
 
 from fleet.airframe import ServoMap, servo_map
 from fleet.autopilots import arduplane
-from fleet.contract import Message, Mission, Outcome, Params, Prediction, Sample, State, Status, Verdict
+from fleet.contract import Message, Mission, Model, Outcome, Params, Prediction, Sample, State, Status, Verdict
 from fleet.frames import Origin
 from fleet.window import Window
 from twin_worker.history import History
@@ -40,6 +40,7 @@ class Twin:
     servos: ServoMap = field(default_factory=lambda: servo_map({}))
     axes: tuple[Axis, Axis] | None = None
     verdict: Verdict = field(default_factory=_unheard)
+    model: Model | None = None
     prediction: Prediction | None = None
     state: State = State.WAITING
     tries: int = 0
@@ -118,7 +119,7 @@ def _hear_status(twin: Twin, status: Status) -> None:
         return
     if status.clock_jumps != before.clock_jumps:
         twin.history.clear()
-        twin.wind.t = -np.inf
+        twin.wind.t = twin.wind_t = twin.identify_t = twin.score_t = -np.inf  # the new time may lie before
         _event(twin, status.t)
     elif status.mode != before.mode:
         _event(twin, status.t)

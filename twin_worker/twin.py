@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from fleet.contract import Alert, AlertKind, FleetRow, Link, Message
+from fleet.contract import Alert, AlertKind, FleetRow, Link, Message, State
 from fleet.frames import to_ned
 from twin_worker.foresee import foresee
 from twin_worker.horizon import AHEAD
@@ -49,8 +49,8 @@ def _watch_link(twin: Twin, now: float) -> list[Message]:
     lost = silent > LOST_S or (twin.status is not None and twin.status.link is Link.LOST and silent > 1.0)
     if lost == twin.lost:
         return []
-    twin.lost = lost
-    twin.predict_t = -np.inf
+    twin.lost, twin.predict_t = lost, -np.inf
+    twin.state = State.LINK_LOST if lost else State.WAITING if twin.axes is None else State.VERIFIED
     said = f"no sample for {silent:.1f} s; the twin flies on alone" if lost else "link back"
     sentence = f"{twin.name}: {said}"
     return [Alert(uav=twin.uav, t=now, kind=AlertKind.LINK_LOST, active=lost, sentence=sentence)]

@@ -1,19 +1,22 @@
 """The live driver: messages from the bus to the twins this worker holds, results back, one line per UAV."""
 
+import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from fleet.bus import Bus
 from fleet.codec import Stamp
-from fleet.contract import Array, FleetState, Message, Mission, Params, Prediction, Sample, Status
+from fleet.contract import Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, Status
 from twin_worker.twin import Twin, advance, fleet_row
 
+_log = logging.getLogger(__name__)
 _INBOX = 4096  # messages waiting per UAV; the oldest go first and are counted
 _SILENT_S = 1.0  # wall time without news after which data time runs on by the wall clock [s]
 _STATE_S = 1.0  # between fleet tables [s]
@@ -28,6 +31,7 @@ class Held:
     inbox: deque[Message] = field(default_factory=lambda: deque(maxlen=_INBOX))
     arrived: float = float("nan")  # wall time of the newest sample [s, monotonic]
     shed: int = 0
+    failed: str = ""  # what went wrong last, a defect of ours
 
 
 class Worker:
@@ -47,6 +51,7 @@ class Worker:
         for kind in (Sample, Status, Mission, Params):
             self.bus.subscribe(kind, lambda message, _: self._hear(message))
         self.bus.answer(Prediction, self._predictions)
+        self.bus.answer(Model, lambda uav, *_: self._stamped((h, h.twin.model) for h in self._asked(uav)))
         self.bus.answer(FleetState, lambda *_: [(self.state(), None)])
         for kind in (Status, Mission, Params):
             for message, _ in self.bus.ask(kind):
@@ -77,8 +82,12 @@ class Worker:
         for held in self.holding():
             messages = [held.inbox.popleft() for _ in range(len(held.inbox))]
             taken += len(messages)
-            for result in _advance_all(held, messages):
-                self.bus.publish(result, Stamp(held.epoch, self.bus.writer))
+            try:
+                for result in _advance_all(held, messages):
+                    self.bus.publish(result, Stamp(held.epoch, self.bus.writer))
+            except Exception as error:  # a defect met by one aircraft must not stop the others
+                held.failed = f"{held.twin.name}: found a defect ({error}), its results are missing; report it"
+                _log.exception(held.failed)
         return taken
 
     def state(self) -> FleetState:
@@ -86,8 +95,9 @@ class Worker:
         writer = f"{self.bus.writer:016x}"
         rows = [fleet_row(h.twin, data_time(h), worker=writer, epoch=h.epoch) for h in self.holding()]
         shed = sum(held.shed for held in self.holding())
-        sentence = self.sentence or (f"{shed} messages shed: too many UAVs for this worker" if shed else "")
-        return FleetState(t=time.time(), rows=tuple(rows), sentence=sentence)
+        said = [f"{shed} messages shed: too many UAVs for this worker"] if shed else []
+        said += [held.failed for held in self.holding() if held.failed]
+        return FleetState(t=time.time(), rows=tuple(rows), sentence=self.sentence or " ".join(said[:3]))
 
     def run(self, stop: threading.Event) -> None:
         """Turn until told to stop, publishing the fleet table once a second."""
@@ -102,10 +112,14 @@ class Worker:
 
     def _predictions(self, uav: int | None, asked: dict[str, str], _: bytes) -> Iterator[tuple[Prediction, Stamp]]:
         grid = wanted(asked)
-        for held in self.holding():
-            prediction = held.twin.prediction
-            if prediction is not None and uav in (None, held.twin.uav):
-                yield resample(prediction, grid), Stamp(held.epoch, self.bus.writer)
+        found = ((held, held.twin.prediction) for held in self._asked(uav))
+        return self._stamped((held, made and resample(made, grid)) for held, made in found)
+
+    def _asked(self, uav: int | None) -> list[Held]:
+        return [held for held in self.holding() if uav in (None, held.twin.uav)]
+
+    def _stamped(self, pairs: Iterable[tuple[Held, Any]]) -> Iterator[tuple[Any, Stamp]]:
+        return ((message, Stamp(held.epoch, self.bus.writer)) for held, message in pairs if message is not None)
 
 
 def data_time(held: Held) -> float:
@@ -142,7 +156,7 @@ def wanted(asked: dict[str, str]) -> np.ndarray | None:
         horizon, step = float(asked.get("horizon", 60.0)), float(asked.get("step", 1.0))
     except ValueError:
         raise ValueError(f"query: found {asked}, expected numbers, e.g. ?horizon=30;step=0.5; correct them") from None
-    if not (0 < horizon <= 60 and step > 0 and horizon / step <= 1000):
+    if not (0 < horizon <= 60 and 0 < step <= 60 and horizon / step <= 1000):
         raise ValueError(f"query: found horizon {horizon}, step {step}; ask for at most 60 s and 1,000 points")
     return np.arange(0.0, horizon + 1e-9, step)
 
