@@ -271,6 +271,10 @@ def endpoint(router: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
+def _family(router: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in endpoint(router)[0] else socket.AF_INET
+
+
 def connect(router: str = ROUTER) -> ZenohBus:
     """Join the bus through a router.
 
@@ -285,6 +289,14 @@ def connect(router: str = ROUTER) -> ZenohBus:
 
 
 def open_router(router: str = ROUTER) -> zenoh.Session:
-    """Be the router: a Zenoh session in router mode that listens at `router`; close it when done."""
-    endpoint(router)
+    """Be the router: a Zenoh session in router mode that listens at `router`; close it when done.
+
+    Raises:
+        ConnectionError: when `router` is not an address of this machine, or taken; Zenoh itself would try for ever.
+    """
+    try:
+        socket.create_server(endpoint(router), family=_family(router)).close()
+    except OSError as error:
+        reason = f"nobody answers and none can be opened here ({error.strerror or error})"
+        raise ConnectionError(f"router {router}: {reason}; start `zenohd` there or name another --router") from None
     return zenoh.open(_config("router", connect=[], listen=[router]))

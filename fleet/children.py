@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections import deque
 from contextlib import AbstractContextManager
 
@@ -17,6 +18,7 @@ class Children(AbstractContextManager):
     def __init__(self) -> None:
         self._running: dict[str, subprocess.Popen[str]] = {}
         self._words: dict[str, deque[str]] = {}
+        self._ears: dict[str, threading.Thread] = {}
 
     def start(self, name: str, module: str, *options: str) -> None:
         """Start `python -m module options…`; what it prints becomes its last words."""
@@ -32,7 +34,8 @@ class Children(AbstractContextManager):
         )
         self._running[name] = child
         self._words[name] = deque(maxlen=6)
-        threading.Thread(target=self._listen, args=(name, child), daemon=True).start()
+        self._ears[name] = threading.Thread(target=self._listen, args=(name, child), daemon=True)
+        self._ears[name].start()
 
     def _listen(self, name: str, child: subprocess.Popen[str]) -> None:
         assert child.stdout is not None
@@ -44,19 +47,31 @@ class Children(AbstractContextManager):
         """Give each child's last line."""
         return [words[-1] for words in self._words.values() if words]
 
-    def dead(self) -> list[str]:
-        """Say which children failed, and their last words; one that ended with 0 was done."""
-        ended = [(name, child.poll()) for name, child in self._running.items()]
-        return [f"{name} ended with {code}: {' | '.join(self._words[name])}" for name, code in ended if code]
+    def done(self) -> list[str]:
+        """Name the children that ended well."""
+        return [name for name, child in self._running.items() if child.poll() == 0]
+
+    def failed(self) -> list[tuple[int, str]]:
+        """Give exit code and sentence of the children that failed; a refusal (2) is the child's own sentence."""
+        found = []
+        for name, child in self._running.items():
+            if code := child.poll():
+                self._ears[name].join(timeout=1.0)  # its last words may still be on the way
+                words = self._words[name]
+                refused = code == 2 and words
+                died = f"{name}: found it ended with exit code {code}, expected it to run until stopped; "
+                found.append((code, words[-1] if refused else died + f"its last words: {' | '.join(words) or 'none'}"))
+        return found
 
     def stop(self) -> None:
         """Ask all to stop, newest first, then insist."""
         for child in reversed(self._running.values()):
             if child.poll() is None:
                 child.send_signal(signal.SIGTERM)
+        patience = time.monotonic() + _PATIENCE_S
         for child in self._running.values():
             try:
-                child.wait(timeout=_PATIENCE_S)
+                child.wait(timeout=max(patience - time.monotonic(), 0.0))
             except subprocess.TimeoutExpired:
                 child.kill()
                 child.wait()

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import socket
 import sys
 import threading
 import time
@@ -16,19 +17,23 @@ from fleet.children import Children
 from fleet.cli import stop_on_signal
 from fleet.commands.status import as_objects, fleet_rows, table
 from fleet.contract import FleetRow, FleetState, State
+from fleet.telemetry.recordings import SUFFIXES
 
 EXAMPLES = """
   fleet up --uavs 8
   fleet up --link udpin:0.0.0.0:14550
   fleet up --replay flight.tlog.xz --speed 4
   fleet up --uavs 8 --for 240 --no-viewer --summary summary.json
+  fleet up --router tcp/127.0.0.1:7448 --mavlink 127.0.0.1:14551 --port 8081      a second fleet beside the first
 """
 _MAVLINK = "127.0.0.1:14550"
+_PLAIN_S = 10.0  # between progress lines where the output is no terminal [s]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--uavs", type=int, default=8, metavar="N", help="simulated aircraft, ids 0 to N-1 (8)")
+    parser.add_argument("--mavlink", default=_MAVLINK, metavar="HOST:PORT", help=f"where they send UDP ({_MAVLINK})")
     parser.add_argument("--link", action="append", default=[], help="real aircraft instead, e.g. udpin:0.0.0.0:14550")
     parser.add_argument("--replay", action="append", default=[], metavar="FILE", help="recordings instead")
     parser.add_argument("--speed", default="1", help="replay speed, a number or max (1)")
@@ -41,9 +46,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Start everything, show it, stop it; exit code 1 where a part died on its own."""
-    if not 1 <= args.uavs <= 250:
-        raise ValueError(f"--uavs: found {args.uavs}, expected 1 to 250 aircraft; start several fleets for more")
+    """Start everything, show it, stop it; exit code 1 where a part died, 2 where it refused what it was told."""
+    _check(args)
     stop = stop_on_signal()
     router = None if reachable(args.router) else open_router(args.router)
     try:
@@ -55,6 +59,38 @@ def run(args: argparse.Namespace) -> int:
             router.close()
 
 
+def _check(args: argparse.Namespace) -> None:
+    """Refuse at once what could only fail later.
+
+    Raises:
+        ValueError: when an option makes no sense; the sentence says which.
+    """
+    if not 1 <= args.uavs <= 250:
+        raise ValueError(f"--uavs: found {args.uavs}, expected 1 to 250 aircraft; start several fleets for more")
+    if not 0 <= args.seconds < float("inf"):
+        raise ValueError(f"--for: found {args.seconds} s, expected 0 (until Ctrl-C) or more; change it")
+    for name in args.replay:
+        if not (Path(name).is_file() and name.endswith(SUFFIXES)):
+            kinds = " or ".join(SUFFIXES)
+            raise ValueError(f"--replay: found no recording {name!r}, expected a {kinds} file; check the path")
+    if args.summary and not args.summary.absolute().parent.is_dir():
+        raise ValueError(f"--summary: found no folder {str(args.summary.parent)!r}, expected one; make it first")
+    if not (args.link or args.replay):
+        _check_free(args.mavlink)
+
+
+def _check_free(mavlink: str) -> None:
+    host, _, port = mavlink.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
+        raise ValueError(f"--mavlink: found {mavlink!r}, expected HOST:PORT such as {_MAVLINK}; correct it")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+        try:
+            trial.bind((host, int(port)))
+        except OSError as error:
+            reason = f"UDP {mavlink} not free ({error.strerror or error}), expected a port for the simulated aircraft"
+            raise ValueError(f"--mavlink: found {reason}; is a fleet already up? name another") from None
+
+
 def _start(children: Children, args: argparse.Namespace) -> None:
     router = ["--router", args.router]
     children.start("twin worker", "twin_worker", "--uavs", "0-249", *router)
@@ -63,8 +99,8 @@ def _start(children: Children, args: argparse.Namespace) -> None:
     if links:
         children.start("gateway", "gateway", *links, *router)
     else:
-        children.start("gateway", "gateway", f"--link=udpin:{_MAVLINK}", "--offset=-1", *router)
-        aircraft = ["--uavs", f"0-{args.uavs - 1}", "--to", _MAVLINK, "--seed", str(args.seed)]
+        children.start("gateway", "gateway", f"--link=udpin:{args.mavlink}", "--offset=-1", *router)
+        aircraft = ["--uavs", f"0-{args.uavs - 1}", "--to", args.mavlink, "--seed", str(args.seed)]
         children.start("aircraft", "fleet.cli", "fly", *aircraft)
     if not args.no_viewer:
         children.start("viewer", "viewer", "--port", str(args.port), *router)
@@ -76,30 +112,58 @@ def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threadi
     bus.subscribe(FleetState, lambda state, _: sentences.update(worker=state.sentence))
     rows: list[FleetRow] = []
     first = None
-    console = Console(stderr=True)
-    with Live(console=console, refresh_per_second=4, transient=False) as live:
+    show = _Show(Console(stderr=True))
+    with show.live:
         while not stop.wait(1.0):
             rows = fleet_rows(bus) or rows
             if first is None and any(row.sample_age_s is not None for row in rows):
                 first = time.monotonic()
             flown = 0.0 if first is None else time.monotonic() - first
-            live.update(_picture(rows, children, sentences.get("worker", ""), flown, args))
-            if children.dead() or (args.seconds and flown >= args.seconds):
+            show.draw(_lines(rows, children, sentences.get("worker", ""), flown, args), rows)
+            if children.failed() or (args.seconds and flown >= args.seconds):
                 break
-    died = "; ".join(children.dead())
+    failed = children.failed()
     if args.summary:
         args.summary.write_text(json.dumps(as_objects(rows), indent=1) + "\n")
-    if died:
-        print(f"fleet up: {died}; see its words above", file=sys.stderr)
-    return 1 if died else 0
+    for _, sentence in failed:
+        print(f"fleet up: {sentence}", file=sys.stderr)
+    if stop.is_set():
+        print("fleet up: stopping", file=sys.stderr)
+    return (2 if all(code == 2 for code, _ in failed) else 1) if failed else 0
 
 
-def _picture(rows: list[FleetRow], children: Children, sentence: str, flown: float, args: argparse.Namespace) -> Group:
+class _Show:
+    """The display: a live table on a terminal, elsewhere a line whenever there is news."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.live = Live(console=console, refresh_per_second=4, transient=not console.is_terminal)
+        self._said: set[str] = set()
+        self._due = 0.0
+
+    def draw(self, lines: list[str], rows: list[FleetRow]) -> None:
+        if self.console.is_terminal:
+            self.live.update(Group(Text("\n".join(lines)), table(rows[:40])))
+            return
+        news = [line for line in lines[1:] if line not in self._said]
+        if time.monotonic() >= self._due:
+            self._due = time.monotonic() + _PLAIN_S
+            news.insert(0, lines[0])
+        self._said.update(news)
+        for line in news:
+            print(line, file=sys.stderr, flush=True)
+
+
+def _lines(
+    rows: list[FleetRow], children: Children, sentence: str, flown: float, args: argparse.Namespace
+) -> list[str]:
     count = {state: sum(row.state is state for row in rows) for state in State}
     said = ", ".join(f"{n} {state.value}" for state, n in count.items() if n) or "waiting for the first sample"
     lines = [f"fleet up · {len(rows)} UAVs · {flown:.0f} s since the first sample · {said}"]
     lines += [sentence] if sentence else []
     lines += children.words()
+    if args.replay and "gateway" in children.done():
+        lines.append("the recording has ended; the twins fly on alone until Ctrl-C")
     if not args.no_viewer:
         lines.append(f"viewer: http://127.0.0.1:{args.port}   (Ctrl-C stops everything)")
-    return Group(Text("\n".join(lines)), table(rows[:40]))
+    return lines
