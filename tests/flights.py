@@ -4,9 +4,11 @@ from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
-from fleet.contract import COLUMNS, Array, Item, Message, Rows, Sample
+from fleet.codec import decode, encode
+from fleet.contract import COLUMNS, Array, Item, Message, Prediction, Rows, Sample
 from fleet.frames import Origin, to_geodetic, wrap
 from fleet.pretend.drive import to_tlog
 from fleet.pretend.uav import PretendUav
@@ -14,7 +16,9 @@ from fleet.telemetry.recordings import replay_messages
 from fleet.window import Window
 from twin_worker.history import History
 from twin_worker.identify import AXES, Axis
+from twin_worker.offline import run
 from twin_worker.prior import INPUTS, STATES, prior
+from twin_worker.twin import Twin, advance
 
 T0 = 1_700_000_000.0
 DT = 0.04
@@ -33,7 +37,7 @@ def sample(uav: int = 1, t: float = T0, **kinds) -> Sample:
     return Sample(uav=uav, t=t, **{name: rows(*pair) for name, pair in kinds.items()})
 
 
-def turn(seconds: float, rate: float = 0.2, Va: float = 20.0, wind=(0.0, 0.0), psi: float = 2.0, bank: float = 0.3):
+def turn(seconds: float, *, rate: float = 0.2, Va: float = 20.0, wind=(0.0, 0.0), psi: float = 2.0, bank: float = 0.3):
     """Rows of a level turn at a constant rate: everything about it is known. Kind -> (t, x)."""
     t = {name: T0 + np.arange(0, seconds, 1 / hz) for name, hz in HZ.items()}
 
@@ -151,6 +155,55 @@ def pretend(folder: Path, seconds: int = 100) -> tuple[Message, ...]:
     path = folder / "flight.tlog"
     to_tlog(path, [PretendUav(0, 3, wind=3.0, turbulence=2)], seconds=seconds, loss=0.01, seed=3)
     return tuple(replay_messages(path))
+
+
+@lru_cache(maxsize=1)
+def learnt(folder: Path) -> tuple[Twin, list[Message]]:
+    """The twin at the end of that flight, and everything it published."""
+    twins: dict[int, Twin] = {}
+    results = list(run(pretend(folder), twins))
+    assert list(twins) == [1]
+    return twins[1], results
+
+
+def predictions(results: Iterable[Message]) -> list[Prediction]:
+    return [r for r in results if isinstance(r, Prediction)]
+
+
+def published(results: Iterable[Message]) -> list[Message]:
+    """What reaches the bus: decoded from its bytes, every number finite (`held` is nan before any)."""
+    out = []
+    for result in results:
+        back = decode(type(result), encode(result))
+        assert numbers(msgspec.to_builtins(result, builtin_types=(bytes,))), result
+        out.append(back)
+    return out
+
+
+def numbers(thing: object) -> bool:
+    """Tell whether every number is finite."""
+    if isinstance(thing, dict):
+        if set(thing) == {"dtype", "shape", "data"}:
+            return bool(np.isfinite(Array(**thing).numpy()).all())
+        return all(numbers(value) for name, value in thing.items() if name != "held")
+    if isinstance(thing, list | tuple):
+        return all(map(numbers, thing))
+    return not isinstance(thing, float) or np.isfinite(thing)
+
+
+def drive(twin: Twin, heard: Iterable[Message]) -> list[Message]:
+    return published(result for m in heard for result in advance(twin, (m,), max(m.t, twin.history.newest)))
+
+
+def shifted(heard: Iterable[Message], by: float, seconds: float) -> list[Message]:
+    """The first seconds of the flight's samples, as if flown later."""
+    out: list[Message] = []
+    for m in heard:
+        if isinstance(m, Sample) and m.t < T0 + seconds:
+            rows = {n: getattr(m, n) for n in m.__struct_fields__ if n not in ("uav", "t")}
+            moved = {n: r and msgspec.structs.replace(r, t=Array.of(r.t.numpy() + by, "<f8")) for n, r in rows.items()}
+            out.append(Sample(uav=m.uav, t=m.t + by, **moved))
+    return out
 
 
 def columns(name: str) -> int:

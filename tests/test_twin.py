@@ -1,0 +1,171 @@
+"""The loop of one aircraft on a pretend flight: what it learns, says, forgets, and never publishes."""
+
+import copy
+
+import flights as f
+import msgspec
+import numpy as np
+import pytest
+from flights import drive, predictions, published, shifted
+
+from fleet.codec import encode
+from fleet.contract import (
+    Message,
+    Mission,
+    Model,
+    Outcome,
+    State,
+    Status,
+)
+from twin_worker.offline import run
+from twin_worker.twin import Twin, advance, fleet_row
+
+FLOWN_S = 100.0
+
+
+@pytest.fixture(scope="session")
+def heard(tmp_path_factory) -> tuple[Message, ...]:
+    return f.pretend(tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture(scope="session")
+def flown(tmp_path_factory) -> tuple[Twin, list[Message]]:
+    """The twin at the end of the flight, and everything it published."""
+    return f.learnt(tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture
+def twin(flown) -> Twin:
+    return copy.deepcopy(flown[0])
+
+
+def status(twin: Twin, **changes) -> Status:
+    assert twin.status is not None
+    return msgspec.structs.replace(twin.status, t=twin.history.newest, **changes)
+
+
+# --- the whole flight ------------------------------------------------------------------------------------------------
+
+
+def test_it_is_verified_within_the_flight_and_at_what_horizon(flown):
+    verdicts = [r.verdict for r in flown[1] if isinstance(r, Model)]
+    good = [v for v in verdicts if v.outcome is Outcome.VERIFIED]
+    assert good and good[-1].horizon_s >= 4.0
+    assert all(np.mean(list(v.fit.values())) > max(0.0, np.mean(list(v.fit_hold.values()))) for v in good)
+    assert all(v.sentence.startswith("uav-1: ") for v in verdicts)
+
+
+def test_everything_it_publishes_is_encodable_and_finite(flown):
+    assert len(published(flown[1])) == len(flown[1]) > 80
+
+
+def test_before_a_model_it_guesses_by_turn_rate_and_says_why(flown):
+    early = [p for p in predictions(flown[1]) if p.t < f.T0 + 25.0]
+    assert early and all(p.method == "imm" and p.state is State.IDENTIFYING for p in early)
+    assert all("30 s are needed" in p.sentence for p in early)
+
+
+def test_in_auto_it_predicts_on_the_route(flown):
+    late = [p for p in predictions(flown[1]) if p.t > f.T0 + FLOWN_S - 15.0]
+    on_route = [p for p in late if p.method == "paper"]
+    assert len(on_route) >= 0.8 * len(late) > 5
+    assert all(p.state is State.PREDICTING and p.seq >= 1 and "L1" in p.law for p in on_route)
+    assert all(0 <= p.horizon_s <= 60 for p in late)
+    assert any(p.horizon_s > 3 for p in on_route)
+
+
+def test_the_prediction_comes_true_for_a_few_seconds(flown):
+    twin, results = flown
+    assert twin.origin is not None
+    from fleet.frames import to_ned
+
+    t, position = twin.history.rows("position")
+    where = to_ned(twin.origin, *position.T)
+    miss = []
+    for p in predictions(results):
+        if p.method == "paper" and p.t + 8.0 < t[-1]:
+            flew = [np.interp(p.t + 8.0, t, c) for c in where.T]
+            miss.append(np.linalg.norm(p.path.numpy()[8] - flew))
+    assert len(miss) > 5 and np.median(miss) < 40.0  # of some 190 m
+
+
+def test_one_flight_gives_one_answer(heard, flown):
+    again = list(run(heard[:600], {}))
+    assert [encode(r) for r in again] == [encode(r) for r in flown[1][: len(again)]]
+
+
+def test_the_row_of_the_fleet_table(twin):
+    row = fleet_row(twin, twin.history.newest + 0.5, worker="ff", epoch=3)
+    assert (row.uav, row.state, row.worker, row.epoch) == (1, twin.state, "ff", 3)
+    assert row.sample_age_s == pytest.approx(0.5)
+    assert row.prediction_age_s is not None and row.prediction_age_s >= 0.5
+    empty = fleet_row(Twin(9), 5.0)
+    assert (empty.sample_age_s, empty.prediction_age_s, empty.t10_s) == (None, None, None)
+
+
+# --- starved ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["servo", "velocity", "attitude"])
+def test_starved_names_what_is_missing(kind):
+    twin = Twin(4)
+    lone = f.messages({k: v for k, v in f.turn(12.0).items() if k != kind}, uav=4)
+    results = drive(twin, lone)
+    assert not [r for r in results if isinstance(r, Model)]
+    assert twin.verdict.outcome is Outcome.STARVED and twin.state is State.WAITING
+    assert f"no {kind} rows yet" in twin.verdict.sentence and twin.verdict.sentence.startswith("uav-4: ")
+
+
+def test_nothing_is_said_before_a_position():
+    twin = Twin(4)
+    assert drive(twin, f.messages({k: v for k, v in f.turn(8.0).items() if k != "position"}, uav=4)) == []
+    assert twin.origin is None
+
+
+def test_standing_on_the_ground_is_not_flown():
+    twin = Twin(4)
+    drive(twin, f.messages(f.turn(45.0, Va=0.1, rate=0.0, bank=0.0), uav=4))
+    assert twin.axes is None and twin.verdict.outcome is Outcome.STARVED
+
+
+# --- events ----------------------------------------------------------------------------------------------------------
+
+
+def test_another_mode_invalidates_at_once(twin, heard):
+    now = twin.history.newest
+    assert twin.record.waiting
+    results = drive(twin, [status(twin, mode="LOITER")])
+    (said,) = predictions(results)
+    assert said.method == "imm" and "LOITER follows no mission" in said.sentence and said.seq == -1
+    assert twin.since == now and twin.state is State.VERIFIED
+    assert all(made.t >= now - 1.0 for made in twin.record.waiting)  # what was predicted in AUTO is not scored
+    (back,) = predictions(drive(twin, [status(twin, mode="AUTO")]))
+    assert back.method == "imm" and "5 s are needed" in back.sentence
+
+
+def test_an_empty_mission_and_a_new_one(twin):
+    t = twin.history.newest
+    (gone,) = predictions(drive(twin, [Mission(uav=1, t=t)]))
+    assert gone.method == "imm" and "no mission on board" in gone.sentence
+    assert twin.since == t
+
+
+def test_the_same_mission_and_parameters_again_change_nothing(twin):
+    since, waiting = twin.since, len(twin.record.waiting)
+    drive(twin, [msgspec.structs.replace(twin.mission, seq=5), twin.params])
+    assert (twin.since, len(twin.record.waiting)) == (since, waiting)
+    more = twin.params.values | {"NAVL1_PERIOD": 31.0}
+    drive(twin, [msgspec.structs.replace(twin.params, values=more, t=twin.history.newest)])
+    assert twin.since == twin.history.newest
+
+
+def test_a_jump_of_the_clock_forgets_and_learns_anew(twin, heard):
+    end = twin.history.newest
+    drive(twin, [status(twin, clock_jumps=1)])
+    assert twin.history.newest == -np.inf and not twin.record.waiting
+    for by in (500.0, -500.0):  # fleet time itself may go either way
+        anew = copy.deepcopy(twin)
+        later = shifted(heard, end + by - f.T0, 40.0)
+        results = [r for m in later for r in advance(anew, (m,), m.t)]
+        assert predictions(results)[0].t < end + by + 5.0
+        assert [r for r in results if isinstance(r, Model)], f"no model after a jump of {by} s"

@@ -1,0 +1,140 @@
+"""What a twin does when the link goes, and with everything nobody should send: it says so, and nothing breaks."""
+
+import copy
+
+import flights as f
+import msgspec
+import numpy as np
+import pytest
+from flights import HERE, drive, item, predictions, published, shifted
+
+from fleet.contract import Alert, AlertKind, Link, Message, Mission, Sample, State, Status
+from twin_worker.twin import Twin, advance, fleet_row
+
+
+@pytest.fixture(scope="session")
+def heard(tmp_path_factory) -> tuple[Message, ...]:
+    return f.pretend(tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture(scope="session")
+def flown(tmp_path_factory) -> tuple[Twin, list[Message]]:
+    """The twin at the end of the flight, and everything it published."""
+    return f.learnt(tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture
+def twin(flown) -> Twin:
+    return copy.deepcopy(flown[0])
+
+
+def status(twin: Twin, **changes) -> Status:
+    assert twin.status is not None
+    return msgspec.structs.replace(twin.status, t=twin.history.newest, **changes)
+
+
+# --- the link --------------------------------------------------------------------------------------------------------
+
+
+def test_a_lost_link_coasts_says_its_age_and_comes_back(twin, heard):
+    end = twin.history.newest
+    results = []
+    for k in range(1, 16):
+        results += published(advance(twin, (), end + k))
+    (alert,) = [r for r in results if isinstance(r, Alert)]
+    assert alert.kind is AlertKind.LINK_LOST and alert.active and alert.sentence.startswith("uav-1: no sample for")
+    coasting = [p for p in predictions(results) if p.coast_s]
+    assert len(coasting) >= 10 and all(p.state is State.LINK_LOST for p in coasting)
+    ages = [p.coast_s for p in coasting]
+    assert ages == sorted(ages) and ages[-1] == pytest.approx(15.0, abs=1.5)
+    assert f"link lost {ages[-1]:.0f} s ago" in coasting[-1].sentence
+    assert coasting[-1].t == pytest.approx(end + 15.0, abs=1.5)  # it flies on
+    tubes = [p.tube.numpy() for p in coasting if p.method == coasting[-1].method]
+    assert (tubes[-1] >= tubes[0]).all() and (tubes[-1][0] > tubes[0][0]).any()
+    assert fleet_row(twin, end + 15.0).state is State.LINK_LOST
+
+    results = drive(twin, shifted(heard, end + 15.0 - f.T0, 3.0))
+    (alert,) = [r for r in results if isinstance(r, Alert)]
+    assert not alert.active and "link back" in alert.sentence
+    assert predictions(results)[-1].coast_s == 0.0 and twin.state is not State.LINK_LOST
+
+
+def test_the_gateway_may_know_first(twin):
+    end = twin.history.newest
+    results = list(advance(twin, [status(twin, link=Link.LOST)], end + 1.5))
+    assert [r.active for r in results if isinstance(r, Alert)] == [True]
+
+
+def test_a_link_lost_before_anything_was_learnt_is_lost_all_the_same():
+    twin = Twin(4)
+    drive(twin, f.messages(f.turn(1.5), uav=4))
+    advance(twin, (), twin.history.newest + 10.0)
+    assert fleet_row(twin, 0.0).state is State.LINK_LOST
+
+
+def test_a_link_lost_for_a_day_is_not_flown_for_a_day(twin):
+    end = twin.history.newest
+    results = published(advance(twin, (), end + 86_400.0))
+    assert not predictions(results) and [r for r in results if isinstance(r, Alert)]
+    row = fleet_row(twin, end + 86_400.0)
+    assert row.state is State.LINK_LOST and row.prediction_age_s > 80_000
+
+
+# --- hostile ---------------------------------------------------------------------------------------------------------
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -1e300, 1e300, 0.0])
+def test_absurd_parameters_never_raise(twin, value):
+    assert twin.params is not None
+    absurd = msgspec.structs.replace(twin.params, values=dict.fromkeys(twin.params.values, value))
+    twin.since = -np.inf
+    twin.params = absurd  # as if it had come long ago
+    published(advance(twin, [absurd], twin.history.newest))
+    twin.since = -np.inf
+    published(advance(twin, (), twin.history.newest + 4.0))
+
+
+@pytest.mark.parametrize(
+    "items",
+    [
+        (item(0),),
+        (item(0), item(1, 177, param1=1.0, param2=-1.0)),
+        (item(0), item(1, 177, param1=2.0, param2=-1.0), item(2, 177, param1=1.0, param2=-1.0)),
+        (item(0), item(1, north=100.0), item(2, north=100.0), item(3, 177, param1=1.0, param2=-1.0)),
+        (item(0), item(1, param1=NAN, param2=INF, param3=NAN, param4=NAN, alt_m=NAN)),
+        (item(0), item(1, 16, alt_m=1e300), item(2, 22), item(3, 21)),
+    ],
+)
+def test_hostile_missions_never_raise(twin, items):
+    drive(twin, [Mission(uav=1, t=twin.history.newest, items=items)])
+    twin.since = -np.inf
+    results = published(advance(twin, (), twin.history.newest + 1.5))
+    assert predictions(results)
+    assert all(p.method == "paper" or p.sentence for p in predictions(results))
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF, 1e300, -1e38, 1e9, 9e4, 0.0])
+@pytest.mark.parametrize("kind", ["attitude", "velocity", "position", "servo", "air", "command", "leg"])
+def test_hostile_rows_never_raise(twin, kind, value):
+    laid = f.turn(3.0)
+    wide = len(laid[kind][1][0])
+    end = twin.history.newest
+    laid = {k: (t - f.T0 + end, x) for k, (t, x) in laid.items()}
+    laid[kind] = (laid[kind][0], np.full((len(laid[kind][0]), wide), value))
+    batch = [f.sample(1, end + 3.0, **laid)]
+    published(advance(twin, batch, end + 3.0))
+    published(advance(twin, (), end + 8.0))
+    fresh = Twin(1)
+    published(advance(fresh, batch, end + 3.0))
+    assert fresh.origin is None or abs(fresh.origin.lat_e7) <= 9e8
+
+
+def test_a_position_that_lies_is_no_origin():
+    for x in (f.rows([f.T0], [[NAN, 1.0, 2.0]]), f.rows([f.T0], [[1.0]]), f.rows(np.empty(0), np.empty((0, 3)))):
+        twin = Twin(1)
+        advance(twin, [Sample(uav=1, t=f.T0, position=x)], f.T0)
+        assert twin.origin is None
+    advance(twin, [f.sample(1, position=([f.T0], [list(HERE)]))], f.T0)
+    assert twin.origin == HERE

@@ -1,0 +1,235 @@
+"""The live driver on a bus in memory: its range, its answers, its table, and peace between the aircraft."""
+
+import flights as f
+import msgspec
+import numpy as np
+import pytest
+from flights import item
+
+from fleet.bus import MemoryBus
+from fleet.codec import Stamp
+from fleet.contract import FleetState, Message, Mission, Model, Params, Prediction, Sample, State, Status
+from twin_worker import worker as live
+from twin_worker.worker import Worker, resample, wanted
+
+NAN = float("nan")
+
+
+class Bus(MemoryBus):
+    """A bus in memory that also carries what a query asks for."""
+
+    def query(self, kind: type, uav: int | None = None, **asked: str) -> list:
+        return [answer for reply in self._reply[kind] for answer in reply(uav, asked, b"")]
+
+
+@pytest.fixture
+def bus() -> Bus:
+    return Bus()
+
+
+@pytest.fixture
+def clock(monkeypatch) -> list[float]:
+    """The wall clock, which stands still until a test moves it."""
+    now = [1000.0]
+    monkeypatch.setattr(live.time, "monotonic", lambda: now[0])
+    return now
+
+
+@pytest.fixture
+def worker(bus, clock) -> Worker:
+    made = Worker(bus, range(2, 5), omega=0.0)
+    made.listen()
+    return made
+
+
+@pytest.fixture(scope="session")
+def heard(tmp_path_factory) -> tuple[Message, ...]:
+    return f.pretend(tmp_path_factory.getbasetemp())
+
+
+def told(bus: Bus, kind: type) -> list:
+    """Collect what is published from now on: (message, stamp)."""
+    found: list = []
+    bus.subscribe(kind, lambda message, stamp: found.append((message, stamp)))
+    return found
+
+
+def fly(bus: Bus, uav: int, seconds: float = 6.0) -> None:
+    """Let an aircraft circle."""
+    for message in f.messages(f.turn(seconds), uav=uav):
+        bus.publish(message)
+
+
+def test_it_holds_its_range_and_nothing_else(bus, worker):
+    for uav in (1, 2, 4, 5, 900):
+        fly(bus, uav, 3.0)
+    worker.turn()
+    assert [held.twin.uav for held in worker.holding()] == [2, 4]
+    assert [row.uav for row in worker.state().rows] == [2, 4]
+
+
+def test_a_recorded_flight_is_learnt_live(bus, worker, heard):
+    models, made = told(bus, Model), told(bus, Prediction)
+    for message in heard:
+        bus.publish(msgspec.structs.replace(message, uav=3))
+    assert worker.turn() == len(heard)
+    assert "verified" in {m.verdict.outcome for m, _ in models}
+    assert any(p.method == "paper" for p, _ in made)
+    (row,) = worker.state().rows
+    assert (row.uav, row.state) == (3, State.PREDICTING)
+    assert row.worker == f"{bus.writer:016x}" and row.epoch > 1.6e12
+    assert row.fit and row.verdict.startswith("uav-3: ")
+    assert row.sample_age_s == pytest.approx(0.0)
+
+
+def test_results_carry_the_claim(bus, worker):
+    made = told(bus, Prediction)
+    fly(bus, 2)
+    worker.turn()
+    (held,) = worker.holding()
+    assert made and {stamp for _, stamp in made} == {Stamp(held.epoch, bus.writer)}
+
+
+def test_wildcard_queries_are_answered_with_stamps(bus, worker):
+    assert bus.ask(Prediction) == []
+    for uav in (2, 3, 4):
+        fly(bus, uav)
+    worker.turn()
+    found = bus.ask(Prediction)
+    assert [p.uav for p, _ in found] == [2, 3, 4]
+    assert all(stamp is not None and stamp.writer == bus.writer for _, stamp in found)
+    assert [p.uav for p, _ in bus.ask(Prediction, 3)] == [3]
+    assert bus.ask(Prediction, 9) == []
+    ((table, _),) = bus.ask(FleetState)
+    assert [row.uav for row in table.rows] == [2, 3, 4]
+
+
+def test_a_query_chooses_horizon_and_step(bus, worker):
+    fly(bus, 2)
+    worker.turn()
+    ((whole, _),) = bus.query(Prediction)
+    ((asked, _),) = bus.query(Prediction, horizon="30", step="0.5")
+    assert np.array_equal(asked.ahead.numpy(), np.arange(0, 30.25, 0.5))
+    assert asked.path.shape == asked.tube.shape == (61, 3)
+    assert np.allclose(asked.path.numpy()[::2], whole.path.numpy()[:31])
+    assert np.allclose(asked.path.numpy()[1], whole.path.numpy()[:2].mean(axis=0))
+    assert (asked.t, asked.horizon_s) == (whole.t, whole.horizon_s)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"horizon": "soon"},
+        {"horizon": "nan"},
+        {"horizon": "inf"},
+        {"horizon": "-1"},
+        {"horizon": "0"},
+        {"horizon": "61"},
+        {"step": "0"},
+        {"step": "-0.5"},
+        {"step": "nan"},
+        {"step": "inf"},
+        {"step": "1e-9"},
+        {"step": "1e-320"},
+        {"step": ""},
+    ],
+)
+def test_absurd_queries_are_refused_with_a_sentence(bus, worker, asked):
+    with pytest.raises(ValueError, match=r"query: found .*;"):
+        bus.query(Prediction, **asked)
+
+
+def test_what_a_query_may_ask():
+    assert wanted({}) is None and wanted({"colour": "red"}) is None
+    assert wanted({"horizon": "2"}).tolist() == [0.0, 1.0, 2.0]
+    assert len(wanted({"step": "0.06"})) == 1001
+    assert len(wanted({"horizon": "60", "step": "60"})) == 2
+
+
+def test_resampling_nothing_gives_the_whole(bus, worker):
+    fly(bus, 2)
+    worker.turn()
+    ((whole, _),) = bus.query(Prediction)
+    assert resample(whole, None) is whole
+
+
+def test_it_asks_for_what_was_said_before_it_came(bus):
+    mission = Mission(uav=3, t=f.T0, items=(item(0), item(1, north=100.0)), complete=True)
+    for message in (mission, Params(uav=3, t=f.T0, values={"A": 1.0}), Status(uav=3, t=f.T0, mode="AUTO")):
+        bus.answer(type(message), lambda uav, asked, payload, message=message: [(message, None)])
+    worker = Worker(bus, range(2, 5), omega=0.0)
+    worker.listen()
+    worker.turn()
+    (held,) = worker.holding()
+    assert held.twin.mission == mission and held.twin.params.values == {"A": 1.0} and held.twin.status.mode == "AUTO"
+
+
+GARBAGE = (
+    Sample(uav=2, t=f.T0, position=f.rows([f.T0], [[NAN, NAN, NAN]])),
+    Sample(uav=2, t=f.T0, position=f.rows([f.T0], [[1.0, 2.0]])),
+    Sample(uav=2, t=f.T0, position=f.rows(np.empty(0), np.empty((0, 3)))),
+    Sample(uav=2, t=NAN, attitude=f.rows([NAN], [[NAN] * 6])),
+    Sample(uav=2, t=1e300, air=f.rows([1e300], [[1e300] * 3])),
+    Params(uav=2, t=NAN, values={"SERVO1_FUNCTION": NAN, "SERVO2_MIN": float("inf"), "NAVL1_PERIOD": NAN}),
+    Mission(uav=2, t=NAN, items=(item(0), item(1, 177, param1=NAN, param2=NAN), item(1, alt_m=NAN)), seq=-7),
+    Status(uav=2, t=NAN, mode="\0", clock_jumps=-1, rates_hz={"": NAN}),
+)
+
+
+def test_garbage_of_one_does_not_stop_the_others(bus, worker):
+    made = told(bus, Prediction)
+    for message in GARBAGE:
+        bus.publish(message)
+        fly(bus, 3, 3.0)
+        worker.turn()
+        fly(bus, 2, 3.0)
+        worker.turn()
+    assert 3 in {p.uav for p, _ in made}
+    assert [row.uav for row in worker.state().rows] == [2, 3]
+    assert worker.state().sentence == ""  # nothing even failed
+
+
+def test_a_failure_of_one_is_counted_said_and_stays_its_own(bus, worker, monkeypatch):
+    advance = live.advance
+
+    def fragile(twin, messages, now):
+        if twin.uav == 2:
+            raise RuntimeError("a defect")
+        return advance(twin, messages, now)
+
+    monkeypatch.setattr(live, "advance", fragile)
+    made = told(bus, Prediction)
+    for uav in (2, 3):
+        fly(bus, uav)
+    worker.turn()
+    assert {p.uav for p, _ in made} == {3}
+    assert "uav-2" in worker.state().sentence and "a defect" in worker.state().sentence
+    monkeypatch.setattr(live, "advance", advance)
+    fly(bus, 2, 8.0)
+    worker.turn()
+    assert {p.uav for p, _ in made} == {2, 3}  # and it goes on with the next message
+
+
+def test_a_flood_sheds_the_oldest_and_says_so(bus, worker):
+    status = Status(uav=2, t=f.T0)
+    for _ in range(live._INBOX + 7):
+        bus.publish(status)
+    assert worker.turn() == live._INBOX
+    assert "7 messages shed" in worker.state().sentence
+
+
+def test_a_silent_aircraft_ages_by_the_wall_clock(bus, worker, clock):
+    made = told(bus, Prediction)
+    fly(bus, 2)
+    worker.turn()
+    clock[0] += 12.0
+    worker.turn()
+    assert made[-1][0].state is State.LINK_LOST and made[-1][0].coast_s == pytest.approx(12.0, abs=0.5)
+    (row,) = worker.state().rows
+    assert row.sample_age_s == pytest.approx(12.0, abs=0.5) and row.state is State.LINK_LOST
+
+
+def test_garbled_bytes_on_the_bus_are_counted(bus, worker):
+    bus.deliver(Sample, b"\xc1 no msgpack", "application/msgpack;parauav.sample.1")
+    bus.deliver(Sample, b"\x80", "application/msgpack;parauav.sample.99")
+    assert bus.bad == 2 and worker.turn() == 0
