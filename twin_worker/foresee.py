@@ -6,7 +6,7 @@ import numpy as np
 from fleet.autopilots import arduplane
 from fleet.contract import Array, Message, Prediction, State
 from fleet.window import Window
-from twin_worker.horizon import AHEAD, LIMIT, QUANTILE, Made, path_length
+from twin_worker.horizon import AHEAD, QUANTILE, Made
 from twin_worker.imm import STEP, imm
 from twin_worker.memory import Twin
 from twin_worker.predict import fly_ahead
@@ -30,7 +30,7 @@ def foresee(twin: Twin, now: float) -> list[Message]:
     if path is None or not np.isfinite(path).all():
         return []
     twin.state = _state(twin, method)
-    prediction = _trusted(twin, path, ahead, window, method)
+    prediction = _trusted(twin, path, ahead, t0, method)
     said = " ".join(part for part in (f"link lost {coast:.0f} s ago" if twin.lost else "", sentence) if part)
     law = arduplane.LAW if method == "paper" else "none: turn rate only"
     t = t0 + float(ahead[0])
@@ -68,21 +68,15 @@ def _state(twin: Twin, method: str) -> State:
     return State.IDENTIFYING if twin.axes is None else State.VERIFIED
 
 
-def _trusted(twin: Twin, path: np.ndarray, ahead: np.ndarray, window: Window, method: str) -> Prediction:
+def _trusted(twin: Twin, path: np.ndarray, ahead: np.ndarray, t: float, method: str) -> Prediction:
     """Wrap the path in its tube and say up to when the 90 % error stays below 10 % of the path."""
-    tube, distance = twin.record.tube(method, np.arange(0.0, ahead[-1] + 1.0))
-    tube, distance = tube[-len(ahead) :], distance[-len(ahead) :]
-    speed = float(np.hypot(*window.v[-1, :2]))
-    start = speed * ahead[0]
-    length = np.maximum(path_length(path, speed) + start, 2.0 * max(speed, 1.0))
-    over = np.flatnonzero(distance / length > LIMIT)
-    over = over[over > 0] if len(over) and not ahead[0] else over
-    horizon = float(AHEAD[over[0] - 1] if len(over) and over[0] else AHEAD[-1] if not len(over) else 0.0)
+    tube = twin.record.tube(method, np.arange(0.0, ahead[-1] + 1.0))[-len(ahead) :]
+    horizon, open_end = twin.record.horizon(method)
     held, n = twin.record.held
     assert twin.origin is not None
     return Prediction(
         uav=twin.uav,
-        t=float(window.t[-1]),
+        t=t,
         state=twin.state,
         method=method,
         origin=(twin.origin.lat_e7, twin.origin.lon_e7, twin.origin.alt_mm),
@@ -90,8 +84,8 @@ def _trusted(twin: Twin, path: np.ndarray, ahead: np.ndarray, window: Window, me
         path=Array.of(path),
         tube=Array.of(tube),
         quantile=QUANTILE,
-        horizon_s=horizon,
-        horizon_open=not len(over),
+        horizon_s=max(horizon - float(ahead[0]), 0.0),
+        horizon_open=open_end,
         held=held,
         held_n=n,
     )

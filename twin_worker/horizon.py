@@ -1,7 +1,8 @@
 """How far a prediction may be trusted: a tube and a horizon from this aircraft's own past predictions.
 
 Scores of past predictions, |error| over an expected spread, give by their conformal quantile the factor that
-would have held the wanted share. Before there are any, a wide prior stands in for them.
+would have held the wanted share. The horizon is the time the same share of past predictions stayed within 10 %.
+Before there are any, a wide prior stands in for them.
 
 Source: Angelopoulos & Bates 2023, "Conformal prediction: a gentle introduction", section 2 (split conformal,
 locally scaled scores). M1, the relative error: |p_hat - p| / max(path flown, 2 s of ground speed).
@@ -16,12 +17,16 @@ AHEAD = np.arange(0.0, 61.0)  # look-ahead grid of every prediction [s]
 LIMIT = 0.10  # relative error at which trust ends [-]
 QUANTILE = 0.9
 _FLOOR_S = 2.0  # least path length, as seconds of ground speed [s]
-_PRIOR = {  # expected spread of along, cross, vertical and distance: base [m], growth [m/s^power], power
-    "paper": (np.array([1.0, 0.8, 0.6, 1.2]), np.array([0.5, 0.2, 0.2, 0.5]), 1.3),
-    "imm": (np.array([2.0, 2.0, 1.0, 2.5]), np.array([1.6, 1.6, 0.5, 2.2]), 1.4),
+_PRIOR = {  # expected spread of along, cross, vertical: base [m], growth [m/s^power], power
+    "paper": (np.array([1.0, 0.8, 0.6]), np.array([0.5, 0.2, 0.2]), 1.3),
+    "imm": (np.array([2.0, 2.0, 1.0]), np.array([1.6, 1.6, 0.5]), 1.4),
+}
+_PRIOR_PASSAGES = {  # times to 10 % that stand in for past predictions, from simulated flights of other seeds [s]
+    "paper": (4.0, 8.0, 16.0, 30.0, 60.0, 60.0),
+    "imm": (1.0, 1.5, 2.0, 3.0, 5.0, 8.0),
 }
 _PRIOR_WEIGHT = 6.0  # past predictions the prior counts as [-]
-_PRIOR_SCORE = 2.5  # its 90 % factor [-]
+_PRIOR_SCORE, _PRIOR_SCORES = 2.5, 3  # its 90 % factor, and how many past predictions say so [-]
 _KEEP = 60  # past predictions remembered per method [-]
 EVERY_S = 5.0  # a prediction is kept for scoring this often [s]
 
@@ -76,8 +81,8 @@ class Record:
     """Past predictions of one aircraft and what came of them."""
 
     waiting: list[Made] = field(default_factory=list)
-    errors: dict[str, deque[np.ndarray]] = field(default_factory=dict)  # along, cross, vertical, distance, (61, 4) [m]
-    passages: deque[tuple[float, bool]] = field(default_factory=lambda: deque(maxlen=200))
+    errors: dict[str, deque[np.ndarray]] = field(default_factory=dict)  # along, cross, vertical, (61, 3) [m]
+    passages: dict[str, deque[tuple[float, bool]]] = field(default_factory=dict)  # time to 10 % [s], censored
     inside: deque[float] = field(default_factory=lambda: deque(maxlen=_KEEP))
 
     def keep(self, made: Made) -> None:
@@ -111,11 +116,12 @@ class Record:
     def _score(self, made: Made, flown: np.ndarray) -> None:
         error = axes_error(made.path, flown)
         self.inside.append(float((error[1:, :3] <= made.tube[1:]).all(axis=1).mean()))
-        self.passages.append(first_passage(error[:, 3] / path_length(flown, made.speed)))
-        self.errors.setdefault(made.method, deque(maxlen=_KEEP)).append(error)
+        passage = first_passage(error[:, 3] / path_length(flown, made.speed))
+        self.passages.setdefault(made.method, deque(maxlen=_KEEP)).append(passage)
+        self.errors.setdefault(made.method, deque(maxlen=_KEEP)).append(error[:, :3])
 
     def spread(self, method: str, ahead: np.ndarray = AHEAD) -> np.ndarray:
-        """Give the expected error by look-ahead: the prior, outweighed by what was measured, (n, 4) [m]."""
+        """Give the expected error by look-ahead: the prior, outweighed by what was measured, (n, 3) [m]."""
         base, growth, power = _PRIOR[method]
         prior = np.hypot(base, growth * ahead[:, None] ** power)
         found = self.errors.get(method)
@@ -128,36 +134,35 @@ class Record:
             spread = np.vstack([spread, prior[len(spread) :] * spread[-1] / prior[len(measured) - 1]])
         return spread
 
-    def factor(self, method: str) -> np.ndarray:
-        """Give the factors on the spread that hold 90 %: jointly for the three axes, and for the distance, (2,)."""
-        spread = self.spread(method)
-        found = [error / spread for error in self.errors.get(method, ())]
-        joint = [float(np.quantile(score[1:, :3].max(axis=1), QUANTILE)) for score in found]
-        distance = [float(np.quantile(score[1:, 3], QUANTILE)) for score in found]
-        doubt = [_PRIOR_SCORE] * max(1, round(_PRIOR_WEIGHT / 2))
-        return np.array([_conformal(joint + doubt), _conformal(distance + doubt)])
+    def factor(self, method: str) -> float:
+        """Give the factor on the spread that holds 90 % jointly on the three axes [-]."""
+        spread = self.spread(method)[1:]
+        scores = [float(np.quantile((e[1:] / spread).max(axis=1), QUANTILE)) for e in self.errors.get(method, ())]
+        ranked = sorted(scores + [_PRIOR_SCORE] * _PRIOR_SCORES)
+        return ranked[min(int(np.ceil((len(ranked) + 1) * QUANTILE)), len(ranked)) - 1]
 
-    def tube(self, method: str, ahead: np.ndarray = AHEAD) -> tuple[np.ndarray, np.ndarray]:
-        """Give the half-axes (n, 3) [m] and the 90 % distance (n,) [m] by look-ahead."""
-        spread, factor = self.spread(method, ahead), self.factor(method)
-        tube = factor[0] * spread[:, :3]
-        return np.maximum.accumulate(tube), np.maximum.accumulate(factor[1] * spread[:, 3])
+    def tube(self, method: str, ahead: np.ndarray = AHEAD) -> np.ndarray:
+        """Give the half-axes along, cross, vertical by look-ahead, never shrinking, (n, 3) [m]."""
+        return np.maximum.accumulate(self.factor(method) * self.spread(method, ahead))
+
+    def horizon(self, method: str) -> tuple[float, bool]:
+        """Give the time 90 % of past predictions stayed within 10 % [s], and whether that is the end of the look-ahead.
+
+        The lower conformal quantile of first passages, rank floor((n + 1) 0.1), at least the smallest.
+        """
+        ranked = sorted([passage[0] for passage in self.passages.get(method, ())] + [*_PRIOR_PASSAGES[method]])
+        time = ranked[max(int((len(ranked) + 1) * (1 - QUANTILE)), 1) - 1]
+        return time, time >= AHEAD[-1]
 
     @property
     def held(self) -> tuple[float, int]:
         """Give the measured share inside the tube so far (nan before any) and the predictions behind it."""
         return (float(np.mean(self.inside)) if self.inside else float("nan")), len(self.inside)
 
-    @property
-    def t10(self) -> tuple[float | None, float | None, int]:
+    def t10(self, method: str) -> tuple[float | None, float | None, int]:
         """Give the median first passage of 10 % [s], the share censored, and how many predictions that is."""
-        if not self.passages:
+        found = self.passages.get(method)
+        if not found:
             return None, None, 0
-        times = [passage[0] for passage in self.passages]
-        return float(np.median(times)), float(np.mean([p[1] for p in self.passages])), len(times)
-
-
-def _conformal(scores: list[float]) -> float:
-    """Give the conformal 90 % quantile, rank ceil((n + 1) 0.9); the largest where n is too small for that rank."""
-    ranked = sorted(scores)
-    return ranked[min(int(np.ceil((len(ranked) + 1) * QUANTILE)), len(ranked)) - 1]
+        times, censored = zip(*found, strict=True)
+        return float(np.median(times)), float(np.mean(censored)), len(times)

@@ -36,18 +36,20 @@ def learn(twin: Twin) -> list[Message]:
     twin.tries += 1
     last = twin.axes or (None, None)
     try:
-        axes = tuple(
+        lon, lat = (
             identify_axis(axis, known, _FREE_RUN_S[attempt], before)[1] for axis, before in zip(AXES, last, strict=True)
         )
     except (ValueError, np.linalg.LinAlgError) as error:
         twin.verdict = Verdict(outcome=Outcome.STARVED, sentence=f"{twin.name}: {error}", tries=twin.tries)
         return []
+    axes = (lon, lat)
     verdict = _fly_once_more(twin, window, held_n, axes, verify(axes, held_out, twin.axes, twin.omega))
     verdict = msgspec.structs.replace(verdict, sentence=f"{twin.name}: {verdict.sentence}", tries=twin.tries)
     if verdict.outcome is Outcome.VERIFIED:
-        twin.axes, twin.tries = axes, 0  # type: ignore[assignment]
+        twin.axes, twin.tries = axes, 0
     twin.verdict = verdict
-    return [_model(twin, axes, verdict, window)]  # type: ignore[arg-type]
+    twin.model = _model(twin, verdict, window)
+    return [twin.model]
 
 
 def _fly_once_more(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Axis], verdict: Verdict) -> Verdict:
@@ -95,15 +97,16 @@ def _missing(twin: Twin) -> str:
     return f"no {', '.join(none)} rows yet" if none else "wait"
 
 
-def _model(twin: Twin, axes: tuple[Axis, Axis], verdict: Verdict, window: Window) -> Model:
-    sound = all(np.isfinite(axis.D).all() for axis in axes)
+def _model(twin: Twin, verdict: Verdict, window: Window) -> Model:
+    """Publish the newest verdict with the model in force: a failed identification never shows its matrices."""
+    lon, lat = twin.axes or (None, None)
     return Model(
         uav=twin.uav,
         t=float(window.t[-1]),
         method="paper",
         verdict=verdict,
-        longitudinal=axes[0].linear() if sound else None,
-        lateral=axes[1].linear() if sound else None,
+        longitudinal=lon.linear() if lon else None,
+        lateral=lat.linear() if lat else None,
         window_t0=float(window.t[0]),
         window_s=window.seconds,
         interpolated=float(window.filled.mean()),

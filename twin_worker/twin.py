@@ -85,7 +85,7 @@ def _score(twin: Twin) -> None:
 
 def fleet_row(twin: Twin, now: float, **claim: object) -> FleetRow:
     """Give the aircraft's line of the fleet table; `now` is data time, `claim` names worker and epoch."""
-    t10, censored, n = twin.record.t10
+    t10, censored, n = twin.record.t10("paper")
     made = twin.prediction
     return FleetRow(
         uav=twin.uav,
