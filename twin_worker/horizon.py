@@ -152,7 +152,7 @@ class Record:
         """
         ranked = sorted([passage[0] for passage in self.passages.get(method, ())] + [*_PRIOR_PASSAGES[method]])
         time = ranked[max(int((len(ranked) + 1) * (1 - QUANTILE)), 1) - 1]
-        return time, time >= AHEAD[-1]
+        return float(time), bool(time >= AHEAD[-1])
 
     @property
     def held(self) -> tuple[float, int]:
