@@ -97,6 +97,19 @@ def test_a_firm_prior_holds_and_a_loose_one_lets_go():
     assert moved[0] < 1e-4 < 1e-2 < moved[1]
 
 
+def test_a_firm_prior_pulls_a_start_that_is_elsewhere():
+    y, u = flight()
+    D = refined(biased(), y, u, prior=truth(), precision=np.full(truth().shape, 1e9))
+    assert np.abs(D - truth()).max() < 1e-3
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_wild_start_never_gets_worse(seed):
+    y, u = flight()
+    start = biased(seed, share=0.5)
+    assert error(refined(start, y, u), y, u) <= error(start, y, u)
+
+
 def test_what_was_not_measured_has_no_say():
     y, u = flight()
     ok = np.ones(len(y), bool)
