@@ -32,8 +32,10 @@ def rows(t, x, dtype: str = "<f8") -> Rows:
     return Rows(t=Array.of(t, "<f8"), x=Array.of(x, dtype))
 
 
-def sample(uav: int = 1, t: float = T0, **kinds) -> Sample:
-    """One message; each kind is a pair of times and values."""
+def sample(uav: int = 1, t: float | None = None, **kinds) -> Sample:
+    """One message, as new as its newest row; each kind is a pair of times and values."""
+    if t is None:
+        t = max([at for times, _ in kinds.values() for at in times if np.isfinite(at) and at < 1e12], default=T0)
     return Sample(uav=uav, t=t, **{name: rows(*pair) for name, pair in kinds.items()})
 
 

@@ -170,3 +170,9 @@ def test_the_window_never_passes_the_data():
     assert window(f.turn(25.0), until=T0 + 500.0) is None
     got = window(f.turn(25.0), until=T0 + 12.0, seconds=5.0)
     assert got.t[-1] <= T0 + 12.0 and got.seconds == pytest.approx(5.0, abs=0.2)
+
+
+def test_rows_newer_than_their_message_are_refused():
+    history = History()
+    assert history.add(f.sample(t=T0, leg=([T0, T0 + 1e6], [[1], [2]]))) == 1
+    assert history.newest == T0

@@ -91,7 +91,7 @@ def test_the_threshold_is_a_threshold():
     assert verify(blurred(0.01), held, None, omega=fit - 0.1).outcome is Outcome.VERIFIED
     refused = verify(truth(), held, None, omega=100.0)
     assert refused.outcome is Outcome.BELOW_THRESHOLD
-    assert refused.threshold == 100.0 and "needs 100 %" in refused.sentence
+    assert refused.threshold == 100.0 and "100 % is needed" in refused.sentence
 
 
 def test_no_better_than_holding_still_is_refused_however_low_the_threshold():
@@ -139,3 +139,11 @@ def test_data_full_of_holes_verify_nothing():
 def test_data_too_short_for_any_horizon_say_so():
     with pytest.raises(ValueError, match="needs 4 s"):
         verify(truth(), linear_flight(3.0), None)
+
+
+def test_one_axis_cannot_carry_the_other():
+    lon, lat = truth()
+    frozen_lon = standstill((lon, lat))[0]
+    verdict = verify((frozen_lon, lat), linear_flight(20.0), None, omega=-100.0)
+    assert verdict.outcome is Outcome.BELOW_THRESHOLD
+    assert "no better than holding still" in verdict.sentence

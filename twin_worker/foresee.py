@@ -85,7 +85,7 @@ def _trusted(twin: Twin, path: np.ndarray, ahead: np.ndarray, t: float, method: 
         tube=Array.of(tube),
         quantile=QUANTILE,
         horizon_s=max(horizon - float(ahead[0]), 0.0),
-        horizon_open=open_end,
+        horizon_open=bool(open_end and not ahead[0]),
         held=held,
         held_n=n,
     )

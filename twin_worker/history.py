@@ -4,6 +4,7 @@ import numpy as np
 
 from fleet.contract import COLUMNS, Rows, Sample
 
+_AHEAD_S = 1.0  # rows newer than their message by more are refused [s]
 _CHUNKS = 40  # chunks of one kind before they are joined
 _MOST = 1e5  # values beyond are noise [m/s, rad, us, ...]
 _MOST_POSITION = 2e9  # the same [1e-7 deg, mm]
@@ -32,7 +33,8 @@ class History:
             if x.ndim != 2 or t.shape != x.shape[:1] or x.shape[1] != len(COLUMNS[name]) or not len(t):
                 bad += 1
                 continue
-            timed = np.isfinite(t)
+            timed = t <= sample.t + _AHEAD_S  # false for nan; a message that dates its rows later contradicts itself
+            timed &= t > 0
             if not timed.all():
                 bad, t, x = bad + 1, t[timed], x[timed]
             if len(t):

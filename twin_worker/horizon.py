@@ -22,8 +22,8 @@ _PRIOR = {  # expected spread of along, cross, vertical: base [m], growth [m/s^p
     "imm": (np.array([2.0, 2.0, 1.0]), np.array([1.6, 1.6, 0.5]), 1.4),
 }
 _PRIOR_PASSAGES = {  # times to 10 % that stand in for past predictions, from simulated flights of other seeds [s]
-    "paper": (4.0, 8.0, 16.0, 30.0, 60.0, 60.0),
-    "imm": (1.0, 1.5, 2.0, 3.0, 5.0, 8.0),
+    "paper": (4.0, 12.0, 60.0),
+    "imm": (1.0, 2.0, 5.0),
 }
 _PRIOR_WEIGHT = 6.0  # past predictions the prior counts as [-]
 _PRIOR_SCORE, _PRIOR_SCORES = 2.5, 3  # its 90 % factor, and how many past predictions say so [-]
@@ -105,13 +105,15 @@ class Record:
         """
         ready = [made for made in self.waiting if len(t) and made.t + AHEAD[-1] <= t[-1]]
         self.waiting = [made for made in self.waiting if made not in ready]
+        scored = 0
         for made in ready:
             at = made.t + AHEAD
             near = np.abs(t[np.clip(np.searchsorted(t, at), 0, len(t) - 1)] - at)
             if made.t < t[0] or near.max() > 2.0:
                 continue  # the flight has a hole there: no answer rather than an invented one
             self._score(made, np.column_stack([np.interp(at, t, column) for column in flown.T]))
-        return len(ready)
+            scored += 1
+        return scored
 
     def _score(self, made: Made, flown: np.ndarray) -> None:
         error = axes_error(made.path, flown)
@@ -151,7 +153,7 @@ class Record:
         The lower conformal quantile of first passages, rank floor((n + 1) 0.1), at least the smallest.
         """
         ranked = sorted([passage[0] for passage in self.passages.get(method, ())] + [*_PRIOR_PASSAGES[method]])
-        time = ranked[max(int((len(ranked) + 1) * (1 - QUANTILE)), 1) - 1]
+        time = ranked[max(int((len(ranked) + 1) * (1 - QUANTILE) + 1e-9), 1) - 1]
         return float(time), bool(time >= AHEAD[-1])
 
     @property

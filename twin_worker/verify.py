@@ -93,9 +93,10 @@ def verify(axes: tuple[Axis, Axis], held: Window, last: tuple[Axis, Axis] | None
         raise ValueError(f"verify: found {held.seconds:.1f} s held out, needs {HORIZONS_S[-1]:.0f} s; wait for more")
     for horizon in allowed:
         fit, still = fits_at(axes, held, horizon)
-        if mean(fit) > max(omega, mean(still)):
+        missing = _missing(axes, fit, still, omega)
+        if not missing:
             break
-    outcome, sentence = _judge(fit, still, held, omega)
+    outcome, sentence = _judge(fit, missing, held)
     if not all(np.isfinite(axis.D).all() for axis in axes):
         outcome, sentence = Outcome.DIVERGED, "the model is not finite; trying again"
     if outcome is Outcome.VERIFIED and last is not None:
@@ -113,16 +114,22 @@ def verify(axes: tuple[Axis, Axis], held: Window, last: tuple[Axis, Axis] | None
     )
 
 
-def _judge(fit: dict[str, float], still: dict[str, float], held: Window, omega: float) -> tuple[Outcome, str]:
+def _missing(axes: tuple[Axis, Axis], fit: dict[str, float], still: dict[str, float], omega: float) -> str:
+    """Say what the fit lacks: the threshold over all states, and on either axis more than holding still; or nothing."""
+    if mean(fit) <= omega:
+        return f"more than {omega:.0f} % is needed"
+    for axis in axes:
+        model, held = (mean({name: each[name] for name in axis.states}) for each in (fit, still))
+        if model <= held:
+            return f"{axis.states[0]} {axis.states[1]} … {model:.0f} % is no better than holding still, {held:.0f} %"
+    return ""
+
+
+def _judge(fit: dict[str, float], missing: str, held: Window) -> tuple[Outcome, str]:
     if mean(fit) <= _LOST:
         return Outcome.DIVERGED, "the free run diverges; trying again"
-    need = max(omega, mean(still))
-    if mean(fit) > need:
-        return Outcome.VERIFIED, f"above the threshold {omega:.0f} % and holding still {mean(still):.0f} %"
-    quiet = held.columns(("phi",)).std() < _QUIET_PHI and held.columns(("q",)).std() < _QUIET_Q
-    if quiet:
-        return (
-            Outcome.NOT_IDENTIFIABLE,
-            f"needs {need:.0f} %; steady flight excites nothing, wait for a turn",
-        )
-    return Outcome.BELOW_THRESHOLD, f"needs {need:.0f} %; trying another window"
+    if not missing:
+        return Outcome.VERIFIED, "above the threshold and better than holding still"
+    if held.columns(("phi",)).std() < _QUIET_PHI and held.columns(("q",)).std() < _QUIET_Q:
+        return Outcome.NOT_IDENTIFIABLE, f"{missing}; steady flight excites nothing, wait for a turn"
+    return Outcome.BELOW_THRESHOLD, f"{missing}; trying another window"
