@@ -169,3 +169,22 @@ def test_a_jump_of_the_clock_forgets_and_learns_anew(twin, heard):
         results = [r for m in later for r in advance(anew, (m,), m.t)]
         assert predictions(results)[0].t < end + by + 5.0
         assert [r for r in results if isinstance(r, Model)], f"no model after a jump of {by} s"
+
+
+# --- who it is -------------------------------------------------------------------------------------------------------
+
+
+def test_what_has_no_wings_is_not_given_any(heard):
+    twin = Twin(1)
+    results = drive(
+        twin, [msgspec.structs.replace(m, vehicle="multirotor") if isinstance(m, Status) else m for m in heard]
+    )
+    assert not [r for r in results if isinstance(r, Model)] and twin.axes is None
+    assert {p.method for p in predictions(results)} == {"imm"}
+    assert "multirotor is not modelled" in predictions(results)[-1].sentence
+
+
+def test_an_autopilot_flown_by_a_law_that_is_not_its_own_is_said(twin):
+    end = twin.history.newest
+    (made,) = predictions(advance(twin, [status(twin, autopilot="px4")], end + 1.0))
+    assert made.method == "paper" and "px4 is flown by ArduPlane's law" in made.sentence

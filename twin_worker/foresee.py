@@ -48,7 +48,13 @@ def _route_path(twin: Twin, window: Window, ahead: np.ndarray) -> tuple[np.ndarr
     if why := twin.why_no_route():
         return None, "", -1, why
     flown = fly_ahead(twin.situation(window), twin.axes, ahead)
-    return flown.path, "paper", flown.seq, flown.sentence
+    return flown.path, "paper", flown.seq, " ".join(filter(None, (_strange_law(twin), flown.sentence)))
+
+
+def _strange_law(twin: Twin) -> str:
+    """Say where the controller twin is not the autopilot's own."""
+    autopilot = twin.status.autopilot if twin.status else "unknown"
+    return "" if autopilot == "ardupilot" else f"autopilot {autopilot} is flown by ArduPlane's law, not its own"
 
 
 def _imm_path(window: Window, ahead: np.ndarray) -> np.ndarray | None:

@@ -13,6 +13,7 @@ from twin_worker.verify import verify
 
 LEAST_S = 30.0  # shortest stretch worth identifying [s]
 WINDOW_S = 140.0  # longest stretch used [s]
+NO_WINGS = ("multirotor", "helicopter")
 SLOW = 6.0  # air-relative forward speed below which nothing flies on its wings [m/s]
 _FREE_RUN_S = (2.0, 4.0, 2.0, 8.0)  # free-run length of the n-th try [s]
 _WORSE = 1.2  # a new model may stray this much further than the last [-]
@@ -21,6 +22,10 @@ _SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the window the n-th try uses
 
 def learn(twin: Twin) -> list[Message]:
     """Identify and verify once; give the model with its verdict, or nothing while data are starved."""
+    if twin.vehicle in NO_WINGS:
+        sentence = f"{twin.name}: a {twin.vehicle} is not modelled yet, turn rate only"
+        twin.verdict = Verdict(outcome=Outcome.NOT_IDENTIFIABLE, sentence=sentence)
+        return []
     window = _airborne(twin.window(WINDOW_S))
     have = 0.0 if window is None else float(window.ok.sum() * DT)
     if window is None or have < LEAST_S:

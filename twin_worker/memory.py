@@ -58,6 +58,11 @@ class Twin:
         """Give the name sentences use, e.g. uav-7."""
         return f"uav-{self.uav}"
 
+    @property
+    def vehicle(self) -> str:
+        """Give the kind of vehicle its heartbeat names, e.g. fixed_wing."""
+        return self.status.vehicle if self.status else "unknown"
+
     def window(self, seconds: float) -> Window | None:
         """Give the newest `seconds` on the grid; None while a needed kind of row is missing."""
         assert self.origin is not None
