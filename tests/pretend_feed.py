@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.bus import ROUTER, Bus, connect, open_router, reachable
+from fleet.bus import ROUTER, Bus, MemoryBus, connect, open_router, reachable
 from fleet.cli import stop_on_signal
 from fleet.codec import Stamp
 from fleet.contract import (
@@ -33,11 +33,13 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin, to_geodetic
+from viewer.feed import Feed
 
 HOME = Origin(473977420, 85455940, 488_000)
 AHEAD = np.arange(0.0, 40.5, 0.5)
 HOSTILE = "<img src=x onerror=window.pwned=1>"
 STAMP = Stamp(1, 0xABCD)
+T = 1_700_000_000.0
 
 
 class PretendUav:
@@ -224,6 +226,28 @@ class PretendFleet:
                 if (alert := one.alert(t)) is not None:
                     self._bus.publish(alert)
         self._bus.publish(FleetState(t=t, rows=tuple(one.row() for one in self.uavs)), STAMP)
+
+
+class Clock:
+    """Monotonic time that only the test moves."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def feed_of(clock: Clock, uavs: int = 3, *, hostile: int | None = None) -> tuple[Feed, PretendFleet, MemoryBus]:
+    bus = MemoryBus()
+    feed = Feed(bus, clock)
+    fleet = PretendFleet(bus, uavs, hostile=hostile)
+    fleet.advance(T)
+    return feed, fleet, bus
+
+
+def fields(message: Prediction) -> dict:
+    return {name: getattr(message, name) for name in message.__struct_fields__}
 
 
 def main() -> int:

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from pretend_feed import HOME, HOSTILE, STAMP, PretendFleet, PretendUav
+from pretend_feed import HOME, HOSTILE, STAMP, Clock, PretendUav, T, feed_of, fields
 
 from fleet.bus import MemoryBus
-from fleet.codec import Stamp
 from fleet.contract import (
     Alert,
     AlertKind,
@@ -18,48 +17,26 @@ from fleet.contract import (
     Model,
     Outcome,
     Prediction,
-    Rows,
-    Sample,
     State,
     Status,
     Verdict,
 )
 from fleet.frames import Origin, body_to_ned, to_geodetic
+from viewer.app import near
 from viewer.camera import FOV, frame
 from viewer.detail import about, band, scale, why
-from viewer.feed import GIVE_UP_S, Feed
+from viewer.feed import Feed
 from viewer.palette import DARK, LIGHT, line_colour, rgb, shown_line
 from viewer.place import UNIT_M, Place, scene_quat
 from viewer.routes import route
 from viewer.scene import DASHES, aircraft, cut_at_horizon
 from viewer.tube import curtain, marks, rings, skin
-from viewer.vehicle import SILENT_S
 from viewer.words import empty, summary, table
-
-T = 1_700_000_000.0
-
-
-class Clock:
-    """Monotonic time that only the test moves."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @pytest.fixture
 def clock() -> Clock:
     return Clock()
-
-
-def feed_of(clock: Clock, uavs: int = 3, *, hostile: int | None = None) -> tuple[Feed, PretendFleet, MemoryBus]:
-    bus = MemoryBus()
-    feed = Feed(bus, clock)
-    fleet = PretendFleet(bus, uavs, hostile=hostile)
-    fleet.advance(T)
-    return feed, fleet, bus
 
 
 # --- colours ---
@@ -131,96 +108,13 @@ def test_a_place_off_this_earth_or_far_away_is_refused(bad: float) -> None:
         Place(HOME).geodetic(np.array([bad]), np.array([8e7]), np.array([0.0]))
 
 
-# --- feed ---
-
-
-def test_a_lower_epoch_is_dropped_until_the_higher_one_falls_silent(clock: Clock) -> None:
-    feed, _, bus = feed_of(clock, 1)
-    one = PretendUav(0)
-    bus.publish(one.prediction(T + 1, 0.0), Stamp(5, 1))
-    bus.publish(one.prediction(T + 2, 0.0), Stamp(4, 2))
-    assert feed.vehicles[0].forecast.t == T + 1
-    assert feed.counts["outdated"] == 1
-    clock.now += GIVE_UP_S + 1
-    bus.publish(one.prediction(T + 3, 0.0), Stamp(4, 2))
-    assert feed.vehicles[0].forecast.t == T + 3
-
-
-def test_a_late_viewer_is_complete_after_asking(clock: Clock) -> None:
-    bus = MemoryBus()
-    fleet = PretendFleet(bus, 2)
-    fleet.advance(T)
-    feed = Feed(bus, clock)
-    feed.catch_up()
-    late = feed.vehicles[0]
-    assert late.mission is not None and late.status is not None and late.model is not None and late.forecast is not None
-    assert feed.vehicles[1].forecast is None  # still identifying: nobody claims a path
-
-
-def test_strange_messages_are_counted_and_change_nothing(clock: Clock) -> None:
-    feed, _, bus = feed_of(clock, 2)
-    before = feed.vehicles[0].at.copy(), feed.vehicles[0].forecast
-    good = PretendUav(0).prediction(T + 1, 0.0)
-    nan, short = np.full(good.path.shape, np.nan), np.zeros((3, 3))
-    strange = [
-        Prediction(**{**_fields(good), "path": Array.of(nan)}),
-        Prediction(**{**_fields(good), "path": Array.of(short)}),
-        Prediction(**{**_fields(good), "ahead": Array.of(np.zeros(good.ahead.shape))}),
-        Prediction(**{**_fields(good), "origin": (999_999_999_999, 0, 0)}),
-        Prediction(**{**_fields(good), "tube": Array("<f4", (9, 9), b"")}),
-        Sample(uav=0, t=T + 1, position=Rows(t=Array.of([T], "<f8"), x=Array.of([[1.0, 2.0]]))),
-        Sample(uav=0, t=float("nan")),
-        Sample(uav=-4, t=T),
-    ]
-    for message in strange:
-        bus.publish(message, STAMP)
-    assert feed.counts["strange"] == len(strange)
-    assert np.array_equal(feed.vehicles[0].at, before[0])
-    assert feed.vehicles[0].forecast is before[1]
-
-
-def _fields(message: Prediction) -> dict:
-    return {name: getattr(message, name) for name in message.__struct_fields__}
-
-
-def test_no_fix_draws_nothing(clock: Clock) -> None:
-    feed = Feed(bus := MemoryBus(), clock)
-    bus.publish(Sample(uav=0, t=T, position=Rows(t=Array.of([T], "<f8"), x=Array.of([[0, 0, 0]], "<i8"))))
-    assert feed.place is None and not feed.vehicles
-
-
-def test_the_trail_is_bounded_and_starts_afresh_when_the_clock_goes_back(clock: Clock) -> None:
-    feed, _, bus = feed_of(clock, 1)
-    one = PretendUav(0)
-    for k in range(30):
-        bus.publish(one.sample(T + 10 * k, T + 10 * (k + 1)))
-    trail = feed.trail(feed.vehicles[0])
-    assert trail.shape == (900, 5) and np.isfinite(trail).all()
-    bus.publish(one.sample(T, T + 0.5))
-    assert len(feed.trail(feed.vehicles[0])) == 5
-
-
-def test_without_samples_the_link_is_lost_and_the_ghost_moves_on(clock: Clock) -> None:
-    feed, _, _ = feed_of(clock, 1)
-    one = feed.vehicles[0]
-    assert one.state(clock.now) is State.PREDICTING
-    clock.now += SILENT_S + 2
-    assert one.state(clock.now) is State.LINK_LOST
-    expected = one.forecast.at(one.clock(clock.now) - one.forecast.t)
-    assert np.allclose(one.where(clock.now), expected)
-    assert np.linalg.norm(one.where(clock.now) - one.at) * UNIT_M > 20
-    clock.now += 1_000
-    assert np.allclose(one.where(clock.now), one.forecast.path[-1])  # and no farther than was predicted
-
-
-def test_an_alert_comes_and_goes(clock: Clock) -> None:
-    feed, _, bus = feed_of(clock, 1)
-    for active, n in ((True, 1), (False, 0)):
-        bus.publish(Alert(uav=0, t=T, kind=AlertKind.GROUND, active=active, sentence="x"))
-        assert len(feed.alerts()) == n
-
-
 # --- shapes ---
+
+
+@pytest.mark.parametrize("apart", [1_000.0, 5_000.0])
+def test_however_far_apart_somebody_is_in_view(apart: float) -> None:
+    points = np.array([[0.0, 0.0, 0.0], [apart, 0.0, 0.0]])
+    assert len(near(points, 2_000.0)) == (2 if apart < 2_000 else 1)
 
 
 def test_the_tube_is_as_wide_as_told() -> None:
@@ -344,7 +238,7 @@ def test_the_panel_says_measured_coverage(clock: Clock) -> None:
 def test_wild_numbers_in_good_messages_do_not_stop_the_page(clock: Clock, value: float) -> None:
     feed, _, bus = feed_of(clock, 2)
     one = PretendUav(0)
-    told = {**_fields(one.prediction(T + 1, 0.0)), "horizon_s": value, "held": value, "coast_s": value}
+    told = {**fields(one.prediction(T + 1, 0.0)), "horizon_s": value, "held": value, "coast_s": value}
     bus.publish(Prediction(**told), STAMP)
     bus.publish(Prediction(**{**told, "t": T + 2, "tube": Array.of(np.full((81, 3), value), "<f8")}), STAMP)
     verdict = Verdict(

@@ -22,8 +22,9 @@ from viewer.selected import Selection
 from viewer.vehicle import Vehicle
 
 TICK_S = 0.1
-NEAR_M = 800.0  # items of the route within this are shown with an aircraft one turns to
-SLOW_S = 10.0  # how often what is missing is asked for again
+NEAR_M = 800.0  # items of the route within this are shown with an aircraft one turns to [m]
+IN_VIEW_M = 20_000.0  # what is farther from the middle of the fleet is not framed [m]
+SLOW_S = 10.0  # how often what is missing is asked for again [s]
 
 
 def serve(host: str, port: int) -> viser.ViserServer:
@@ -61,7 +62,8 @@ class App:
         self.selected: int | None = None
         self._dirty = threading.Event()
         self._seen: tuple = ()
-        self._followed: np.ndarray | None = None
+        self._followed: tuple[int, np.ndarray] | None = None
+        self._life = 1.2  # how much larger than life an aircraft of size 1 is drawn
 
     def choose(self, uav: int) -> None:
         """Select a UAV; the next tick shows it."""
@@ -72,13 +74,13 @@ class App:
     def visit(self, uav: int) -> None:
         """Select a UAV that may be out of sight, and turn the cameras to it."""
         self.choose(uav)
-        vehicle, place = self.feed.vehicles.get(uav), self.feed.place
+        vehicle, place = self.feed.one(uav), self.feed.place
         if vehicle is None or place is None or (at := vehicle.where(time.monotonic())) is None:
             return
         told = [vehicle.forecast.path] if vehicle.forecast is not None else []
         around = route(vehicle.mission, place, self.scene.ground).points[1:]
-        near = around[np.linalg.norm(around - at, axis=1) < NEAR_M / UNIT_M]
-        self.cameras.fly_to(np.vstack([at, *told, near]))
+        close = around[np.linalg.norm(around - at, axis=1) < NEAR_M / UNIT_M]
+        self.cameras.fly_to(np.vstack([at, *told, close]))
 
     def run(self, stop: threading.Event) -> None:
         """Draw until told to stop."""
@@ -97,7 +99,8 @@ class App:
     def _ask(self, stop: threading.Event) -> None:
         """Ask for what was said before we came, and again while something is missing."""
         while not stop.is_set():
-            if any(v.mission is None or v.model is None for v in self.feed.all()) or not self.feed.vehicles:
+            fleet = self.feed.all()
+            if not fleet or any(v.mission is None or v.model is None for v in fleet):
                 with contextlib.suppress(OSError, RuntimeError):
                     self.feed.catch_up()
             stop.wait(SLOW_S)
@@ -106,18 +109,18 @@ class App:
         """Draw what is due at this tick; selection changes are drawn at once."""
         if tick % 10 and not self._server.get_clients():
             return  # nobody looks: once a second keeps the trails
-        now, fleet = time.monotonic(), self.feed.all()
-        changed = self._dirty.is_set()
-        self._dirty.clear()
+        now, fleet, place = time.monotonic(), self.feed.all(), self.feed.place
+        if changed := self._dirty.is_set():
+            self._dirty.clear()
         if self.selected is None and (known := [v for v in fleet if v.forecast is not None]):
             self.selected, changed = known[0].uav, True
         if tick % 10 == 0 or changed:
             self.panels.draw(fleet, self.feed, now, self.selected)
-        if not fleet or self.feed.place is None:
+        if not fleet or place is None:
             return
         self.scene.vehicles(fleet, now, self.selected)
         if tick % 10 == 0 or changed:
-            self._slowly(fleet, now, self.feed.place)
+            self._slowly(fleet, now, place, tick)
         if tick % (2 if len(fleet) <= 300 else 10) == 0:
             where = {vehicle.uav: vehicle.at for vehicle in fleet}
             self.scene.heads([where[uav] for uav in self.scene.uavs])
@@ -133,11 +136,12 @@ class App:
     def _chosen(self, fleet: list[Vehicle]) -> Vehicle | None:
         return next((vehicle for vehicle in fleet if vehicle.uav == self.selected), None)
 
-    def _slowly(self, fleet: list[Vehicle], now: float, place: Place) -> None:
-        """Do what is due once a second: trails, predicted paths, routes, ground, display options, camera."""
+    def _slowly(self, fleet: list[Vehicle], now: float, place: Place, tick: int) -> None:
+        """Draw trails, predicted paths, routes, ground and camera: once a second, and when the selection changes."""
         options, scene, chosen = self.panels, self.scene, self._chosen(fleet)
-        scene.set_ground(_ground(fleet, place))
-        scene.beat(fleet)
+        scene.set_ground(_ground(fleet, place, scene.ground))
+        if tick % 10 == 0:
+            scene.beat(fleet)
         scene.draw_predicted(fleet, now, self.selected if options.tube.value else None)
         scene.predicted.show(options.predicted.value)
         scene.stems.show(options.stems.value)
@@ -148,34 +152,43 @@ class App:
         self.selection.tube = options.tube.value
         own = route(chosen.mission if chosen else None, place, scene.ground)
         self.selection.draw_route(own)
-        self._frame(fleet, now, own.points)
+        self._frame(fleet, now, place, own.points)
+        scene.glyph = options.glyph.value * self._life
 
-    def _frame(self, fleet: list[Vehicle], now: float, points: np.ndarray) -> None:
+    def _frame(self, fleet: list[Vehicle], now: float, place: Place, points: np.ndarray) -> None:
         """Frame fleet, route and prediction when something new of these appears or someone new looks."""
-        at = [place for v in fleet if (place := v.where(now)) is not None]
+        at = [spot for v in fleet if (spot := v.where(now)) is not None]
         if not at:
             return
         told = [v.forecast.path[:: max(len(v.forecast.path) // 8, 1)] for v in fleet if v.forecast is not None]
-        seen = (len(at), len(told), bool(len(points)), self.cameras.watchers())
+        seen = (place.origin, len(at), len(told), bool(len(points)), self.cameras.watchers())
         if seen == self._seen:
             return
         self._seen = seen
-        cloud = np.vstack([np.array(at), *told, points])
-        cloud = cloud[np.linalg.norm(cloud - np.median(cloud, axis=0), axis=1) < 20_000 / UNIT_M]
+        cloud = near(np.vstack([np.array(at), *told, points]), IN_VIEW_M / UNIT_M)
         span = float(np.linalg.norm(np.ptp(cloud, axis=0)))
-        self.scene.glyph = self.panels.glyph.value * float(np.clip(span / 42, 1.2, 12.0))
+        self._life = float(np.clip(span / 42, 1.2, 12.0))
         self.cameras.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, self.scene.ground]]))
 
     def _follow(self, chosen: Vehicle | None, now: float) -> None:
         at = chosen.where(now) if chosen is not None and self.panels.follow.value else None
-        if at is not None and self._followed is not None:
-            self.cameras.follow(at - self._followed)
-        self._followed = at
+        if chosen is None or at is None:
+            self._followed = None
+            return
+        if self._followed is not None and self._followed[0] == chosen.uav:
+            self.cameras.follow(at - self._followed[1])
+        self._followed = chosen.uav, at
 
 
-def _ground(fleet: list[Vehicle], place: Place) -> float:
-    """Guess the ground: the lowest home of a mission, else 60 m below the lowest aircraft, scene [10 m]."""
+def near(points: np.ndarray, reach: float) -> np.ndarray:
+    """Keep the points (n, 3) within `reach` of the most central one: never none [10 m]."""
+    centre = points[np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1))]
+    return points[np.linalg.norm(points - centre, axis=1) < reach]
+
+
+def _ground(fleet: list[Vehicle], place: Place, before: float) -> float:
+    """Guess the ground: the lowest home of a mission, else 60 m below the lowest ever seen, scene [10 m]."""
     homes = [alt for vehicle in fleet if (alt := home_alt_m(vehicle.mission)) is not None]
     if homes:
         return (min(homes) - place.origin.alt_mm * 1e-3) / UNIT_M
-    return min([float(v.at[2]) for v in fleet if v.at is not None], default=0.0) - 6.0
+    return min([before, *(float(v.at[2]) - 6.0 for v in fleet if v.at is not None)])

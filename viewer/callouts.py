@@ -24,7 +24,7 @@ class Callouts:
         ]
 
     def draw(self, fleet: list[Vehicle], now: float, *, selected: int | None, size: float) -> None:
-        """Name alerts and lost links; `size` is the drawn span of an aircraft [10 m]."""
+        """Name alerts and lost links; `now` is monotonic [s], `size` is the drawn span of an aircraft [10 m]."""
         worst = [v for v in fleet if v.uav != selected and (v.alerts or v.state(now) is State.LINK_LOST)]
         worst = [v for v in sorted(worst, key=lambda v: severity(v, now)) if v.where(now) is not None][:LABELS]
         for label, vehicle in zip(self._labels, worst, strict=False):
@@ -40,5 +40,5 @@ def caption(vehicle: Vehicle, now: float) -> str:
     """Say in few words what is wrong with a UAV."""
     if vehicle.state(now) is State.LINK_LOST:
         return f"{GLYPH[State.LINK_LOST]} {vehicle.name} link lost {ago(vehicle.age(now))}"
-    kinds = ", ".join(kind.value.replace("_", " ") for kind in list(vehicle.alerts))
+    kinds = ", ".join(kind.value.replace("_", " ") for kind in vehicle.alerts)
     return f"▲ {vehicle.name} {kinds}"

@@ -59,7 +59,9 @@ class Cameras:
         """Frame the points for everyone who has not moved their camera."""
         position, look_at = frame(points, 1.0)
         self._server.initial_camera.position, self._server.initial_camera.look_at = position, look_at
-        for number, client in self._server.get_clients().items():
+        clients = self._server.get_clients()
+        self._placed = {number: placed for number, placed in self._placed.items() if number in clients}
+        for number, client in clients.items():
             camera = client.camera
             placed = self._placed.get(number)
             if placed is not None and np.linalg.norm(camera.position - placed) > 0.01 * np.linalg.norm(placed):

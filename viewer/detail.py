@@ -14,7 +14,8 @@ from viewer.place import UNIT_M
 from viewer.vehicle import Vehicle
 from viewer.words import ago, fit, horizon_s
 
-PAST_S = 60.0  # how far the histories reach back
+PAST_S = 60.0  # how far the histories reach back [s]
+REFUSED_S = 10.0  # how long a refused message is spoken of [s]
 
 
 def about(vehicle: Vehicle, palette: Palette, now: float) -> str:
@@ -54,6 +55,11 @@ def why(vehicle: Vehicle, now: float) -> list[str]:
         said.append(f"No sample for {ago(vehicle.age(now))}: {ghost}.")
     elif state in (State.WAITING, State.UNCLAIMED) and vehicle.model is None:
         said.append("No worker has judged this UAV yet; check that `twin_worker` runs on this router.")
+    elif state is State.UNCLAIMED:
+        said.append(
+            f"No worker has spoken of this UAV for {ago(now - vehicle.believed)}: what is shown is its last word; "
+            "check that `twin_worker` runs on this router."
+        )
     elif vehicle.forecast is None:
         said.append("No horizon yet: nothing is claimed before a model is verified.")
     if vehicle.prediction is not None and vehicle.prediction.sentence:
@@ -62,13 +68,15 @@ def why(vehicle: Vehicle, now: float) -> list[str]:
         said.append(vehicle.status.sentence)
     if vehicle.mission is not None and vehicle.mission.sentence:
         said.append(vehicle.mission.sentence)
+    if now - vehicle.refused[0] < REFUSED_S:
+        said.append(vehicle.refused[1])
     return said
 
 
 def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
     cards = [
         f'<div class="say" style="border-color:{palette.mismatch}">▲ {escape(a.sentence)}</div>'
-        for a in list(vehicle.alerts.values())
+        for a in vehicle.alerts.values()
     ]
     cards += [f'<div class="say">{escape(text)}</div>' for text in why(vehicle, now)]
     verdict = vehicle.model.verdict if vehicle.model is not None else None
@@ -76,7 +84,7 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
         colour = palette.verified if verdict.outcome is Outcome.VERIFIED else palette.identifying
         cards.append(
             f'<div class="say" style="border-color:{colour}"><b>{escape(verdict.outcome.value.replace("_", " "))}</b> '
-            f'<span class="soft">threshold {verdict.threshold:.0f} %, tried {verdict.tries} times</span><br>'
+            f'<span class="soft">newest try; threshold {verdict.threshold:.0f} %, tried {verdict.tries} times</span><br>'
             f"{escape(verdict.sentence)}</div>"
         )
     elif vehicle.row is not None and vehicle.row.verdict:
@@ -85,9 +93,9 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
 
 
 def _fits(vehicle: Vehicle) -> str:
-    if vehicle.model is None or not vehicle.model.verdict.fit:
+    if vehicle.model is None or not (vehicle.model.in_force or vehicle.model.verdict).fit:
         return ""
-    verdict = vehicle.model.verdict
+    verdict = vehicle.model.in_force or vehicle.model.verdict
     names = list(verdict.fit)[:12]
     head = "".join(f'<th class="num">{escape(name)}</th>' for name in names)
     ours = "".join(f'<td class="num">{verdict.fit[name]:.0f}</td>' for name in names)

@@ -12,11 +12,11 @@ from fleet.bus import Bus, key
 from fleet.codec import Stamp
 from fleet.contract import Alert, AlertKind, FleetState, Mission, Model, Prediction, Sample, State, Status
 from fleet.frames import Origin
-from viewer.place import Place
-from viewer.vehicle import JUMP_S, Forecast, Vehicle, forecast
+from viewer.place import Place, TooFar
+from viewer.vehicle import GIVE_UP_S, JUMP_S, Forecast, Vehicle, forecast
 
 MAX_VEHICLES = 2_000  # ids are written by strangers: more than this many are counted, not kept
-GIVE_UP_S = 10.0  # a writer silent for so long has lost its claim: a lower epoch (a restarted fleet) may speak
+MAX_WRITERS = 16  # workers whose sentences are kept: a restarted one is another
 LATE = (
     Status,
     Mission,
@@ -61,12 +61,30 @@ class Feed:
         for kind in LATE:
             hear = self._guarded(kind)
             for message, stamp in self._bus.ask(kind):
-                hear(message, stamp)
+                if not self._is_known(message):
+                    hear(message, stamp)
+
+    def _is_known(self, message: Any) -> bool:
+        """Tell whether something as new came by itself while we asked."""
+        with self.lock:
+            held = getattr(self.vehicles.get(getattr(message, "uav", -1)), message.topic, None)
+        return held is not None and held.t >= message.t
 
     def all(self) -> list[Vehicle]:
-        """Give the UAVs in order of their ids."""
+        """Copy the UAVs, in order of their ids: nothing changes in them while they are drawn."""
         with self.lock:
-            return [self.vehicles[uav] for uav in sorted(self.vehicles)]
+            return [self.vehicles[uav].still() for uav in sorted(self.vehicles)]
+
+    def one(self, uav: int) -> Vehicle | None:
+        """Copy one UAV; None where it was never heard of."""
+        with self.lock:
+            found = self.vehicles.get(uav)
+            return found.still() if found is not None else None
+
+    def said(self) -> list[str]:
+        """Copy what the workers say of themselves."""
+        with self.lock:
+            return [text for text in self.sentences.values() if text]
 
     def trail(self, vehicle: Vehicle) -> np.ndarray:
         """Copy the flown trail: (n, 5) fleet time [s], scene ENU [10 m], Va [m/s]."""
@@ -91,8 +109,10 @@ class Feed:
                 try:
                     self._hears[kind](message, stamp, self._clock())
                     self.counts[kind.__name__] += 1
-                except (ValueError, IndexError, TypeError, OverflowError):
+                except (ValueError, IndexError, TypeError, OverflowError) as error:
                     self.counts["strange"] += 1
+                    if (vehicle := self.vehicles.get(getattr(message, "uav", -1))) is not None:
+                        vehicle.refused = self._clock(), f"A {kind.__name__.lower()} was refused: {error}"
 
         return hear
 
@@ -106,8 +126,23 @@ class Feed:
     def _sample(self, sample: Sample, _: Stamp | None, now: float) -> None:
         if self.place is None and (origin := _first_fix(sample)) is not None:
             self.place = Place(origin)
-        if self.place is not None:
-            self._vehicle(sample.uav).hear_sample(sample, self.place, now)
+        if self.place is None:
+            return
+        vehicle = self._vehicle(sample.uav)
+        try:
+            vehicle.hear_sample(sample, self.place, now)
+        except TooFar:
+            others = (v for v in self.vehicles.values() if v is not vehicle and v.at is not None)
+            if (origin := _first_fix(sample)) is None or any(now - v.heard < GIVE_UP_S for v in others):
+                raise
+            self._move(Place(origin))
+            vehicle.hear_sample(sample, self.place, now)
+
+    def _move(self, place: Place) -> None:
+        """Begin anew elsewhere: where we are, nobody flies any more; the first position was a wrong one, say."""
+        self.place = place
+        for vehicle in self.vehicles.values():
+            vehicle.forget()
 
     def _keep(self, name: str) -> Callable[[Any, Stamp | None, float], None]:
         def hear(message: Any, _: Stamp | None, __: float) -> None:
@@ -137,22 +172,27 @@ class Feed:
         if not self._believe(vehicle, stamp.epoch if stamp else 0, now):
             return
         if vehicle.prediction is not None and 0 < vehicle.prediction.t - message.t < JUMP_S:
-            return  # asked for or delayed, and newer is here
+            return  # delayed, and newer is here
         if self.place is None and message.path.shape[0]:
             self.place = Place(_checked(Origin(*message.origin)))
         found = forecast(message, self.place, now) if self.place is not None else None
         vehicle.prediction, vehicle.forecast = message, found
-        if found is not None and (not vehicle.past or found.t - vehicle.past[-1].t >= 0.9):
+        if found is None:
+            return
+        if vehicle.past and found.t < vehicle.past[-1].t - JUMP_S:
+            vehicle.past.clear()
+        if not vehicle.past or found.t - vehicle.past[-1].t >= 0.9:
             vehicle.past.append(found)
 
     def _alert(self, alert: Alert, _: Stamp | None, __: float) -> None:
-        alerts = self._vehicle(alert.uav).alerts
-        alerts.pop(alert.kind, None)
-        if alert.active:
-            alerts[alert.kind] = alert
+        vehicle = self._vehicle(alert.uav)
+        others = {kind: held for kind, held in vehicle.alerts.items() if kind is not alert.kind}
+        vehicle.alerts = {**others, alert.kind: alert} if alert.active else others
 
     def _fleet(self, fleet: FleetState, stamp: Stamp | None, now: float) -> None:
         self.sentences[stamp.writer if stamp else 0] = fleet.sentence
+        while len(self.sentences) > MAX_WRITERS:
+            del self.sentences[next(iter(self.sentences))]
         for row in fleet.rows:
             vehicle = self._vehicle(row.uav)
             if row.state is not State.UNCLAIMED and self._believe(vehicle, row.epoch, now):
@@ -161,7 +201,7 @@ class Feed:
     def alerts(self) -> list[tuple[Vehicle, AlertKind, Alert]]:
         """Give the alerts in force, newest first."""
         with self.lock:
-            found = [(v, kind, alert) for v in self.vehicles.values() for kind, alert in v.alerts.items()]
+            found = [(v.still(), kind, alert) for v in self.vehicles.values() for kind, alert in v.alerts.items()]
         return sorted(found, key=lambda one: -one[2].t)
 
 

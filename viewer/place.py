@@ -8,8 +8,12 @@ UNIT_M = 10.0  # metres per scene unit: keeps a fleet of kilometres well inside 
 REACH_M = 100_000.0  # farther from the origin than this the tangent plane lies, and nothing is drawn
 
 
+class TooFar(ValueError):
+    """A position that cannot be drawn in the scene there is."""
+
+
 class Place:
-    """The common frame: its origin is the first position anyone reported."""
+    """The common frame: its origin is the first position anyone reported, until nobody flies within its reach."""
 
     def __init__(self, origin: Origin) -> None:
         self.origin = origin
@@ -18,21 +22,26 @@ class Place:
         """Map geodetic positions, (n,) [1e-7 deg, 1e-7 deg, mm], to the scene: (n, 3) ENU [10 m].
 
         Raises:
-            ValueError: when a position is not on this earth or farther than 100 km from the fleet; check the sender.
+            ValueError: when a position is not on this earth; check the sender.
+            TooFar: when it is farther than 100 km from the fleet.
         """
         lat, lon, alt = (np.asarray(x, float) for x in (lat_e7, lon_e7, alt_mm))
         if not all(np.isfinite(x).all() for x in (lat, lon, alt)) or (np.abs(lat) > 9e8).any():
             raise ValueError("position: found a value that is no latitude, longitude or altitude; check the sender")
         scene = ned_to_scene(to_ned(self.origin, lat, lon, alt))
         if (np.abs(scene) > REACH_M / UNIT_M).any():
-            raise ValueError("position: found one more than 100 km from the fleet; open another viewer for it")
+            away = np.abs(scene).max() * UNIT_M / 1000
+            raise TooFar(
+                f"position: found one {away:.0f} km from the fleet's first, expected at most 100 km; "
+                "open another viewer for it"
+            )
         return scene
 
     def local(self, origin: Origin, ned: np.ndarray) -> np.ndarray:
         """Map NED positions relative to another origin, (n, 3) [m], to the scene: (n, 3) ENU [10 m]."""
         ned = np.asarray(ned, float)
         if not np.isfinite(ned).all() or (np.abs(ned) > 2 * REACH_M).any():
-            raise ValueError("path: found values that are not finite or beyond 200 km; resend")
+            raise ValueError("path: found values that are not finite or beyond 200 km, expected metres; resend")
         if origin == self.origin:
             return ned_to_scene(ned)
         return self.geodetic(*to_geodetic(origin, ned).T)

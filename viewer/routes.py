@@ -24,8 +24,8 @@ AT_A_PLACE = {
 }
 RADIUS_IN = {LOITER_UNLIM: "param3", LOITER_TURNS: "param3", LOITER_TIME: "", LOITER_TO_ALT: "param2"}
 ABSOLUTE = {0, 5}  # MAV_FRAME: GLOBAL, GLOBAL_INT; every other altitude counts from home
-RADIUS_M = 60.0  # where an item names no loiter radius: the default of ArduPlane's WP_LOITER_RAD
-MAX_M = 50_000.0  # altitudes and radii beyond are not drawn
+RADIUS_M = 60.0  # where an item names no loiter radius: the default of ArduPlane's WP_LOITER_RAD [m]
+MAX_M = 50_000.0  # altitudes and radii beyond are not drawn [m]
 
 
 class Route(NamedTuple):
@@ -45,7 +45,7 @@ def home_alt_m(mission: Mission | None) -> float | None:
     if mission is None or len(mission.items) < 2:
         return None
     first, rest = mission.items[0], mission.items[1:]
-    is_home = first.seq == 0 and first.command == WAYPOINT and first.frame in ABSOLUTE and np.isfinite(first.alt_m)
+    is_home = first.seq == 0 and first.command == WAYPOINT and first.frame in ABSOLUTE and _usable(first)
     return float(first.alt_m) if is_home and any(item.frame not in ABSOLUTE for item in rest) else None
 
 

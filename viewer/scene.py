@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from fleet.contract import State
-from viewer.palette import Palette, line_colour, mesh_colour, mix, rgb, triple
+from viewer.palette import Palette, mesh_colour, mix, rgb, triple
 from viewer.place import UNIT_M, scene_quat
 from viewer.routes import NOTHING, Route, circle
 from viewer.strokes import Strokes, chain, dash_lines, faded
@@ -15,6 +15,7 @@ from viewer.vehicle import Vehicle
 CHUNKS, STEPS = 5, 12  # the trail: immutable chunks of 12 s, and a head of up to 12 s, one point a second
 DASHES = 14  # dashes of one predicted path
 CROWD = 300  # above this many, stems go and only exceptions keep their predicted path
+LEAP_M = 1_000.0  # farther within a second is no flight but another one (a recording begun anew): a new trail [m]
 RINGS_M = (500, 1000, 2000)
 
 
@@ -138,8 +139,10 @@ class Scene:
         now = [where.get(uav) for uav in self.uavs]
         self._ring = np.roll(self._ring, -1, axis=1)
         self._ring[:, -1] = [self._ring[i, -2] if at is None else at for i, at in enumerate(now)]
+        leapt = np.linalg.norm(self._ring[:, -1] - self._ring[:, -2], axis=1) > LEAP_M / UNIT_M
+        self._ring[leapt] = self._ring[leapt, -1:]
         self._beat += 1
-        if self._beat % STEPS == 0:
+        if self._beat % STEPS == 0 or leapt.any():
             for age in range(CHUNKS):
                 self._chunk(age)
 
@@ -236,8 +239,3 @@ def aircraft() -> tuple[np.ndarray, np.ndarray]:
     faces.append(np.array([(0, 1, 2), (0, 2, 3), (2, 1, 0), (3, 2, 0)]) + n)
     faces.append(np.array([(4, n + 4, 5), (6, n + 4, 4), (7, n + 4, 6), (5, n + 4, 7)]) * 1)
     return 1.1 * np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
-
-
-def ground_colour(palette: Palette) -> np.ndarray:
-    """Give the vertex colour that vanishes into the ground: (3,) uint8."""
-    return line_colour(rgb(palette.ground))

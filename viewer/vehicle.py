@@ -6,12 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.contract import Alert, AlertKind, FleetRow, Link, Mission, Model, Outcome, Prediction, Sample, State, Status
+from fleet.contract import Alert, AlertKind, FleetRow, Link, Mission, Model, Prediction, Sample, State, Status
 from fleet.frames import Origin
 from viewer.place import UNIT_M, Place
 
 TRAIL_ROWS = 900  # about 90 s at 10 Hz
 SILENT_S = 3.0  # without a sample for this long the link counts as lost, whatever was last said
+GIVE_UP_S = 10.0  # a writer silent for so long has lost its claim: a lower epoch (a restarted fleet) may speak
+ABANDONED_S = 30.0  # without a word of any worker for so long, what was last said is no state any more
 JUMP_S = 5.0  # a step back in time by more than this is another flight: start afresh
 MAX_STEPS, MAX_AHEAD_S = 5_000, 3_600.0  # look-ahead accepted from outside: steps, and time [s]
 
@@ -81,7 +83,8 @@ class Vehicle:
     prediction: Prediction | None = None
     forecast: Forecast | None = None
     row: FleetRow | None = None
-    alerts: dict[AlertKind, Alert] = field(default_factory=dict)
+    alerts: dict[AlertKind, Alert] = field(default_factory=dict)  # replaced as a whole, never changed
+    refused: tuple[float, str] = (-np.inf, "")  # when a message was refused, monotonic [s], and why
     trail: deque = field(default_factory=lambda: deque(maxlen=TRAIL_ROWS))  # t, east, north, up, Va
     past: deque = field(default_factory=lambda: deque(maxlen=60))  # forecasts, about one a second
     fits: deque = field(default_factory=lambda: deque(maxlen=200))  # t, mean fit [%]
@@ -96,13 +99,21 @@ class Vehicle:
         silent = now - self.heard > SILENT_S
         if silent or (self.status is not None and self.status.link is Link.LOST):
             return State.LINK_LOST
+        if now - self.believed > ABANDONED_S:
+            return State.WAITING if self.believed == -np.inf else State.UNCLAIMED
         if self.row is not None:
             return self.row.state
         if self.prediction is not None:
             return self.prediction.state
         if self.model is not None:
-            return State.VERIFIED if self.model.verdict.outcome is Outcome.VERIFIED else State.IDENTIFYING
+            return State.VERIFIED if self.model.in_force is not None else State.IDENTIFYING
         return State.WAITING
+
+    def still(self) -> "Vehicle":
+        """Give a copy that nobody changes any more; the histories stay shared, read them through the feed."""
+        copy = object.__new__(Vehicle)
+        copy.__dict__.update(self.__dict__)
+        return copy
 
     def age(self, now: float) -> float:
         """Give the time since the last sample arrived [s]; infinite before any."""
@@ -149,7 +160,8 @@ class Vehicle:
         self.at, self.alt_m = enu[-1], float(x[fix][-1, 2]) * 1e-3
 
     def forget(self) -> None:
-        """Drop everything that belongs to a flight: the clock went back."""
+        """Drop everything that belongs to a flight: the clock went back, or the scene begins anew elsewhere."""
+        self.at, self.alerts = None, {}
         self.t, self.forecast, self.prediction, self.model, self.row = -np.inf, None, None, None, None
         for history in (self.trail, self.past, self.fits):
             history.clear()

@@ -23,9 +23,13 @@ def horizon_s(vehicle: Vehicle) -> float:
 
 
 def fit(vehicle: Vehicle) -> float | None:
-    """Give the mean fit over the states of the last verdict [%]; None before any."""
+    """Give the mean fit over the states of the model in force [%]; None before any."""
     source = (
-        vehicle.model.verdict.fit if vehicle.model is not None else vehicle.row.fit if vehicle.row is not None else {}
+        (vehicle.model.in_force or vehicle.model.verdict).fit
+        if vehicle.model is not None
+        else vehicle.row.fit
+        if vehicle.row is not None
+        else {}
     )
     values = [value for value in source.values() if isfinite(value)]
     return sum(values) / len(values) if values else None
@@ -33,9 +37,9 @@ def fit(vehicle: Vehicle) -> float | None:
 
 def empty(feed: Feed, now: float) -> str:
     """Say what is listened to and what to check, while nobody is there."""
-    n, strange = sum(feed.counts.values()) - feed.counts["strange"], feed.counts["strange"]
+    n, strange = sum(tuple(feed.counts.values())) - feed.counts["strange"], feed.counts["strange"]
     odd = f" {strange} could not be read." if strange else ""
-    said = "".join(f"<br>{escape(text)}" for text in feed.sentences.values() if text)
+    said = "".join(f"<br>{escape(text)}" for text in feed.said())
     return (
         f'<div class="uav"><h1>No vehicles yet</h1><div class="soft">Listening on <code>{escape(feed.listening)}'
         f"</code> for {now - feed.since:.0f} s. {n} messages.{odd}{said}<br>Check that a gateway "
@@ -55,7 +59,7 @@ def summary(fleet: list[Vehicle], feed: Feed, palette: Palette, now: float) -> s
     )
     horizons = sorted(h for vehicle in fleet if (h := horizon_s(vehicle)) > 0)
     median = f" · median horizon {horizons[len(horizons) // 2]:.0f} s" if horizons else ""
-    said = "".join(f'<div class="soft">{escape(text)}</div>' for text in feed.sentences.values() if text)
+    said = "".join(f'<div class="soft">{escape(text)}</div>' for text in feed.said())
     plural = "UAV" if len(fleet) == 1 else "UAVs"
     head = f"<h1>{len(fleet)} {plural}<small>{median}{_fleet_coverage(fleet)}</small></h1>"
     return f'<div class="uav">{head}{chips}{said}</div>'
