@@ -216,7 +216,8 @@ class Model(Message, frozen=True, kw_only=True):
     topic: ClassVar[str] = "model"
 
     method: Annotated[str, Meta(description="paper")]
-    verdict: Verdict
+    verdict: Annotated[Verdict, Meta(description="of the newest identification")]
+    in_force: Annotated[Verdict | None, Meta(description="of the model below; null before any was verified")] = None
     longitudinal: Linear | None = None
     lateral: Linear | None = None
     window_t0: Annotated[float, Meta(description="first instant of the identification window [s since 1970]")] = 0.0

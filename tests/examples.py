@@ -102,6 +102,7 @@ MESSAGES = (
         t=T,
         method="paper",
         verdict=VERDICT,
+        in_force=VERDICT,
         longitudinal=_linear(("u", "w", "q", "theta"), ("delta_e", "delta_t")),
         lateral=_linear(("phi", "psi", "p", "r", "v"), ("delta_a", "delta_r")),
         window_t0=T - 20.0,

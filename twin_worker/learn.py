@@ -51,7 +51,7 @@ def learn(twin: Twin) -> list[Message]:
     verdict = _fly_once_more(twin, window, held_n, axes, verify(axes, held_out, twin.axes, twin.omega))
     verdict = msgspec.structs.replace(verdict, sentence=f"{twin.name}: {verdict.sentence}", tries=twin.tries)
     if verdict.outcome is Outcome.VERIFIED:
-        twin.axes, twin.tries = axes, 0
+        twin.axes, twin.in_force, twin.tries = axes, verdict, 0
     twin.verdict = verdict
     twin.model = _model(twin, verdict, window)
     return [twin.model]
@@ -110,6 +110,7 @@ def _model(twin: Twin, verdict: Verdict, window: Window) -> Model:
         t=float(window.t[-1]),
         method="paper",
         verdict=verdict,
+        in_force=twin.in_force,
         longitudinal=lon.linear() if lon else None,
         lateral=lat.linear() if lat else None,
         window_t0=float(window.t[0]),

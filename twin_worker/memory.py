@@ -40,6 +40,7 @@ class Twin:
     servos: ServoMap = field(default_factory=lambda: servo_map({}))
     axes: tuple[Axis, Axis] | None = None
     verdict: Verdict = field(default_factory=_unheard)
+    in_force: Verdict | None = None  # the verdict `axes` were believed on
     model: Model | None = None
     prediction: Prediction | None = None
     state: State = State.WAITING
@@ -57,6 +58,13 @@ class Twin:
     def name(self) -> str:
         """Give the name sentences use, e.g. uav-7."""
         return f"uav-{self.uav}"
+
+    @property
+    def standing(self) -> str:
+        """Give the verdict of the model in force, and what became of the newest try where that is another."""
+        if self.in_force is None or self.verdict.outcome is Outcome.VERIFIED:
+            return self.verdict.sentence
+        return f"{self.in_force.sentence}; newest try: {self.verdict.outcome.value.replace('_', ' ')}"
 
     @property
     def vehicle(self) -> str:

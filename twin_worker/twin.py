@@ -90,8 +90,8 @@ def fleet_row(twin: Twin, now: float, **claim: object) -> FleetRow:
     return FleetRow(
         uav=twin.uav,
         state=twin.state,
-        verdict=twin.verdict.sentence,
-        fit=twin.verdict.fit,
+        verdict=twin.standing,
+        fit=(twin.in_force or twin.verdict).fit,
         horizon_s=made.horizon_s if made else 0.0,
         sample_age_s=max(now - twin.history.newest, 0.0) if np.isfinite(twin.history.newest) else None,
         prediction_age_s=max(now - made.t, 0.0) if made else None,

@@ -84,7 +84,7 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
         colour = palette.verified if verdict.outcome is Outcome.VERIFIED else palette.identifying
         cards.append(
             f'<div class="say" style="border-color:{colour}"><b>{escape(verdict.outcome.value.replace("_", " "))}</b> '
-            f'<span class="soft">newest try; threshold {verdict.threshold:.0f} %, tried {verdict.tries} times</span><br>'
+            f'<span class="soft">newest try, number {verdict.tries}, threshold {verdict.threshold:.0f} %</span><br>'
             f"{escape(verdict.sentence)}</div>"
         )
     elif vehicle.row is not None and vehicle.row.verdict:
