@@ -6,6 +6,7 @@ Source: Huang 2021, eq. 16-17 (Newton-Raphson on J = e'e); Ljung 1999, section 1
 
 import numba as nb
 import numpy as np
+import scipy.linalg
 
 
 @nb.njit(cache=True)
@@ -120,7 +121,7 @@ def refine(
             state = g, H
         g, H = state
         lhs = H + np.diag(Lambda + mu * (np.diag(H) + Lambda))
-        trial = par + np.linalg.solve(lhs, g - Lambda * (par - par0))
+        trial = par + scipy.linalg.solve(lhs, g - Lambda * (par - par0), assume_a="pos")
         cost, g, H, _ = normal_equations(trial.reshape(shape), y, u, ok, W, length)
         total = cost + float(Lambda @ (trial - par0) ** 2)
         if np.isfinite(total) and total < best:
