@@ -49,7 +49,11 @@ class Bus(AbstractContextManager, Protocol):
         """Declare one wildcard queryable for a class: `reply(uav or None, parameters, payload)`."""
 
     def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
-        """Ask everyone for a class; the highest epoch per aircraft is kept."""
+        """Ask everyone for a class, for at most `timeout_s` [s]; the highest epoch per aircraft is kept.
+
+        Raises:
+            ConnectionError: when the session is closed; join the router again.
+        """
 
     def present(self, name: str) -> None:
         """Say that this process lives, until it does not: a liveliness token at `parauav/@live/{name}`."""
@@ -59,19 +63,20 @@ class Bus(AbstractContextManager, Protocol):
 
 
 def newest(found: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
-    """Keep the reply with the highest epoch, then the newest, per UAV; messages without a UAV all stay."""
-    best: dict[int, tuple[M, Stamp | None]] = {}
+    """Keep the reply with the highest epoch, then the newest, per UAV (and kind of alert); without a UAV all stay."""
+    best: dict[tuple[int, str], tuple[M, Stamp | None]] = {}
     rest = []
     for message, stamp in found:
         uav = getattr(message, "uav", None)
         if uav is None:
             rest.append((message, stamp))
             continue
+        what = uav, str(getattr(message, "kind", ""))
         rank = (stamp.epoch if stamp else 0, message.t)  # type: ignore[attr-defined]
-        held = best.get(uav)
+        held = best.get(what)
         if held is None or rank > (held[1].epoch if held[1] else 0, held[0].t):  # type: ignore[attr-defined]
-            best[uav] = (message, stamp)
-    return [best[uav] for uav in sorted(best)] + rest
+            best[what] = (message, stamp)
+    return [best[what] for what in sorted(best)] + rest
 
 
 def asked_for(uav: int | None, answers: Answers) -> list[tuple[Any, Stamp | None]]:
@@ -152,9 +157,9 @@ class ZenohBus(AbstractContextManager):
         publisher = self._publishers.get(name)
         if publisher is None:
             with self._lock:
-                publisher = self._publishers.setdefault(
-                    name, self._session.declare_publisher(name, encoding=encoding(kind))
-                )
+                if (publisher := self._publishers.get(name)) is None:
+                    publisher = self._session.declare_publisher(name, encoding=encoding(kind))
+                    self._publishers[name] = publisher
         publisher.put(encode(message), attachment=pack_stamp(stamp) if stamp else None)
 
     def subscribe(self, kind: type, heard: Heard) -> None:
@@ -193,12 +198,17 @@ class ZenohBus(AbstractContextManager):
 
     def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
         """Ask everyone for a class; the highest epoch per aircraft is kept."""
-        replies = self._session.get(
-            key(kind, who),
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout_s,
-        )
+        try:
+            replies = self._session.get(
+                key(kind, who),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout_s,
+            )
+        except zenoh.ZError as error:
+            raise ConnectionError(
+                f"bus: asking on {key(kind, who)} failed ({error}), expected an open session; join the router again"
+            ) from None
         pairs = [self._read(kind, reply.ok) for reply in replies if reply.ok is not None]
         return newest([pair for pair in pairs if pair is not None])
 

@@ -14,7 +14,7 @@ from examples import EXAMPLES
 
 from fleet.bus import Bus, MemoryBus, connect, endpoint, key, newest, open_router, reachable, uav_in
 from fleet.codec import Stamp, encode, encoding
-from fleet.contract import Account, Alert, FleetState, Prediction, Sample, Status
+from fleet.contract import Account, Alert, AlertKind, FleetState, Prediction, Sample, Status
 
 PATIENCE_S = 10.0
 STAMP = Stamp(epoch=5, writer=99)
@@ -169,6 +169,11 @@ def test_newest_prefers_the_epoch_then_the_time() -> None:
     assert newest([(early, Stamp(2, 1)), (late, Stamp(2, 2))]) == [(late, Stamp(2, 2))]
     assert newest([(late, None), (early, Stamp(1, 1))]) == [(early, Stamp(1, 1))]
     assert newest([]) == []
+
+
+def test_newest_keeps_every_kind_of_alert() -> None:
+    both = [(Alert(uav=1, t=1.0, kind=kind), None) for kind in (AlertKind.CONFLICT, AlertKind.GROUND)]
+    assert newest(both) == both
 
 
 # --- zenoh alone -----------------------------------------------------------------------------------------------------
