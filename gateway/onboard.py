@@ -14,6 +14,7 @@ from fleet.telemetry.craft import Craft
 SYSTEM, COMPONENT = 255, dialect.MAV_COMP_ID_MISSIONPLANNER  # how ground stations call themselves
 HEARTBEAT_S = 1.0
 RETRY_S = 0.5  # for one item or a handful of parameters
+ITEM_TRIES = 20  # in vain, then the list is asked for again: it may have become shorter
 FIRST_WAIT_S, LONGEST_WAIT_S = 1.0, 60.0  # for a whole list, doubled at every try
 ITEMS_AT_ONCE = {"ardupilot": 5}  # the others want one request at a time
 PARAMS_AT_ONCE = 10
@@ -62,6 +63,7 @@ class Questions:
         self._rate_wait, self._rate_tries = Patience(10.0), 0
         self._params_at = self._items_at = float("-inf")
         self._items_left: int | None = None
+        self._item_tries = 0  # since the last item that came
 
     def ask(self, now: float) -> list[Any]:
         """Give the messages to send now."""
@@ -74,6 +76,12 @@ class Questions:
                 return []
             if self._items_left != len(missing):
                 self._mission_list.reset()
+                self._item_tries = 0
+            self._item_tries += 1
+            if self._item_tries > ITEM_TRIES:
+                self._item_tries = 0
+                route.drop_download()
+                return []
             self._items_left, self._items_at = len(missing), now
             wanted = missing[: ITEMS_AT_ONCE.get(self.craft.autopilot, 1)]
             return [dialect.MAVLink_mission_request_int_message(*self._to, seq) for seq in wanted]

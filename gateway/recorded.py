@@ -30,6 +30,12 @@ class Replay:
         self._thread.start()
 
     def _play(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
+        try:
+            self._play_steps(number, out, stop)
+        finally:  # a disk that fails half-way ends the recording too
+            _put(out, Batch(number, [], ended=True), stop)
+
+    def _play_steps(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
         began, (now, heard) = time.monotonic(), self._first
         first = now
         while not stop.wait(max(0.0, began + (now - first) / self.spec.speed - time.monotonic())):
@@ -39,7 +45,6 @@ class Replay:
             if step is None:
                 break
             now, heard = step
-        _put(out, Batch(number, [], ended=True), stop)
 
     def length_s(self) -> float:
         """Read how long the recording is [s]; takes a moment."""

@@ -37,8 +37,9 @@ def read_spec(text: str, offset: int = 0) -> Spec:
                 return Spec(text, kind, host or LOOPBACK, int(port), 1.0, offset)
         if not settings and kind == "replay":
             path, _, query = rest.partition("?")
-            speed = read_speed(dict(parse_qsl(query)).get("speed", "1"))
-            if path.endswith(SUFFIXES):
+            asked = dict(parse_qsl(query))
+            speed = read_speed(asked.pop("speed", "1"))
+            if path.endswith(SUFFIXES) and not asked:
                 return Spec(text, kind, path, 0, speed, offset)
     raise ValueError(
         f"--link: found {text!r}, expected udpin:HOST:PORT or replay:FILE.tlog?speed=4, "

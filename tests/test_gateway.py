@@ -68,6 +68,7 @@ def test_a_link_is_read():
         "replay:x.csv",
         "udpin:h:1#offset=x",
         "udpin:h:1#a=1",
+        "replay:x.tlog?sped=4",
     ],
 )
 def test_what_is_no_link_stops_at_start(text):

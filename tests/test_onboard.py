@@ -8,11 +8,12 @@ from fleet.telemetry.intake import Intake
 from gateway.onboard import Onboard
 
 
-def fly(aircraft, seconds, tick=0.1):
+def fly(aircraft, seconds, tick=0.1, every_tick=lambda t: None):
     """Let intake and questions talk with an aircraft for a while of pretended time."""
     intake, onboard, news = Intake(), Onboard(), []
     for step in range(round(seconds / tick)):
         t = T0 + step * tick
+        every_tick(t - T0)
         if step % 10 == 0:
             intake.hear(t, aircraft.talker.heartbeat(), "air")
         for frame in aircraft.stream():
@@ -40,6 +41,35 @@ def test_mission_and_parameters_are_fetched_whatever_the_radio_loses(loss):
             names.count("PARAM_REQUEST_LIST") == names.count("MISSION_REQUEST_LIST") == names.count("MISSION_ACK") == 1
         )
         assert names.count("MISSION_REQUEST_INT") <= len(ITEMS) + 5
+
+
+def test_a_mission_that_became_shorter_meanwhile_is_asked_for_again():
+    aircraft = Aircraft(0.0)
+
+    def shorten(t):
+        if any(name == "MISSION_REQUEST_INT" for name in aircraft.names()):
+            aircraft.voice._items = ITEMS[:5]
+
+    news, _ = fly(aircraft, 60.0, every_tick=shorten)
+    mission = of(Mission, news)[-1]
+    assert mission.complete
+    assert mission.items == ITEMS[:5]
+    assert aircraft.names().count("MISSION_REQUEST_INT") < 150
+
+
+def test_after_a_restart_the_mission_is_asked_for_again():
+    aircraft, intake, onboard = Aircraft(0.0), Intake(), Onboard()
+    for step in range(600):
+        t = T0 + 0.1 * step
+        if step == 300:
+            aircraft.voice._items = ITEMS[:5]
+        boot = 500 + 0.1 * step if step < 300 else 0.1 * (step - 300)
+        intake.hear(t, aircraft.talker.heartbeat() + aircraft.talker.attitude(boot), "air")
+        for _, data in onboard.tick(t, intake.crafts.values()):
+            for frame in aircraft.hear(data, t):
+                intake.hear(t, frame, "air")
+    (craft,) = intake.crafts.values()
+    assert craft.route.items == ITEMS[:5]
 
 
 def test_who_does_not_answer_is_asked_ever_less():

@@ -12,9 +12,9 @@ from fleet.telemetry.params import ParamBook
 from fleet.telemetry.route import MESSAGES, RouteBook
 from fleet.telemetry.shelf import Shelf
 
-LOST_S = 3.0  # silence after which the link is called lost
-STATUS_S = 0.95  # a little under the second, for it is asked every 0.1 s
-REMEMBER_S = 30.0  # how long a sentence stands
+LOST_S = 3.0  # silence after which the link is called lost [s]
+STATUS_S = 0.95  # between two messages; a little under the second, for it is asked every 0.1 s [s]
+REMEMBER_S = 30.0  # how long a sentence stands [s]
 SMOOTH = 0.4  # weight of the newest second in a rate
 
 
@@ -23,7 +23,7 @@ class Craft:
 
     def __init__(self, uav: int, system: int, component: int, source: Hashable) -> None:
         self.uav, self.system, self.component, self.source = uav, system, component, source
-        self.heard = float("-inf")  # arrival of the last message
+        self.heard = float("-inf")  # arrival of the last message, fleet time [s since 1970]
         self.link = Link.LIVE
         self.autopilot, self.vehicle, self.mode, self.armed = "generic", heartbeat.UNKNOWN, "", False
         self.params, self.route = ParamBook(uav), RouteBook(uav)
@@ -82,6 +82,7 @@ class Craft:
         self._refused += not fresh and row.tick is not Tick.NONE  # without a time of its own it may well repeat one
         if self._clocks.jumps != self._jumps:
             self._jumps = self._clocks.jumps
+            self.route.stale = True  # after a restart there may be another mission on board
             self.say(f"the aircraft's clock jumped ({self._jumps} times so far), time was anchored anew", arrival)
 
     def _read_heartbeat(self, message: Any) -> None:

@@ -68,6 +68,10 @@ class RouteBook:
             return None
         return [seq for seq in range(draft.count) if seq not in draft.items]
 
+    def drop_download(self) -> None:
+        """Forget a download that came to a stop; the list has to be asked for again."""
+        self._drafts[False], self.stale = None, True
+
     def take(self, now: float) -> Mission | None:
         """Give the mission when there is news."""
         up, down = self._drafts[True], self._drafts[False]
