@@ -170,7 +170,7 @@ class Voice:
         """Listen to bytes from the ground at `t` since boot [s] and give the answers; noise is passed over."""
         try:
             messages: Iterable[Any] = self._in.parse_buffer(data) or ()
-        except mav.MAVError:
+        except (mav.MAVError, ValueError):  # a wrong checksum, or text that is no text
             return []
         answers: list[Any] = []
         for message in messages:
@@ -217,7 +217,7 @@ class Voice:
         del t
         wanted = mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION
         asks_version = message.command == mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
-            message.command == mav.MAV_CMD_REQUEST_MESSAGE and int(message.param1) == wanted
+            message.command == mav.MAV_CMD_REQUEST_MESSAGE and message.param1 == wanted  # which may be no number
         )
         fine = asks_version or message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL  # the rates are as they should be
         result = mav.MAV_RESULT_ACCEPTED if fine else mav.MAV_RESULT_UNSUPPORTED
