@@ -11,8 +11,8 @@ from typing import NamedTuple, Protocol, cast
 from gateway.spec import Spec
 
 QUEUE = 20_000  # batches between receiving and decoding
-POLL_S = 0.2  # how soon a receiving thread notices the end
-DATAGRAM = 65_535
+POLL_S = 0.2  # how soon a receiving thread notices the end [s]
+DATAGRAM = 65_535  # longest there is [bytes]
 _T0 = time.time() - time.monotonic()
 
 

@@ -13,15 +13,15 @@ from fleet.telemetry.craft import Craft
 
 SYSTEM, COMPONENT = 255, dialect.MAV_COMP_ID_MISSIONPLANNER  # how ground stations call themselves
 HEARTBEAT_S = 1.0
-RETRY_S = 0.5  # for one item or a handful of parameters
+RETRY_S = 0.5  # for one item or a handful of parameters [s]
 ITEM_TRIES = 20  # in vain, then the list is asked for again: it may have become shorter
-FIRST_WAIT_S, LONGEST_WAIT_S = 1.0, 60.0  # for a whole list, doubled at every try
+FIRST_WAIT_S, LONGEST_WAIT_S = 1.0, 60.0  # for a whole list, doubled at every try [s]
 ITEMS_AT_ONCE = {"ardupilot": 5}  # the others want one request at a time
 PARAMS_AT_ONCE = 10
 LIST_AGAIN = 200  # so many parameters missing are asked for as a list
-RATES_AFTER_S = 5.0  # the first judgement of rates
+RATES_AFTER_S = 5.0  # the first judgement of rates [s]
 RATE_TRIES = 3
-WANTED_HZ: dict[str, float] = {
+WANTED_HZ: dict[str, float] = {  # [Hz]
     "ATTITUDE": 25,
     "SERVO_OUTPUT_RAW": 20,
     "GLOBAL_POSITION_INT": 10,

@@ -8,7 +8,7 @@ from fleet.bus import Answers, Bus
 from fleet.contract import Account, Message, Mission, Params, Status
 
 KEPT = (Status, Mission, Params)
-REPEAT_S = 10.0  # mission and parameters are said again, for those who missed them
+REPEAT_S = 10.0  # mission and parameters are said again, for those who missed them [s]
 
 
 class Publisher:

@@ -13,9 +13,9 @@ from gateway.link import QUEUE, Batch, Link, wall
 from gateway.onboard import Onboard
 from gateway.publish import Publisher
 
-TICK_S = 0.1
-NAP_S = 0.02
-ACCOUNT_S = 1.0
+TICK_S = 0.1  # between two publications of a live link [s]
+NAP_S = 0.02  # at an empty queue [s]
+ACCOUNT_S = 1.0  # between two counts [s]
 
 
 class Pump:
@@ -38,7 +38,7 @@ class Pump:
         self._queue: queue.Queue[Batch] = queue.Queue(QUEUE)
         self._open = set(range(len(links)))
         self._live = [number for number, link in enumerate(links) if link.spec.kind != "replay"]
-        self._recorded = float("-inf")  # newest recorded time
+        self._recorded = float("-inf")  # newest recorded time [s since 1970]
 
     def run(self, stop: threading.Event) -> None:
         """Work until `stop` is set or every recording has ended; the links' threads end with it."""

@@ -119,7 +119,10 @@ class Feed:
     def _vehicle(self, uav: int) -> Vehicle:
         if uav not in self.vehicles:
             if len(self.vehicles) >= MAX_VEHICLES or not 0 <= uav < 1_000_000:
-                raise ValueError(f"uav-{uav}: one too many, or no id; the page keeps {MAX_VEHICLES}")
+                raise ValueError(
+                    f"uav-{uav}: found {len(self.vehicles)} UAVs already or no id below 1,000,000, "
+                    f"expected at most {MAX_VEHICLES}; open another viewer"
+                )
             self.vehicles[uav] = Vehicle(uav)
         return self.vehicles[uav]
 
@@ -174,7 +177,7 @@ class Feed:
         if vehicle.prediction is not None and 0 < vehicle.prediction.t - message.t < JUMP_S:
             return  # delayed, and newer is here
         if self.place is None and message.path.shape[0]:
-            self.place = Place(_checked(Origin(*message.origin)))
+            self.place = Place(_checked(message.ned_origin()))
         found = forecast(message, self.place, now) if self.place is not None else None
         vehicle.prediction, vehicle.forecast = message, found
         if found is None:

@@ -7,14 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.contract import Alert, AlertKind, FleetRow, Link, Mission, Model, Prediction, Sample, State, Status
-from fleet.frames import Origin
 from viewer.place import UNIT_M, Place
 
 TRAIL_ROWS = 900  # about 90 s at 10 Hz
-SILENT_S = 3.0  # without a sample for this long the link counts as lost, whatever was last said
-GIVE_UP_S = 10.0  # a writer silent for so long has lost its claim: a lower epoch (a restarted fleet) may speak
-ABANDONED_S = 30.0  # without a word of any worker for so long, what was last said is no state any more
-JUMP_S = 5.0  # a step back in time by more than this is another flight: start afresh
+SILENT_S = 3.0  # without a sample for this long the link counts as lost, whatever was last said [s]
+GIVE_UP_S = 10.0  # a writer silent for so long has lost its claim: a lower epoch (a restarted fleet) may speak [s]
+ABANDONED_S = 30.0  # without a word of any worker for so long, what was last said is no state any more [s]
+JUMP_S = 5.0  # a step back in time by more than this is another flight: start afresh [s]
 MAX_STEPS, MAX_AHEAD_S = 5_000, 3_600.0  # look-ahead accepted from outside: steps, and time [s]
 
 
@@ -54,14 +53,17 @@ def forecast(message: Prediction, place: Place, heard: float) -> Forecast | None
     if n == 0:
         return None
     if not 2 <= n <= MAX_STEPS or path.shape != (n, 3) or tube.shape != (n, 3):
-        raise ValueError(f"uav-{message.uav}: prediction has shapes {ahead.shape} {path.shape} {tube.shape}; resend")
+        raise ValueError(
+            f"uav-{message.uav}: prediction has shapes {ahead.shape} {path.shape} {tube.shape}, "
+            f"expected (n,) (n, 3) (n, 3) with 2 to {MAX_STEPS} steps; resend"
+        )
     if (
         not (np.isfinite(ahead).all() and np.isfinite(message.t) and (np.diff(ahead) > 0).all())
         or np.abs(ahead).max() > MAX_AHEAD_S
     ):
         raise ValueError(f"uav-{message.uav}: prediction has times that do not rise within an hour; resend")
     tube = np.clip(np.nan_to_num(tube / UNIT_M), 0.0, 1e4)
-    return Forecast(message.t, heard, ahead, place.local(Origin(*message.origin), path), tube, message)
+    return Forecast(message.t, heard, ahead, place.local(message.ned_origin(), path), tube, message)
 
 
 @dataclass
@@ -136,7 +138,9 @@ class Vehicle:
     def hear_sample(self, sample: Sample, place: Place, now: float) -> None:
         """Take over the newest rows of a sample."""
         if not np.isfinite(sample.t):
-            raise ValueError(f"uav-{self.uav}: sample time {sample.t}; resend")
+            raise ValueError(
+                f"uav-{self.uav}: sample has time {sample.t}, expected seconds since 1970; check the gateway"
+            )
         if sample.t < self.t - JUMP_S:
             self.forget()
         self.heard, self.t = now, max(sample.t, self.t)
@@ -151,7 +155,7 @@ class Vehicle:
 
     def _hear_position(self, t: np.ndarray, x: np.ndarray, place: Place) -> None:
         if x.ndim != 2 or x.shape[1] < 3 or t.shape != (len(x),):
-            raise ValueError(f"uav-{self.uav}: position rows of shape {x.shape}; resend")
+            raise ValueError(f"uav-{self.uav}: position rows have shape {x.shape}, expected (n, 3) and n times; resend")
         fix = np.isfinite(x[:, :3]).all(axis=1) & np.isfinite(t) & (np.abs(x[:, :2]).sum(axis=1) > 0)
         if not fix.any():
             return

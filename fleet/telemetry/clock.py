@@ -6,16 +6,16 @@ fastest tells the offset best. Source: minimum-delay filter as in NTP (RFC 5905,
 
 from fleet.telemetry.dialects.mavlink import Tick
 
-WRAP_BOOT_S = 2**32 * 1e-3  # time_boot_ms
-WRAP_USEC_S = 2**32 * 1e-6  # time_usec cut to 32 bit
-BACK_S = 1.0  # going back further than this is a jump, not a late message
-LEAP_S = 2.0  # getting ahead of arrival further than this is a jump
+WRAP_BOOT_S = 2**32 * 1e-3  # time_boot_ms [s]
+WRAP_USEC_S = 2**32 * 1e-6  # time_usec cut to 32 bit [s]
+BACK_S = 1.0  # going back further than this is a jump, not a late message [s]
+LEAP_S = 2.0  # getting ahead of arrival further than this is a jump [s]
 CONFIRM = 3  # messages in a row that must agree on a jump
-WARM_UP_S = 1.0  # the offset may still step
-BUCKET_S = 15.0  # the minimum is over one to two of these
+WARM_UP_S = 1.0  # the offset may still step [s]
+BUCKET_S = 15.0  # the minimum is over one to two of these [s]
 SLEW = 2e-3  # drift the offset may follow [s/s]
 SLEW_FAST = 0.1  # when the offset is plainly too late [s/s]
-PLAIN_S = 0.25
+PLAIN_S = 0.25  # what is plainly [s]
 
 
 class Clock:

@@ -8,7 +8,7 @@ from fleet.contract import Params
 
 UNSOLICITED = 65535  # index of a value nobody asked for
 MOST = 5_000  # parameters accepted from one aircraft
-PAUSE_S = 1.0  # least time between two publications
+PAUSE_S = 1.0  # least time between two publications [s]
 _AS_INTEGER = {1: "<Bxxx", 2: "<bxxx", 3: "<Hxx", 4: "<hxx", 5: "<I", 6: "<i"}  # MAV_PARAM_TYPE
 
 

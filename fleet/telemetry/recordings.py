@@ -15,7 +15,7 @@ from fleet.telemetry.restamp import Record, backlog_offset, restamped
 
 SUFFIXES = (".tlog", ".tlog.xz")
 CHUNK = 1 << 16
-FLUSH_S = 0.1  # recorded time between two publications
+FLUSH_S = 0.1  # recorded time between two publications [s]
 EARLIEST, LATEST = 3e8, 4e9  # believable stamps [s since 1970]
 LONGEST_GAP_S = 86_400.0
 

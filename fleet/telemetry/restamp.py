@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 
 from fleet.telemetry.decode import V1
 
-BACKLOG_S = 5.0  # more than this is a backlog, not a delay
+BACKLOG_S = 5.0  # more than this is a backlog, not a delay [s]
 _BOOT_FIRST = {30, 32, 33}  # ATTITUDE, LOCAL_POSITION_NED, GLOBAL_POSITION_INT: time_boot_ms leads the payload
 
 Record = tuple[float, bytes]

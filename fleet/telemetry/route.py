@@ -10,8 +10,8 @@ NOTHING = 0  # no MAV_CMD; stands for an item that cannot be flown
 NAV_LAST = 95  # MAV_CMD_NAV_LAST: commands above it are no place to fly to
 DO_JUMP = 177
 WAYPOINT = 16
-ACCEPT_S = 3.0  # an upload without an acknowledgement is believed after this silence
-SETTLE_S = 2.0  # an incomplete list is shown after this silence
+ACCEPT_S = 3.0  # an upload without an acknowledgement is believed after this silence [s]
+SETTLE_S = 2.0  # an incomplete list is shown after this silence [s]
 
 _NAMES = ("MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_ACK", "MISSION_CLEAR_ALL", "MISSION_CURRENT")
 MESSAGES = frozenset(_NAMES)
