@@ -1,11 +1,16 @@
 """What every test shares: the recordings, a browser, a free port, the option that renews the golden bytes."""
 
+import copy
 import os
 import shutil
 import socket
 from pathlib import Path
 
+import flights
 import pytest
+
+from fleet.contract import Message
+from twin_worker.twin import Twin
 
 ROOT = Path(__file__).resolve().parent.parent
 LONG_FILES = pytest.StashKey[list[str]]()
@@ -55,3 +60,21 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     if found := config.stash[LONG_FILES]:
         terminalreporter.write_line("over 250 lines, think again: " + ", ".join(found))
+
+
+@pytest.fixture(scope="session")
+def heard(tmp_path_factory) -> tuple[Message, ...]:
+    """What the gateway says of one pretend flight."""
+    return flights.pretend(tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture(scope="session")
+def flown(tmp_path_factory) -> tuple[Twin, list[Message]]:
+    """The twin at the end of the flight, and everything it published."""
+    return flights.learnt(tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture
+def twin(flown) -> Twin:
+    """A copy of that twin, to do anything with."""
+    return copy.deepcopy(flown[0])

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from fleet.codec import decode, encode
-from fleet.contract import COLUMNS, Array, Item, Message, Prediction, Rows, Sample
+from fleet.contract import COLUMNS, Array, Item, Message, Prediction, Rows, Sample, Status
 from fleet.frames import Origin, to_geodetic, wrap
 from fleet.pretend.drive import to_tlog
 from fleet.pretend.uav import PretendUav
@@ -210,3 +210,9 @@ def shifted(heard: Iterable[Message], by: float, seconds: float) -> list[Message
 
 def columns(name: str) -> int:
     return len(COLUMNS[name])
+
+
+def status(twin: Twin, **changes) -> Status:
+    """What the gateway would say of the twin's aircraft now, changed."""
+    assert twin.status is not None
+    return msgspec.structs.replace(twin.status, t=twin.history.newest, **changes)

@@ -6,11 +6,10 @@ import flights as f
 import msgspec
 import numpy as np
 import pytest
-from flights import drive, predictions, published, shifted
+from flights import drive, predictions, published, shifted, status
 
 from fleet.codec import encode
 from fleet.contract import (
-    Message,
     Mission,
     Model,
     Outcome,
@@ -21,27 +20,6 @@ from twin_worker.offline import run
 from twin_worker.twin import Twin, advance, fleet_row
 
 FLOWN_S = 100.0
-
-
-@pytest.fixture(scope="session")
-def heard(tmp_path_factory) -> tuple[Message, ...]:
-    return f.pretend(tmp_path_factory.getbasetemp())
-
-
-@pytest.fixture(scope="session")
-def flown(tmp_path_factory) -> tuple[Twin, list[Message]]:
-    """The twin at the end of the flight, and everything it published."""
-    return f.learnt(tmp_path_factory.getbasetemp())
-
-
-@pytest.fixture
-def twin(flown) -> Twin:
-    return copy.deepcopy(flown[0])
-
-
-def status(twin: Twin, **changes) -> Status:
-    assert twin.status is not None
-    return msgspec.structs.replace(twin.status, t=twin.history.newest, **changes)
 
 
 # --- the whole flight ------------------------------------------------------------------------------------------------

@@ -1,37 +1,13 @@
 """What a twin does when the link goes, and with everything nobody should send: it says so, and nothing breaks."""
 
-import copy
-
 import flights as f
 import msgspec
 import numpy as np
 import pytest
-from flights import HERE, drive, item, predictions, published, shifted
+from flights import HERE, drive, item, predictions, published, shifted, status
 
-from fleet.contract import Alert, AlertKind, Link, Message, Mission, Sample, State, Status
+from fleet.contract import Alert, AlertKind, Link, Mission, Sample, State
 from twin_worker.twin import Twin, advance, fleet_row
-
-
-@pytest.fixture(scope="session")
-def heard(tmp_path_factory) -> tuple[Message, ...]:
-    return f.pretend(tmp_path_factory.getbasetemp())
-
-
-@pytest.fixture(scope="session")
-def flown(tmp_path_factory) -> tuple[Twin, list[Message]]:
-    """The twin at the end of the flight, and everything it published."""
-    return f.learnt(tmp_path_factory.getbasetemp())
-
-
-@pytest.fixture
-def twin(flown) -> Twin:
-    return copy.deepcopy(flown[0])
-
-
-def status(twin: Twin, **changes) -> Status:
-    assert twin.status is not None
-    return msgspec.structs.replace(twin.status, t=twin.history.newest, **changes)
-
 
 # --- the link --------------------------------------------------------------------------------------------------------
 
