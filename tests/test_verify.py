@@ -61,17 +61,17 @@ def test_standstill_is_holding():
 
 
 def test_a_perfect_model_fits_perfectly():
-    verdict = verify(truth(), linear_flight(20.0), None)
+    verdict = verify(truth(), linear_flight(20.0))
     assert verdict.outcome is Outcome.VERIFIED
     assert min(verdict.fit.values()) > 99.9
     assert mean(verdict.fit_hold) < 50.0
-    noisy = verify(truth(), linear_flight(20.0, noise=0.02), None)
+    noisy = verify(truth(), linear_flight(20.0, noise=0.02))
     assert 80.0 < mean(noisy.fit) < mean(verdict.fit)
 
 
 @pytest.mark.parametrize(("seconds", "longest"), [(20.0, 16.0), (16.0, 16.0), (15.0, 8.0), (9.0, 8.0), (5.0, 4.0)])
 def test_verified_at_the_longest_horizon_the_data_allow(seconds, longest):
-    verdict = verify(truth(), linear_flight(seconds), None)
+    verdict = verify(truth(), linear_flight(seconds))
     assert verdict.horizon_s == longest
     assert f"over {longest:.0f} s" in verdict.sentence
 
@@ -81,51 +81,40 @@ def test_a_model_good_for_a_while_is_verified_for_that_while():
     fits = [mean(fits_at(drifting, held, h)[0]) for h in (16.0, 8.0, 4.0)]
     assert fits[0] < fits[1] < fits[2]
     for horizon, between in ((8.0, fits[:2]), (4.0, fits[1:])):
-        verdict = verify(drifting, held, None, omega=sum(between) / 2)
+        verdict = verify(drifting, held, omega=sum(between) / 2)
         assert verdict.outcome is Outcome.VERIFIED and verdict.horizon_s == horizon
 
 
 def test_the_threshold_is_a_threshold():
     held = linear_flight(20.0)
-    fit = mean(verify(blurred(0.01), held, None).fit)
-    assert verify(blurred(0.01), held, None, omega=fit - 0.1).outcome is Outcome.VERIFIED
-    refused = verify(truth(), held, None, omega=100.0)
+    fit = mean(verify(blurred(0.01), held).fit)
+    assert verify(blurred(0.01), held, omega=fit - 0.1).outcome is Outcome.VERIFIED
+    refused = verify(truth(), held, omega=100.0)
     assert refused.outcome is Outcome.BELOW_THRESHOLD
     assert refused.threshold == 100.0 and "100 % is needed" in refused.sentence
 
 
 def test_no_better_than_holding_still_is_refused_however_low_the_threshold():
-    verdict = verify(standstill(truth()), linear_flight(20.0), None, omega=-100.0)
+    verdict = verify(standstill(truth()), linear_flight(20.0), omega=-100.0)
     assert verdict.outcome is Outcome.BELOW_THRESHOLD
 
 
 def test_steady_flight_identifies_nothing():
     held = linear_flight(20.0, lively=0.02, noise=0.1)
-    verdict = verify(standstill(truth()), held, None)
+    verdict = verify(standstill(truth()), held)
     assert verdict.outcome is Outcome.NOT_IDENTIFIABLE
     assert "steady flight" in verdict.sentence
 
 
-def test_a_worse_model_does_not_replace_the_last():
-    held = linear_flight(20.0)
-    worse = blurred(0.02)
-    assert verify(worse, held, None).outcome is Outcome.VERIFIED
-    verdict = verify(worse, held, truth())
-    assert verdict.outcome is Outcome.WORSE_THAN_LAST
-    assert "last verified model has 100 %" in verdict.sentence
-    assert verify(truth(), held, worse).outcome is Outcome.VERIFIED
-    assert verify(truth(), held, truth()).outcome is Outcome.VERIFIED
-
-
 def test_a_diverging_model_is_named_so():
-    verdict = verify(truth(grow=0.5), linear_flight(20.0), None)
+    verdict = verify(truth(grow=0.5), linear_flight(20.0))
     assert verdict.outcome is Outcome.DIVERGED
     assert all(np.isfinite(fit) for fit in verdict.fit.values())
 
 
 def test_a_model_of_no_numbers_is_refused():
     lon, lat = truth()
-    verdict = verify((replace(lon, D=np.full_like(lon.D, np.nan)), lat), linear_flight(20.0), None)
+    verdict = verify((replace(lon, D=np.full_like(lon.D, np.nan)), lat), linear_flight(20.0))
     assert verdict.outcome is Outcome.DIVERGED
     assert all(np.isfinite(fit) for fit in verdict.fit.values())
 
@@ -133,17 +122,17 @@ def test_a_model_of_no_numbers_is_refused():
 def test_data_full_of_holes_verify_nothing():
     held = linear_flight(20.0)
     held.ok[::50] = False
-    assert verify(truth(), held, None).outcome is not Outcome.VERIFIED
+    assert verify(truth(), held).outcome is not Outcome.VERIFIED
 
 
 def test_data_too_short_for_any_horizon_say_so():
     with pytest.raises(ValueError, match="needs 4 s"):
-        verify(truth(), linear_flight(3.0), None)
+        verify(truth(), linear_flight(3.0))
 
 
 def test_one_axis_cannot_carry_the_other():
     lon, lat = truth()
     frozen_lon = standstill((lon, lat))[0]
-    verdict = verify((frozen_lon, lat), linear_flight(20.0), None, omega=-100.0)
+    verdict = verify((frozen_lon, lat), linear_flight(20.0), omega=-100.0)
     assert verdict.outcome is Outcome.BELOW_THRESHOLD
     assert "no better than holding still" in verdict.sentence

@@ -6,7 +6,7 @@ import numpy as np
 from fleet.contract import Message, Model, Outcome, State, Verdict
 from fleet.window import Window
 from twin_worker.identify import AXES, Axis, identify_axis
-from twin_worker.memory import Twin
+from twin_worker.memory import Believed, Twin
 from twin_worker.predict import fly_ahead
 from twin_worker.preprocess import DT
 from twin_worker.verify import verify
@@ -16,7 +16,8 @@ WINDOW_S = 140.0  # longest stretch used [s]
 NO_WINGS = ("multirotor", "helicopter")
 SLOW = 6.0  # air-relative forward speed below which nothing flies on its wings [m/s]
 _FREE_RUN_S = (2.0, 4.0, 2.0, 8.0)  # free-run length of the n-th try [s]
-_WORSE = 1.2  # a new model may stray this much further than the last [-]
+_KEEP = 4  # verified models kept to choose from
+_NEW = 1.2  # a new model's only flight so far counts as a miss this much larger [-]
 _SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the window the n-th try uses
 
 
@@ -48,27 +49,33 @@ def learn(twin: Twin) -> list[Message]:
         twin.verdict = Verdict(outcome=Outcome.STARVED, sentence=f"{twin.name}: {error}", tries=twin.tries)
         return []
     axes = (lon, lat)
-    verdict = _fly_once_more(twin, window, held_n, axes, verify(axes, held_out, twin.axes, twin.omega))
+    verdict = verify(axes, held_out, twin.omega)
     verdict = msgspec.structs.replace(verdict, sentence=f"{twin.name}: {verdict.sentence}", tries=twin.tries)
-    if verdict.outcome is Outcome.VERIFIED:
-        twin.axes, twin.in_force, twin.tries = axes, verdict, 0
-    twin.verdict = verdict
-    twin.model = _model(twin, verdict, window)
+    twin.verdict = _choose(twin, window, held_n, axes, verdict)
+    if twin.verdict.outcome in (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST):
+        twin.tries = 0
+    twin.model = _model(twin, twin.verdict, window)
     return [twin.model]
 
 
-def _fly_once_more(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Axis], verdict: Verdict) -> Verdict:
-    """Withdraw a verdict whose model, flown in closed loop over the held-out data, strays further than the last one."""
-    if verdict.outcome is not Outcome.VERIFIED:
+def _choose(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Axis], verdict: Verdict) -> Verdict:
+    """Fly every verified model in closed loop over the held-out data; the one that strays least is in force."""
+    for known in twin.pool:
+        known.flown(_hindcast(twin, window, held_n, known.axes))
+    if verdict.outcome is Outcome.VERIFIED:
+        miss = _hindcast(twin, window, held_n, axes)
+        if np.isinf(miss):
+            sentence = f"{verdict.sentence}; but on the route the twin leaves its envelope; trying again"
+            verdict = msgspec.structs.replace(verdict, outcome=Outcome.DIVERGED, sentence=sentence)
+        else:
+            twin.pool.append(Believed(axes, verdict, float(window.t[-1]), _NEW * miss))
+    twin.pool = sorted((known for known in twin.pool if not np.isinf(known.miss)), key=Believed.rank)[:_KEEP]
+    if not twin.pool:
         return verdict
-    miss, before = (_hindcast(twin, window, held_n, each) for each in (axes, twin.axes))
-    if np.isinf(miss) and not np.isfinite(before):
-        sentence = f"{verdict.sentence}; but on the route the twin leaves its envelope; trying again"
-        return msgspec.structs.replace(verdict, outcome=Outcome.DIVERGED, sentence=sentence)
-    if miss > _WORSE * before + 1.0:
-        sentence = (
-            f"{verdict.sentence}; but on the route it strays {miss:.0f} m, the last verified model {before:.0f} m"
-        )
+    best = twin.pool[0]
+    twin.axes, twin.in_force = best.axes, best.verdict
+    if verdict.outcome is Outcome.VERIFIED and best.axes is not axes:
+        sentence = f"{verdict.sentence}; but an earlier model strays less on the route and stays in force"
         return msgspec.structs.replace(verdict, outcome=Outcome.WORSE_THAN_LAST, sentence=sentence)
     return verdict
 

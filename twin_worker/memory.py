@@ -24,6 +24,35 @@ def _unheard() -> Verdict:
     return Verdict(outcome=Outcome.STARVED, sentence="no samples yet")
 
 
+_NEWS = 0.3  # weight of the newest flight in a model's miss [-]
+
+
+@dataclass
+class Believed:
+    """A verified model, and how far it strays when it flies the newest held-out data in closed loop.
+
+    Attributes:
+        axes: longitudinal and lateral model
+        verdict: what it was believed on
+        t: end of the data it was believed on [s since 1970]
+        miss: mean miss on the route, smoothed over the hops [m]; nan before any route, inf once it left its envelope
+    """
+
+    axes: tuple[Axis, Axis]
+    verdict: Verdict
+    t: float
+    miss: float
+
+    def flown(self, miss: float) -> None:
+        """Take the miss of one more flight; nan, where there was no route to fly, changes nothing."""
+        if not np.isnan(miss):
+            self.miss = miss if np.isnan(self.miss) else (1 - _NEWS) * self.miss + _NEWS * miss
+
+    def rank(self) -> tuple[bool, float]:
+        """Give the sort key: least miss first; those that never flew a route last, the newest of them first."""
+        return (True, -self.t) if np.isnan(self.miss) else (False, self.miss)
+
+
 @dataclass
 class Twin:
     """One aircraft's twin: what was heard of it, the model in force, and how past predictions fared."""
@@ -40,6 +69,7 @@ class Twin:
     servos: ServoMap = field(default_factory=lambda: servo_map({}))
     axes: tuple[Axis, Axis] | None = None
     verdict: Verdict = field(default_factory=_unheard)
+    pool: list[Believed] = field(default_factory=list)
     in_force: Verdict | None = None  # the verdict `axes` were believed on
     model: Model | None = None
     prediction: Prediction | None = None

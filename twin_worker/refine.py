@@ -121,7 +121,9 @@ def refine(
             state = g, H
         g, H = state
         lhs = H + np.diag(Lambda + mu * (np.diag(H) + Lambda))
-        trial = par + scipy.linalg.solve(lhs, g - Lambda * (par - par0), assume_a="pos")
+        even = 1 / np.sqrt(np.diag(lhs))  # variances differ by many orders
+        scaled = even[:, None] * lhs * even
+        trial = par + even * scipy.linalg.solve(scaled, even * (g - Lambda * (par - par0)), assume_a="pos")
         cost, g, H, _ = normal_equations(trial.reshape(shape), y, u, ok, W, length)
         total = cost + float(Lambda @ (trial - par0) ** 2)
         if np.isfinite(total) and total < best:
