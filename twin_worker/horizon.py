@@ -22,7 +22,7 @@ _PRIOR = {  # expected spread of along, cross, vertical: base [m], growth [m/s^p
     "imm": (np.array([2.0, 2.0, 1.0]), np.array([1.6, 1.6, 0.5]), 1.4),
 }
 _PRIOR_PASSAGES = {  # times to 10 % that stand in for past predictions, from simulated flights of other seeds [s]
-    "paper": (4.0, 12.0, 60.0),
+    "paper": (8.0, 30.0, 60.0),
     "imm": (1.0, 2.0, 5.0),
 }
 _PRIOR_WEIGHT = 6.0  # past predictions the prior counts as [-]
