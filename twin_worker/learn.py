@@ -23,39 +23,50 @@ _SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the window the n-th try uses
 
 def learn(twin: Twin) -> list[Message]:
     """Identify and verify once; give the model with its verdict, or nothing while data are starved."""
-    if twin.vehicle in NO_WINGS:
-        sentence = f"{twin.name}: a {twin.vehicle} is not modelled yet, turn rate only"
-        twin.verdict = Verdict(outcome=Outcome.NOT_IDENTIFIABLE, sentence=sentence)
-        return []
     window = _airborne(twin.window(WINDOW_S))
-    have = 0.0 if window is None else float(window.ok.sum() * DT)
-    if window is None or have < LEAST_S:
-        if twin.axes is None:
-            sentence = f"{twin.name}: {have:.0f} s of whole data, {LEAST_S:.0f} s are needed; {_missing(twin)}"
-            twin.verdict, twin.state = Verdict(outcome=Outcome.STARVED, sentence=sentence), State.WAITING
+    why_not = _why_not(twin, window)
+    if window is None or why_not is not None:
+        if twin.axes is None and why_not is not None:
+            twin.verdict, twin.state = why_not, State.WAITING
         return []
     twin.state = State.IDENTIFYING if twin.axes is None else twin.state
     held_n = int(np.clip(0.3 * len(window), 8.2 / DT, 20.0 / DT))
-    known, held_out = window.part(0, len(window) - held_n), window.part(len(window) - held_n, len(window))
-    attempt = twin.tries % len(_SHARE)
-    known = known.part(int(len(known) * (1 - _SHARE[attempt])), len(known))
-    twin.tries += 1
-    last = twin.axes or (None, None)
     try:
-        lon, lat = (
-            identify_axis(axis, known, _FREE_RUN_S[attempt], before)[1] for axis, before in zip(AXES, last, strict=True)
-        )
+        axes = _identify(twin, window.part(0, len(window) - held_n))
     except (ValueError, np.linalg.LinAlgError) as error:
         twin.verdict = Verdict(outcome=Outcome.STARVED, sentence=f"{twin.name}: {error}", tries=twin.tries)
         return []
-    axes = (lon, lat)
-    verdict = verify(axes, held_out, twin.omega)
+    verdict = verify(axes, window.part(len(window) - held_n, len(window)), twin.omega)
     verdict = msgspec.structs.replace(verdict, sentence=f"{twin.name}: {verdict.sentence}", tries=twin.tries)
     twin.verdict = _choose(twin, window, held_n, axes, verdict)
     if twin.verdict.outcome in (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST):
         twin.tries = 0
     twin.model = _model(twin, twin.verdict, window)
     return [twin.model]
+
+
+def _why_not(twin: Twin, window: Window | None) -> Verdict | None:
+    """Say why there is nothing to identify yet; None where there is."""
+    if twin.vehicle in NO_WINGS:
+        sentence = f"{twin.name}: a {twin.vehicle} is not modelled yet, turn rate only"
+        return Verdict(outcome=Outcome.NOT_IDENTIFIABLE, sentence=sentence)
+    have = 0.0 if window is None else float(window.ok.sum() * DT)
+    if window is not None and have >= LEAST_S:
+        return None
+    sentence = f"{twin.name}: {have:.0f} s of whole data, {LEAST_S:.0f} s are needed; {_missing(twin)}"
+    return Verdict(outcome=Outcome.STARVED, sentence=sentence)
+
+
+def _identify(twin: Twin, known: Window) -> tuple[Axis, Axis]:
+    """Identify both axes; every further try uses another free-run length or share of the window."""
+    attempt = twin.tries % len(_SHARE)
+    twin.tries += 1
+    known = known.part(int(len(known) * (1 - _SHARE[attempt])), len(known))
+    before = twin.axes or (None, None)
+    lon, lat = (
+        identify_axis(axis, known, _FREE_RUN_S[attempt], last)[1] for axis, last in zip(AXES, before, strict=True)
+    )
+    return lon, lat
 
 
 def _choose(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Axis], verdict: Verdict) -> Verdict:
@@ -80,9 +91,9 @@ def _choose(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Axis], ve
     return verdict
 
 
-def _hindcast(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Axis] | None) -> float:
+def _hindcast(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Axis]) -> float:
     """Give the mean miss of a flight from the start of the held-out data [m]; inf: it diverges, nan: no route."""
-    if axes is None or twin.why_no_route():
+    if twin.why_no_route():
         return np.nan
     start = len(window) - held_n
     ahead = np.arange(0.0, int(held_n * DT))
