@@ -9,6 +9,7 @@ import time
 from collections import deque
 from contextlib import AbstractContextManager
 
+PARENT = "PARAUAV_PARENT"  # process id of the parent that started this process as its child
 _PATIENCE_S = 8.0  # between the request to stop and the end of patience [s]
 
 
@@ -30,7 +31,7 @@ class Children(AbstractContextManager):
             text=True,
             errors="replace",
             start_new_session=True,  # Ctrl-C reaches the parent alone, which then ends the children in order
-            env=os.environ | {"PYTHONUNBUFFERED": "1"},
+            env=os.environ | {"PYTHONUNBUFFERED": "1", PARENT: str(os.getpid())},
         )
         self._running[name] = child
         self._words[name] = deque(maxlen=6)

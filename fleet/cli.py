@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import os
 import pkgutil
 import signal
 import sys
@@ -9,6 +10,7 @@ import threading
 from collections.abc import Callable
 
 from fleet import __version__, commands
+from fleet.children import PARENT
 
 Run = Callable[[argparse.Namespace], int]
 
@@ -37,11 +39,20 @@ def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
 
 
 def stop_on_signal() -> threading.Event:
-    """Give an event that Ctrl-C and SIGTERM set, so that every process ends through its own door."""
+    """Give an event that Ctrl-C, SIGTERM and the death of a parent set, so that every process ends by its own door."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    if parent := os.environ.get(PARENT):
+        threading.Thread(target=_outlive_nobody, args=(int(parent), stop), daemon=True).start()
     return stop
+
+
+def _outlive_nobody(parent: int, stop: threading.Event) -> None:
+    """Stop once the process that started this one is gone, even if it was killed and could not say so."""
+    while not stop.wait(1.0):
+        if os.getppid() != parent:
+            stop.set()
 
 
 def id_range(text: str) -> range:

@@ -251,9 +251,9 @@ class Prediction(Message, frozen=True, kw_only=True):
     path: Annotated[Array, Meta(description="mean position, NED from origin, (n, 3) <f4 [m]")]
     tube: Annotated[Array, Meta(description="half-axes of the band, along, cross, vertical, (n, 3) <f4 [m]")]
     quantile: Annotated[float, Meta(description="share of flights the tube is meant to hold, 0..1")] = 0.9
-    horizon_s: Annotated[
-        float, Meta(description="confidence horizon: `quantile` of its like stay within 10 % [s]")
-    ] = 0.0
+    horizon_s: Annotated[float, Meta(description="confidence horizon: `quantile` of its like stay within 10 % [s]")] = (
+        0.0
+    )
     horizon_open: Annotated[bool, Meta(description="true: still below 10 % at the end of `ahead`")] = False
     held: Annotated[float, Meta(description="measured share inside the tube so far, 0..1; nan before any")] = float(
         "nan"

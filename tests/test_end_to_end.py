@@ -120,6 +120,21 @@ def test_ctrl_c_while_compiling_ends_every_child(tmp_path: Path) -> None:
     assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]
 
 
+def test_a_fleet_whose_parent_is_killed_ends_all_the_same() -> None:
+    ports, _ = own_ports()
+    with process("fleet.cli", "up", "--uavs", "1", *ports) as up:
+        wait(lambda: "UAVs" in up.stderr.readline(), up)
+        children = _children(up.pid)
+        assert len(children) == 3
+        up.kill()
+        wait(lambda: not any(_alive(pid) for pid in children))
+
+
+def _alive(pid: int) -> bool:
+    stat = Path(f"/proc/{pid}/stat")
+    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
 def _children(pid: int) -> list[int]:
     listed = f"/proc/{pid}/task/{pid}/children"
     return [int(child) for child in Path(listed).read_text().split()]

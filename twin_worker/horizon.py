@@ -21,7 +21,7 @@ _PRIOR = {  # expected spread of along, cross, vertical: base [m], growth [m/s^p
     "paper": (np.array([1.0, 0.8, 0.6]), np.array([0.5, 0.2, 0.2]), 1.3),
     "imm": (np.array([2.0, 2.0, 1.0]), np.array([1.6, 1.6, 0.5]), 1.4),
 }
-_PRIOR_PASSAGES = {  # times to 10 % that stand in for past predictions, from simulated flights of other seeds [s]
+_PRIOR_PASSAGES = {  # times to 10 % that stand in for past predictions, from simulated flights of two seeds, 541 in all [s]
     "paper": (8.0, 30.0, 60.0),
     "imm": (1.0, 2.0, 5.0),
 }
@@ -43,7 +43,7 @@ class Made:
 
 
 def track_frame(path: np.ndarray) -> np.ndarray:
-    """Give the horizontal unit vector along the path at each point, (n, 2); the last good one where it stands still."""
+    """Give the horizontal unit vector along the path at each point, (n, 2); north where it stands still."""
     step = np.gradient(path[:, :2], axis=0)
     length = np.linalg.norm(step, axis=1, keepdims=True)
     return np.divide(step, length, out=np.tile([1.0, 0.0], (len(path), 1)), where=length > 1e-6)
