@@ -159,11 +159,12 @@ class Record:
     @property
     def held(self) -> tuple[float, int]:
         """Give the measured share inside the tube so far (nan before any) and the predictions behind it."""
-        return (float(np.mean(self.inside)) if self.inside else float("nan")), len(self.inside)
+        inside = tuple(self.inside)  # at once: another thread may read while this one scores
+        return (float(np.mean(inside)) if inside else float("nan")), len(inside)
 
     def t10(self, method: str) -> tuple[float | None, float | None, int]:
         """Give the median first passage of 10 % [s], the share censored, and how many predictions that is."""
-        found = self.passages.get(method)
+        found = tuple(self.passages.get(method, ()))
         if not found:
             return None, None, 0
         times, censored = zip(*found, strict=True)
