@@ -21,7 +21,7 @@ _PRIOR = {  # expected spread of along, cross, vertical: base [m], growth [m/s^p
     "paper": (np.array([1.0, 0.8, 0.6]), np.array([0.5, 0.2, 0.2]), 1.3),
     "imm": (np.array([2.0, 2.0, 1.0]), np.array([1.6, 1.6, 0.5]), 1.4),
 }
-_PRIOR_PASSAGES = {  # times to 10 % that stand in for past predictions, from simulated flights of two seeds, 541 in all [s]
+_PRIOR_PASSAGES = {  # stand in for past times to 10 %; drawn from 541 predictions of two simulated fleets [s]
     "paper": (8.0, 30.0, 60.0),
     "imm": (1.0, 2.0, 5.0),
 }
