@@ -45,7 +45,7 @@ browser:
 lock:
 	@rm -rf .venv-lock && $(PYTHON) -m venv .venv-lock && .venv-lock/bin/pip install -q pip-tools
 	@.venv-lock/bin/pip-compile pyproject.toml --extra dev --all-build-deps --allow-unsafe --generate-hashes \
-	  --no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-header --no-annotate --strip-extras \
+	  --no-emit-options --no-header --no-annotate --strip-extras \
 	  --quiet --output-file $(LOCK)
 	@sed -i -e '/^#/d' -e '1i # Every package by version and hash, build backend included. Made from pyproject.toml by `make lock`; not by hand.' $(LOCK)
 	@rm -rf .venv-lock
