@@ -17,7 +17,7 @@ The letters of Beard & McLain, "Small Unmanned Aircraft" (2012), used everywhere
 Positive aileron rolls right, positive elevator pitches up, positive rudder yaws right.
 """
 
-from math import atan2, cos, hypot, pi, radians, sin, sqrt
+from math import cos, pi, radians, sin, sqrt
 from typing import Any, NamedTuple
 
 import numba as nb
@@ -73,21 +73,6 @@ def to_geodetic(origin: Origin, ned: np.ndarray) -> np.ndarray:
     return np.rint(np.stack([lat, lon, alt], axis=-1)).astype(np.int64)
 
 
-def quaternion(phi: float, theta: float, psi: float) -> np.ndarray:
-    """Turn 3-2-1 Euler angles [rad] into `quat` (4,), body -> NED, scalar first. Source: Beard & McLain, App. B."""
-    c1, s1 = cos(psi / 2), sin(psi / 2)
-    c2, s2 = cos(theta / 2), sin(theta / 2)
-    c3, s3 = cos(phi / 2), sin(phi / 2)
-    return np.array(
-        [
-            c1 * c2 * c3 + s1 * s2 * s3,
-            c1 * c2 * s3 - s1 * s2 * c3,
-            c1 * s2 * c3 + s1 * c2 * s3,
-            s1 * c2 * c3 - c1 * s2 * s3,
-        ]
-    )
-
-
 def body_to_ned(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, body: np.ndarray) -> np.ndarray:
     """Rotate body vectors to NED. Angles (n,) [rad], body FRD (n, 3). Source: Beard & McLain eq. 2.5."""
     return np.einsum("nij,nj->ni", _rotation(phi, theta, psi), body)
@@ -106,16 +91,6 @@ def _rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray
         [-st, sf * ct, cf * ct],
     ]
     return np.moveaxis(np.array(rows), -1, 0)
-
-
-def bearing(north: float, east: float) -> float:
-    """Give the bearing of a horizontal vector, from north clockwise [rad]."""
-    return atan2(east, north)
-
-
-def ground_speed(v_n: float, v_e: float) -> float:
-    """Give the speed over ground [m/s]."""
-    return hypot(v_n, v_e)
 
 
 @nb.njit(cache=True)

@@ -76,7 +76,6 @@ class Twin:
     state: State = State.WAITING
     tries: int = 0
     since: float = -np.inf  # last change of mode, mission or parameters
-    first_t: float = np.nan
     wind_t: float = -np.inf
     identify_t: float = -np.inf
     predict_t: float = -np.inf
@@ -129,7 +128,7 @@ def hear(twin: Twin, message: Message) -> None:
     if isinstance(message, Sample):
         twin.bad += twin.history.add(message)
         if twin.origin is None and message.position is not None:
-            twin.origin, twin.first_t = _first_place(twin.history), message.t
+            twin.origin = _first_place(twin.history)
     elif isinstance(message, Status):
         _hear_status(twin, message)
     elif isinstance(message, Mission):

@@ -31,14 +31,12 @@ class Flown:
     Attributes:
         path: position at each wanted look-ahead time, NED, (k, 3) [m]; None where the twin cannot fly this
         seq: mission item it starts on
-        replay_rms: how well the controller twin met the reported bank command on telemetry [rad]
         sentence: what limits it, or empty
         diverged: the twin left its flight envelope
     """
 
     path: np.ndarray | None
     seq: int
-    replay_rms: float
     sentence: str
     diverged: bool = False
 
@@ -91,31 +89,31 @@ def fly_ahead(now: Situation, axes: tuple[Axis, Axis], ahead: np.ndarray) -> Flo
     """
     good = _on_this_route(now.window, now.onboard.since)
     if len(good) < 5.0 / good.dt:
-        return Flown(None, -1, np.nan, f"{good.seconds:.0f} s on this route, 5 s are needed; wait")
+        return Flown(None, -1, f"{good.seconds:.0f} s on this route, 5 s are needed; wait")
     at = good.t[(len(good) - 1) % _SHADOW_STEP :: _SHADOW_STEP]
     seq = held(*now.history.rows("leg"), at, 15.0)[:, 0]
     if not np.isfinite(seq[-1]):
-        return Flown(None, -1, np.nan, "the mission item in force is not reported (MISSION_CURRENT)")
+        return Flown(None, -1, "the mission item in force is not reported (MISSION_CURRENT)")
     seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
     par, absent = arduplane.parameters(now.onboard.params, now.origin.alt_mm * 1e-3 - float(good.p[-1, 2]))
     way = route(now.onboard.items, seq=int(seq[0]), origin=now.origin, params=now.onboard.params)
     if not len(way.legs):
-        return Flown(None, int(seq[-1]), np.nan, " ".join(way.sentences) or "the mission has no legs to fly")
+        return Flown(None, int(seq[-1]), " ".join(way.sentences) or "the mission has no legs to fly")
     start = way.start if np.isfinite(way.start).all() else good.p[0]
-    ctl, rms = arduplane.shadow(par, way.legs, start, *_telemetry(good, at, now.history), seq)  # type: ignore[call-arg]
+    ctl, _ = arduplane.shadow(par, way.legs, start, *_telemetry(good, at, now.history), seq)  # type: ignore[call-arg]
     kind = int(way.legs[int(ctl[arduplane.LEG]), KIND])
     if kind in _REFUSED:
-        return Flown(None, int(seq[-1]), rms, f"{_REFUSED[kind]} is not modelled: no route-aware prediction")
+        return Flown(None, int(seq[-1]), f"{_REFUSED[kind]} is not modelled: no route-aware prediction")
     out = np.empty((int(ahead[-1] / good.dt) + 2, N_STATE))
     model = [part for axis in axes for part in (_settled(axis, good), axis.means)]
     done = simulate(ctl, par, way.legs, *model, *_start(now, good), good.dt, out)  # type: ignore
     if done <= ahead[-1] / good.dt:
-        return Flown(None, int(seq[-1]), rms, f"the twin leaves its envelope {done * good.dt:.0f} s ahead", True)
+        return Flown(None, int(seq[-1]), f"the twin leaves its envelope {done * good.dt:.0f} s ahead", True)
     path = np.column_stack([np.interp(ahead, good.dt * np.arange(done), column) for column in out[:done, :3].T])
     said = list(way.sentences)
     if absent:
         said.append(f"{len(absent)} autopilot parameters not received, defaults assumed ({', '.join(absent[:3])} …)")
-    return Flown(path, int(seq[-1]), rms, " ".join(said))
+    return Flown(path, int(seq[-1]), " ".join(said))
 
 
 def _on_this_route(window: Window, since: float) -> Window:
