@@ -108,8 +108,8 @@ def _start(children: Children, args: argparse.Namespace) -> None:
 
 def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threading.Event) -> int:
     """Show the fleet once a second until told to stop, a part dies or the time is over."""
-    sentences: dict[str, str] = {}
-    bus.subscribe(FleetState, lambda state, _: sentences.update(worker=state.sentence))
+    said: list[str] = [""]  # by the worker, the newest last; none is lost between two looks
+    bus.subscribe(FleetState, lambda state, _: said.append(state.sentence) if state.sentence != said[-1] else None)
     rows: list[FleetRow] = []
     first = None
     show = _Show(Console(stderr=True))
@@ -119,7 +119,7 @@ def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threadi
             if first is None and any(row.sample_age_s is not None for row in rows):
                 first = time.monotonic()
             flown = 0.0 if first is None else time.monotonic() - first
-            show.draw(_lines(rows, children, sentences.get("worker", ""), flown, args), rows)
+            show.draw(_lines(rows, children, said[-1], flown, args), rows, said)
             if children.failed() or (args.seconds and flown >= args.seconds):
                 break
     failed = children.failed()
@@ -141,11 +141,11 @@ class _Show:
         self._said: set[str] = set()
         self._due = 0.0
 
-    def draw(self, lines: list[str], rows: list[FleetRow]) -> None:
+    def draw(self, lines: list[str], rows: list[FleetRow], said: list[str]) -> None:
         if self.console.is_terminal:
             self.live.update(Group(Text("\n".join(lines)), table(rows[:40])))
             return
-        news = [line for line in lines[1:] if line not in self._said]
+        news = [line for line in dict.fromkeys([*said, *lines[1:]]) if line and line not in self._said]
         if time.monotonic() >= self._due:
             self._due = time.monotonic() + _PLAIN_S
             news.insert(0, lines[0])
