@@ -79,6 +79,8 @@ COLUMNS: dict[str, tuple[tuple[str, str], ...]] = {
     "servo": tuple((f"servo{i}", "us pulse width") for i in range(1, 9)),
     "command": (("phi_c", "rad"), ("theta_c", "rad"), ("xtrack_error", "m"), ("alt_error", "m"), ("Va_error", "m/s")),
     "leg": (("seq", "mission item in force"),),
+    "wind": (("w_n", "m/s"), ("w_e", "m/s")),
+    "target": (("lat", "1e-7 deg"), ("lon", "1e-7 deg"), ("alt", "mm above mean sea level")),
 }
 """Columns of each `Rows` field of a `Sample`: name and unit, in wire order. Specific force and rates are FRD."""
 
@@ -106,6 +108,8 @@ class Sample(Message, frozen=True, kw_only=True):
     servo: Rows | None = None
     command: Rows | None = None
     leg: Rows | None = None
+    wind: Annotated[Rows | None, Meta(description="as the autopilot says, where it blows to [m/s]")] = None
+    target: Annotated[Rows | None, Meta(description="the point the autopilot says it steers for")] = None
 
 
 class Link(StrEnum):

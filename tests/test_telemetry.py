@@ -7,7 +7,8 @@ from talker import T0, Talker, assert_finite, of
 
 from fleet.contract import COLUMNS, Sample, Status
 from fleet.telemetry.decode import Decoder
-from fleet.telemetry.dialects.mavlink import HIGHEST, ROWS, TABLE, believable
+from fleet.telemetry.dialects.mavlink import ROWS, TABLE
+from fleet.telemetry.dialects.row import HIGHEST, believable
 from fleet.telemetry.intake import Intake
 
 
@@ -94,7 +95,7 @@ def test_the_better_imu_wins_and_the_other_returns_after_a_silence():
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])
 def test_unbelievable_values_are_refused_counted_and_said(bad):
-    assert not believable("velocity", (0.0, bad, 0.0))
+    assert not believable("velocity", np.array([0.0, bad, 0.0]))
     intake, talker = Intake(), Talker()
     intake.hear(T0, talker.heartbeat() + talker.attitude(1.0, phi=bad) + talker.attitude(1.1))
     news = intake.flush(T0 + 0.1)

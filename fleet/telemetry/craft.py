@@ -4,10 +4,13 @@ from collections import Counter
 from collections.abc import Hashable
 from typing import Any
 
+import numpy as np
+
 from fleet.contract import Link, Mission, Params, Sample, Status
 from fleet.telemetry import heartbeat
 from fleet.telemetry.clock import Clocks
-from fleet.telemetry.dialects.mavlink import ROWS, Row, Tick, believable, raw_seconds
+from fleet.telemetry.dialects.mavlink import ROWS, Tick, raw_seconds
+from fleet.telemetry.dialects.row import Row, believable
 from fleet.telemetry.params import ParamBook
 from fleet.telemetry.route import MESSAGES, RouteBook
 from fleet.telemetry.shelf import Shelf
@@ -70,7 +73,7 @@ class Craft:
         if row.when is not None and not row.when(message):
             return
         values = row.columns(message)
-        if not believable(row.field, values):
+        if not believable(row.field, np.array(values, float)):
             self._refused += 1
             self.say(
                 f"{row.message} with a value that is not finite or out of range was refused; check the sensor", arrival

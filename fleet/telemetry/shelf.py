@@ -6,7 +6,7 @@ from fleet.contract import COLUMNS, Array, Rows, Sample
 
 MOST_ROWS = 2_000  # rows one aircraft may put between two publications
 YIELD_S = 3.0  # a lower-ranked source speaks again after this silence of the better one [s]
-_DTYPE = {"position": "<i4", "leg": "<i4"}
+_DTYPE = {"position": "<i4", "leg": "<i4", "target": "<i4"}
 
 
 class Shelf:

@@ -4,10 +4,13 @@ The only place where degrees, centimetres, milli-g and per cent become SI, NED, 
 Source: MAVLink common.xml; for what ArduPilot really sends, its GCS_Common.cpp and GCS_MAVLink_Plane.cpp.
 """
 
-from collections.abc import Callable
 from enum import Enum
 from math import pi
-from typing import Any, NamedTuple
+from typing import Any
+
+import numpy as np
+
+from fleet.telemetry.dialects.row import Row
 
 DEG = pi / 180  # [rad/deg]
 MILLI_G = 9.80665e-3  # [m/s2 per milli-g]
@@ -22,97 +25,85 @@ class Tick(Enum):
     NONE = "no time: the newest boot time heard from the same aircraft"
 
 
-class Row(NamedTuple):
-    """One way from a message to columns of a `Sample` field."""
-
-    message: str  # MAVLink name
-    field: str  # field of `Sample`; columns as in `contract.COLUMNS`
-    tick: Tick
-    columns: Callable[[Any], tuple[float, ...]]
-    rank: int = 0  # among rows of one field the highest rank that flows wins
-    autopilots: tuple[str, ...] = ()  # empty: any
-    when: Callable[[Any], bool] | None = None  # which messages of that name count
-
-
-def _imu_milli(m: Any) -> tuple[float, ...]:
+def _imu_milli(m: Any) -> tuple[Any, ...]:
     acc = (m.xacc * MILLI_G, m.yacc * MILLI_G, m.zacc * MILLI_G)
     return (*acc, m.xgyro * 1e-3, m.ygyro * 1e-3, m.zgyro * 1e-3)
 
 
-def _command(m: Any, va_error: float) -> tuple[float, ...]:
+def _command(m: Any, va_error: Any) -> tuple[Any, ...]:
     return (m.nav_roll * DEG, m.nav_pitch * DEG, m.xtrack_error, m.alt_error, va_error)
 
 
-def _servo(m: Any) -> tuple[float, ...]:
+def _servo(m: Any) -> tuple[Any, ...]:
     raw = (m.servo1_raw, m.servo2_raw, m.servo3_raw, m.servo4_raw, m.servo5_raw, m.servo6_raw, m.servo7_raw)
     return (*raw, m.servo8_raw)
 
 
+_NO_ITEM = 65535
 _NO_FIX_E7 = 100_000  # a kilometre round zero, zero [1e-7 deg]
 
 
-def _has_fix(m: Any) -> bool:
-    return max(abs(m.lat), abs(m.lon)) > _NO_FIX_E7  # without a fix autopilots say zero, zero, or drift around it
+def _has_fix(m: Any) -> Any:
+    return _somewhere(m.lat, m.lon)  # without a fix autopilots say zero, zero, or drift around it
+
+
+def _somewhere(lat: Any, lon: Any) -> Any:
+    return (abs(lat) > _NO_FIX_E7) | (abs(lon) > _NO_FIX_E7)
+
+
+def _wind(m: Any) -> tuple[Any, ...]:
+    return (-m.speed * np.cos(m.direction * DEG), -m.speed * np.sin(m.direction * DEG))  # it names where from
 
 
 TABLE: tuple[Row, ...] = (
     Row(
         "ATTITUDE",
         "attitude",
-        Tick.BOOT_MS,
         lambda m: (m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed),
+        Tick.BOOT_MS,
     ),
-    Row("HIGHRES_IMU", "imu", Tick.USEC, lambda m: (m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro), rank=3),
-    Row("SCALED_IMU", "imu", Tick.BOOT_MS, _imu_milli, rank=2),
-    Row("RAW_IMU", "imu", Tick.USEC, _imu_milli, rank=1, autopilots=("ardupilot",)),  # elsewhere raw has no unit
-    Row("GLOBAL_POSITION_INT", "position", Tick.BOOT_MS, lambda m: (m.lat, m.lon, m.alt), when=_has_fix),
+    Row("HIGHRES_IMU", "imu", lambda m: (m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro), Tick.USEC, rank=3),
+    Row("SCALED_IMU", "imu", _imu_milli, Tick.BOOT_MS, rank=2),
+    Row("RAW_IMU", "imu", _imu_milli, Tick.USEC, rank=1, autopilots=("ardupilot",)),  # elsewhere raw has no unit
+    Row("GLOBAL_POSITION_INT", "position", lambda m: (m.lat, m.lon, m.alt), Tick.BOOT_MS, when=_has_fix),
     Row(
         "GLOBAL_POSITION_INT",
         "velocity",
-        Tick.BOOT_MS,
         lambda m: (m.vx * 1e-2, m.vy * 1e-2, m.vz * 1e-2),
+        Tick.BOOT_MS,
         when=_has_fix,
     ),
-    Row("VFR_HUD", "air", Tick.NONE, lambda m: (m.airspeed, m.throttle * 1e-2, m.climb)),
-    Row("SERVO_OUTPUT_RAW", "servo", Tick.USEC32, _servo, when=lambda m: m.port == 0),
+    Row("VFR_HUD", "air", lambda m: (m.airspeed, m.throttle * 1e-2, m.climb), Tick.NONE),
+    Row("SERVO_OUTPUT_RAW", "servo", _servo, Tick.USEC32, when=lambda m: m.port == 0),
     Row(
         "NAV_CONTROLLER_OUTPUT",
         "command",
-        Tick.NONE,
         lambda m: _command(m, m.aspd_error * 1e-2),  # ArduPilot sends cm/s, not the m/s of common.xml
+        Tick.NONE,
         autopilots=("ardupilot",),
     ),
     Row(
         "NAV_CONTROLLER_OUTPUT",
         "command",
-        Tick.NONE,
         lambda m: _command(m, m.aspd_error),
+        Tick.NONE,
         autopilots=("px4", "generic"),
     ),
-    Row("MISSION_CURRENT", "leg", Tick.NONE, lambda m: (-1 if m.seq == 65535 else m.seq,)),
+    Row("MISSION_CURRENT", "leg", lambda m: (np.where(m.seq == _NO_ITEM, -1.0, m.seq),), Tick.NONE),
+    Row("WIND", "wind", _wind, Tick.NONE, rank=1),
+    Row("WIND_COV", "wind", lambda m: (m.wind_x, m.wind_y), Tick.USEC, rank=2),
+    Row(
+        "POSITION_TARGET_GLOBAL_INT",
+        "target",
+        lambda m: (m.lat_int, m.lon_int, m.alt * 1e3),
+        Tick.BOOT_MS,
+        when=lambda m: ((m.coordinate_frame == 0) | (m.coordinate_frame == 5)) & _somewhere(m.lat_int, m.lon_int),
+    ),
 )
 
 ROWS: dict[str, tuple[Row, ...]] = {
     name: tuple(row for row in TABLE if row.message == name) for name in {row.message for row in TABLE}
 }
-
-_RATES = (100.0,) * 3  # [rad/s]
-HIGHEST: dict[str, tuple[float, ...]] = {
-    "attitude": (7.0, 7.0, 7.0, *_RATES),
-    "imu": (1e3, 1e3, 1e3, *_RATES),
-    "position": (9e8, 1.8e9, 1e8),
-    "velocity": (500.0, 500.0, 500.0),
-    "air": (500.0, 1.5, 500.0),
-    "servo": (65535.0,) * 8,
-    "command": (7.0, 7.0, 1e6, 1e5, 1e3),
-    "leg": (65535.0,),
-}
-"""Largest believable magnitude per column, in the units of `contract.COLUMNS`; beyond it (or not finite) is refused."""
-
-
-def believable(field: str, values: tuple[float, ...]) -> bool:
-    """Tell whether every column is finite and within its largest believable magnitude."""
-    return all(-high <= value <= high for value, high in zip(values, HIGHEST[field], strict=True))
 
 
 def raw_seconds(tick: Tick, message: Any) -> float:
