@@ -20,11 +20,11 @@ class Tally:
         self.datagrams += 1
         self.bytes_in += len(data)
 
-    def account(self, t: float, links: Sequence[Link], intakes: Sequence[Intake], published: int) -> Account:
-        """Make the message; `t` is fleet time [s since 1970]."""
+    def account(self, t: float, links: Sequence[Link], intakes: Sequence[Intake], players: set[int]) -> Account:
+        """Make the message; `t` is fleet time [s since 1970], `players` the UAV ids of recordings."""
         counts: Counter[str] = Counter()
         refused: Counter[str] = Counter()
-        uavs: set[int] = set()
+        uavs = set(players)
         for link, intake in zip(links, intakes, strict=True):
             counts.update(intake.counters())
             refused.update(intake.refused)
@@ -41,6 +41,5 @@ class Tally:
             bad_bytes=counts["bad_bytes"],
             bad_frames=counts["bad_frames"],
             refused=dict(refused),
-            published=published,
             sentence="" if uavs else "no aircraft heard yet; point its telemetry at one of the links",
         )

@@ -5,9 +5,11 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from typing import NamedTuple, Protocol, cast
 
+from fleet.contract import Message
+from fleet.telemetry.decode import Piece
 from gateway.spec import Spec
 
 QUEUE = 20_000  # batches between receiving and decoding
@@ -22,11 +24,11 @@ def wall() -> float:
 
 
 class Batch(NamedTuple):
-    """What one link heard: received pieces with their time, and possibly a point in recorded time reached."""
+    """What one link heard: bytes as they came, or the news of a recording."""
 
     link: int
-    heard: list[tuple[float, Hashable, bytes]]  # (fleet time [s since 1970], sender, bytes)
-    now: float | None = None  # recorded time to publish up to
+    heard: Sequence[Piece] = ()
+    news: Sequence[Message] = ()
     ended: bool = False
 
 
@@ -72,7 +74,7 @@ class Udp:
             except OSError:  # nothing for a while, or an earlier answer found nobody
                 continue
             try:
-                out.put_nowait(Batch(number, [(wall(), sender, data)]))
+                out.put_nowait(Batch(number, heard=[(wall(), sender, data)]))
             except queue.Full:
                 self.dropped += 1
 

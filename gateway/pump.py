@@ -5,6 +5,8 @@ import threading
 import time
 from collections.abc import Sequence
 
+import msgspec
+
 from fleet.bus import Bus
 from fleet.telemetry.craft import Craft
 from fleet.telemetry.intake import Intake
@@ -39,6 +41,7 @@ class Pump:
         self._open = set(range(len(links)))
         self._live = [number for number, link in enumerate(links) if link.spec.kind != "replay"]
         self._recorded = float("-inf")  # newest recorded time [s since 1970]
+        self._players: set[int] = set()  # UAV ids heard of in recordings
 
     def run(self, stop: threading.Event) -> None:
         """Work until `stop` is set or every recording has ended; the links' threads end with it."""
@@ -67,9 +70,10 @@ class Pump:
         for t, source, data in batch.heard:
             self.tally.add(data)
             intake.hear(t, data, source)
-        if batch.now is not None:
-            self._recorded = max(self._recorded, batch.now)
-            self.publisher.publish(intake.flush(batch.now))
+        if batch.news:
+            self._recorded = max(self._recorded, *(news.t for news in batch.news))
+            self._players.update(news.uav for news in batch.news)
+            self.publisher.publish(batch.news)
         if batch.ended:
             self._open.discard(batch.link)
 
@@ -92,4 +96,5 @@ class Pump:
 
     def _tell(self) -> None:
         now = wall() if self._live else self._recorded
-        self.publisher.account(self.tally.account(now, self.links, self.intakes, self.publisher.published))
+        account = self.tally.account(now, self.links, self.intakes, self._players)
+        self.publisher.account(msgspec.structs.replace(account, published=self.publisher.published))

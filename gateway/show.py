@@ -4,9 +4,8 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 from gateway.link import Link
 from gateway.recorded import Replay
@@ -34,11 +33,10 @@ def shown(links: Sequence[Link]) -> Iterator[None]:
 
 
 def _bars(replays: Sequence[Replay], done: threading.Event) -> None:
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} of {task.total:.0f} s"))
-    with Progress(*columns) as progress:
-        bars = [progress.add_task(Path(replay.spec.where).name, total=replay.length_s()) for replay in replays]
+    with Progress(TextColumn("{task.description}"), BarColumn(), TaskProgressColumn()) as progress:
+        bars = [progress.add_task(replay.recording.name, total=1.0) for replay in replays]
         ended = False
         while not ended:
             ended = done.wait(REFRESH_S)
             for bar, replay in zip(bars, replays, strict=True):
-                progress.update(bar, completed=replay.played_s)
+                progress.update(bar, completed=replay.recording.share)

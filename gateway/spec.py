@@ -4,8 +4,6 @@ import contextlib
 from typing import NamedTuple
 from urllib.parse import parse_qsl
 
-from fleet.telemetry.recordings import SUFFIXES
-
 LOOPBACK = "127.0.0.1"
 
 
@@ -39,10 +37,10 @@ def read_spec(text: str, offset: int = 0) -> Spec:
             path, _, query = rest.partition("?")
             asked = dict(parse_qsl(query))
             speed = read_speed(asked.pop("speed", "1"))
-            if path.endswith(SUFFIXES) and not asked:
+            if path and not asked:
                 return Spec(text, kind, path, 0, speed, offset)
     raise ValueError(
-        f"--link: found {text!r}, expected udpin:HOST:PORT or replay:FILE.tlog?speed=4, "
+        f"--link: found {text!r}, expected udpin:HOST:PORT or replay:FILE?speed=4, "
         "both with #offset=-1 if wanted; write one of these"
     )
 

@@ -49,6 +49,17 @@ class Talker:
         return self.pack(mav.MAVLink_param_value_message(name.encode(), value, kind, count, index))
 
 
+class Ears:
+    """Hear whole messages in whatever bytes come."""
+
+    def __init__(self):
+        self.decoder = Decoder()
+
+    def feed(self, data: bytes) -> list:
+        frames = self.decoder.feed([(T0, None, data)])
+        return [frames.message(i) for i in range(len(frames.at))]
+
+
 def of(kind, messages, uav=None) -> list:
     """Pick messages of one class, and of one aircraft where it is named."""
     return [m for m in messages if isinstance(m, kind) and uav in (None, m.uav)]
@@ -79,7 +90,7 @@ class Aircraft:
         self._loss, self._silent = loss, silent
         self._rng = np.random.default_rng(4)
         self.asked: list = []
-        self._ears = Decoder()
+        self._ears = Ears()
 
     def hear(self, data: bytes, t: float) -> list[bytes]:
         if self._rng.random() < self._loss:

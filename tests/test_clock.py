@@ -2,8 +2,37 @@ import numpy as np
 import pytest
 from talker import T0
 
-from fleet.telemetry.clock import WRAP_BOOT_S, WRAP_USEC_S, Clock, Clocks
-from fleet.telemetry.dialects.mavlink import Tick
+from fleet.telemetry import clock as c
+from fleet.telemetry.clock import BOOT, NONE, USEC, USEC32, WRAP_BOOT_S, WRAP_USEC_S
+
+
+class Clock:
+    """One clock, as a test would ask it."""
+
+    def __init__(self, wrap_s=0.0):
+        self.state = c.new_clock(wrap_s)
+
+    def fleet(self, raw_s, arrival):
+        t = c.read(self.state, raw_s, arrival, -np.inf)
+        return None if np.isnan(t) else t
+
+    @property
+    def jumps(self):
+        return self.state[c.JUMPS]
+
+
+class Clocks:
+    """The clocks of one aircraft."""
+
+    def __init__(self):
+        self.states = c.new_clocks()
+
+    def fleet(self, tick, raw_s, arrival):
+        return c.tell(self.states, tick, raw_s, arrival)
+
+    @property
+    def jumps(self):
+        return c.jumps(self.states)
 
 
 def test_the_fastest_message_tells_the_offset():
@@ -66,11 +95,11 @@ def test_a_stalled_radio_is_no_jump():
 def test_usec_counts_from_boot_or_from_1970_and_is_cut_to_32_bits():
     clocks = Clocks()
     boot = 3 * WRAP_USEC_S + 100
-    t = clocks.fleet(Tick.BOOT_MS, boot, T0)
-    assert clocks.fleet(Tick.USEC32, (boot + 0.02) % WRAP_USEC_S, T0 + 0.02) == pytest.approx(t + 0.02)
-    assert clocks.fleet(Tick.USEC, boot + 0.03, T0 + 0.03) == pytest.approx(t + 0.03)
+    t = clocks.fleet(BOOT, boot, T0)
+    assert clocks.fleet(USEC32, (boot + 0.02) % WRAP_USEC_S, T0 + 0.02) == pytest.approx(t + 0.02)
+    assert clocks.fleet(USEC, boot + 0.03, T0 + 0.03) == pytest.approx(t + 0.03)
     unix = 1.6e9
-    times = [clocks.fleet(Tick.USEC, unix + s * 0.1, T0 + 1 + s * 0.1) for s in range(50)]
+    times = [clocks.fleet(USEC, unix + s * 0.1, T0 + 1 + s * 0.1) for s in range(50)]
     assert np.diff(times) == pytest.approx(0.1, abs=1e-6)
     assert times[0] == pytest.approx(T0 + 1)
     assert clocks.jumps == 0
@@ -78,7 +107,7 @@ def test_usec_counts_from_boot_or_from_1970_and_is_cut_to_32_bits():
 
 def test_a_message_without_time_takes_the_newest():
     clocks = Clocks()
-    assert clocks.fleet(Tick.NONE, 0.0, T0) == T0
-    t = clocks.fleet(Tick.BOOT_MS, 9.0, T0 + 0.1)
-    assert clocks.fleet(Tick.NONE, 0.0, T0 + 0.13) == pytest.approx(t + 0.03)
-    assert clocks.fleet(Tick.NONE, 0.0, T0 + 60.0) == pytest.approx(t + 0.5)
+    assert clocks.fleet(NONE, 0.0, T0) == T0
+    t = clocks.fleet(BOOT, 9.0, T0 + 0.1)
+    assert clocks.fleet(NONE, 0.0, T0 + 0.13) == pytest.approx(t + 0.03)
+    assert clocks.fleet(NONE, 0.0, T0 + 60.0) == pytest.approx(t + 0.5)

@@ -91,13 +91,13 @@ def test_a_second_sender_for_a_live_id_is_refused_until_the_first_is_silent():
     one.hear(T0 + 0.1, Talker().attitude(50.0), "b")
     two.hear(T0 + 0.2, Talker().heartbeat(), "c")
     two.hear(T0 + 0.2, Talker().attitude(70.0), "c")
+    news = one.flush(T0 + 0.3) + two.flush(T0 + 0.3)
     assert one.refused["second sender for a live id"] == 1
     assert two.refused["second sender for a live id"] == 2
-    news = one.flush(T0 + 0.3) + two.flush(T0 + 0.3)
     assert of(Sample, news) == []
     assert "second sender" in of(Status, news)[0].sentence
     two.hear(T0 + 9.0, Talker().heartbeat(), "c")
-    assert [s.uav for s in of(Status, one.flush(T0 + 9.1) + two.flush(T0 + 9.1))] == [7]
+    assert [s.uav for s in of(Status, two.flush(T0 + 9.1) + one.flush(T0 + 9.1))] == [7]
 
 
 def test_a_download_and_an_upload_are_overheard():

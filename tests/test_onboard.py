@@ -1,9 +1,8 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
-from talker import ITEMS, T0, Aircraft, Talker, of
+from talker import ITEMS, T0, Aircraft, Ears, Talker, of
 
 from fleet.contract import Mission, Params
-from fleet.telemetry.decode import Decoder
 from fleet.telemetry.intake import Intake
 from gateway.onboard import Onboard
 
@@ -68,6 +67,7 @@ def test_after_a_restart_the_mission_is_asked_for_again():
         for _, data in onboard.tick(t, intake.crafts.values()):
             for frame in aircraft.hear(data, t):
                 intake.hear(t, frame, "air")
+        intake.flush(t)
     (craft,) = intake.crafts.values()
     assert craft.route.items == ITEMS[:5]
 
@@ -95,7 +95,7 @@ def test_rates_that_are_high_enough_are_left_alone():
         intake.hear(t, talker.attitude(step * 0.02), "air")
         if step % 5 == 0:
             intake.flush(t)
-            asked += [m for _, d in onboard.tick(t, intake.crafts.values()) for m in Decoder().feed(d)]
+            asked += [m for _, d in onboard.tick(t, intake.crafts.values()) for m in Ears().feed(d)]
     ids = {int(m.param1) for m in asked if m.get_type() == "COMMAND_LONG"}
     assert ids
     assert mav.MAVLINK_MSG_ID_ATTITUDE not in ids
@@ -104,6 +104,7 @@ def test_rates_that_are_high_enough_are_left_alone():
 def test_a_lost_aircraft_is_not_spoken_to():
     intake, onboard = Intake(), Onboard()
     intake.hear(T0, Talker().heartbeat(), "air")
+    intake.flush(T0)
     assert onboard.tick(T0, intake.crafts.values())
     intake.flush(T0 + 10)
     assert onboard.tick(T0 + 10, intake.crafts.values()) == []

@@ -6,21 +6,22 @@ import pytest
 from talker import T0, Talker, assert_finite, of
 
 from fleet.contract import COLUMNS, Mission, Params, Sample, Status
-from fleet.telemetry.intake import Intake
-from fleet.telemetry.recordings import records, replay_messages
-from fleet.telemetry.restamp import backlog_offset, boot_s, restamped
+from fleet.telemetry.decode import Decoder
+from fleet.telemetry.opening import Source
+from fleet.telemetry.recordings import Recording, replay_messages
+from fleet.telemetry.tlog import Line, Tlog, backlog_offset, boot_s, restamped
 
 S02 = "sitl/s02_nominal_light_wind.tlog.xz"
 
 
 @pytest.fixture(scope="module")
 def s02(recordings):
-    intake = Intake()
-    return list(replay_messages(recordings / S02, intake=intake)), intake
+    skipped: list[str] = []
+    return list(replay_messages(recordings / S02, skipped=skipped)), skipped
 
 
 def test_a_recorded_flight_comes_out_whole(s02):
-    news, intake = s02
+    news, skipped = s02
     missions, params, status = of(Mission, news), of(Params, news), of(Status, news)
     assert {m.uav for m in news} == {3}
     assert missions[-1].complete
@@ -33,7 +34,7 @@ def test_a_recorded_flight_comes_out_whole(s02):
     assert next(t for t, mode in modes if mode == "AUTO") == pytest.approx(35.1, abs=0.5)
     assert status[-1].vehicle == "fixed_wing"
     assert status[-1].clock_jumps == 0
-    assert intake.counters()["bad_bytes"] == 0
+    assert skipped == []
 
 
 def test_a_recorded_flight_is_finite_in_order_and_on_its_own_time(s02):
@@ -69,46 +70,93 @@ def log_of(frames, t0=T0, step=0.05):
     return b"".join(stamp + frame for stamp, frame in zip(stamps, frames, strict=True))
 
 
-def test_a_damaged_recording_keeps_what_is_good(tmp_path, caplog):
+def read(path) -> tuple[list[bytes], list[float], list[str]]:
+    """Frames and times of a .tlog, and what was skipped."""
+    tlog, frames, times = Tlog(Source(path)), [], []
+    for batch in tlog.batches():
+        frames += [batch.buf[start:stop].tobytes() for start, stop in batch.at[:, :2]]
+        times += batch.arrival.tolist()
+    return frames, times, tlog.skipped
+
+
+def test_a_damaged_recording_keeps_what_is_good(tmp_path):
     talker = Talker()
     frames = [talker.attitude(i * 0.05) for i in range(400)]
     half = log_of(frames[:200])
     data = half + np.random.default_rng(5).bytes(3000) + log_of(frames[200:], T0 + 10) + b"\0\0\x06"
     path = tmp_path / "damaged.tlog"
     path.write_bytes(data)
-    found = list(records(path))
-    assert sum(frame in frames for _, frame in found) >= 396
-    assert "damaged bytes skipped" in caplog.text
+    found, times, skipped = read(path)
+    assert found == frames
+    assert np.diff(times) == pytest.approx(0.05, abs=1e-5)
+    assert skipped == ["3003 damaged bytes skipped, the first near byte 0, 400 frames read"]
 
 
-def test_a_cut_archive_keeps_what_came_before(tmp_path, caplog):
+def test_a_cut_archive_keeps_what_came_before(tmp_path):
     talker = Talker()
-    data = lzma.compress(log_of([talker.attitude(i * 0.05, phi=math.sin(i)) for i in range(20_000)]))
+    whole = log_of([talker.heartbeat()] + [talker.attitude(i * 0.05, phi=math.sin(i)) for i in range(20_000)])
+    data = lzma.compress(whole)
     path = tmp_path / "cut.tlog.xz"
-    path.write_bytes(data[: len(data) // 2])
-    assert len(list(records(path))) > 1000
-    path.write_bytes(data[:-200] + bytes(100))
-    assert len(list(records(path))) > 1000
-    assert "damaged" in caplog.text
+    for damaged in (data[: len(data) // 2], data[:-200] + bytes(100)):
+        path.write_bytes(damaged)
+        skipped: list[str] = []
+        rows = sum(len(s.attitude.t.numpy()) for s in of(Sample, replay_messages(path, skipped=skipped)))
+        assert rows > 1000
+        assert any("the compressed file is damaged" in sentence for sentence in skipped)
 
 
 @pytest.mark.parametrize(
-    ("name", "data"), [("a.tlog", b""), ("a.tlog", b"hello" * 99), ("a.csv", b""), ("a.tlog.xz", b"no")]
+    ("name", "data"), [("a.tlog", b""), ("a.tlog", b"hello" * 99), ("a.csv", b"1,2"), ("a.tlog.xz", b"no")]
 )
 def test_what_is_no_recording_is_named(tmp_path, name, data):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(ValueError, match=name):
-        list(records(tmp_path / name))
+        list(replay_messages(tmp_path / name))
+
+
+def test_what_is_no_file_is_named(tmp_path):
+    (tmp_path / "endless.tlog").symlink_to("/dev/zero")
+    (tmp_path / "folder.tlog").mkdir()
+    for name in ("none.tlog", "endless.tlog", "folder.tlog"):
+        with pytest.raises(OSError, match=name):
+            list(replay_messages(tmp_path / name))
+
+
+def test_a_wrong_suffix_is_seen_through(tmp_path):
+    talker = Talker()
+    path = tmp_path / "flight.ulg"
+    path.write_bytes(log_of([talker.heartbeat()] + [talker.attitude(i * 0.05) for i in range(100)]))
+    recording = Recording(path)
+    assert recording.kind == "telemetry log"
+    assert of(Sample, [news for _, step in recording.steps() for news in step])
+    assert "flight.ulg: is a telemetry log by its content" in recording.skipped[0]
+
+
+def heard(frames, times):
+    """Frames of one sender, each with its time of arrival."""
+    return Decoder().feed([(t, None, frame) for t, frame in zip(times, frames, strict=True)])
 
 
 def test_a_backlog_is_played_in_the_time_of_the_flight():
     talker = Talker()
     frames = [talker.attitude(100 + i * 0.1) for i in range(1000)]
-    rushed = [(T0 + i * 0.01, frame) for i, frame in enumerate(frames)]
-    offset = backlog_offset(rushed)
+    rushed = heard(frames, [T0 + i * 0.01 for i in range(1000)])
+    offset = backlog_offset(iter([rushed]))
     assert offset is not None
-    times = [t for t, _ in restamped(rushed, offset)]
-    assert np.diff(times) == pytest.approx(0.1, abs=1e-6)
-    assert times[-1] == pytest.approx(rushed[-1][0], abs=1e-3)
-    assert backlog_offset([(T0 + i * 0.1, frame) for i, frame in enumerate(frames)]) is None
-    assert boot_s(frames[5]) == 100.5
+    (played,) = restamped(iter([rushed]), offset)
+    assert np.diff(played.arrival) == pytest.approx(0.1, abs=1e-6)
+    assert played.arrival[-1] == pytest.approx(rushed.arrival[-1], abs=1e-3)
+    assert backlog_offset(iter([heard(frames, [T0 + i * 0.1 for i in range(1000)])])) is None
+    assert boot_s(rushed)[5] == 100.5
+
+
+def test_the_recorders_clock_is_straightened():
+    t = T0 + np.arange(100.0)
+    for wrong in (t + 0.0, np.where(t == T0 + 50, t + 3600, t), np.where(t == T0 + 50, t - 3600, t)):
+        straight = np.concatenate([line.straight(part) for line in [Line()] for part in np.split(wrong, [30, 70])])
+        assert np.abs(straight - t).max() <= 1.0  # a wrong stamp takes its neighbour's time
+        assert (np.diff(straight) >= 0).all()
+    set_back = np.where(t >= T0 + 50, t - 7200, t)
+    straight = Line().straight(set_back)
+    assert np.diff(straight).min() >= 0
+    assert straight[-1] == pytest.approx(t[-1], abs=1.5)

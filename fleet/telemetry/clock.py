@@ -1,10 +1,13 @@
-"""Boot time to fleet time: an offset with slow drift, wraps undone, jumps noticed and survived.
+"""Boot time to fleet time: an offset with slow drift, wraps undone, jumps noticed and survived. Compiled.
 
 fleet = boot + offset, and offset = min(arrival - boot) over the last half minute: the message that travelled
 fastest tells the offset best. Source: minimum-delay filter as in NTP (RFC 5905, section 10).
 """
 
-from fleet.telemetry.dialects.mavlink import Tick
+from math import inf, isnan, nan
+
+import numba as nb
+import numpy as np
 
 WRAP_BOOT_S = 2**32 * 1e-3  # time_boot_ms [s]
 WRAP_USEC_S = 2**32 * 1e-6  # time_usec cut to 32 bit [s]
@@ -17,112 +20,133 @@ SLEW = 2e-3  # drift the offset may follow [s/s]
 SLEW_FAST = 0.1  # when the offset is plainly too late [s/s]
 PLAIN_S = 0.25  # what is plainly [s]
 
-
-class Clock:
-    """Map one clock of one aircraft to fleet time."""
-
-    def __init__(self, wrap_s: float = 0.0) -> None:
-        self.offset_s = 0.0
-        self.jumps = 0
-        self.newest_s: float | None = None  # newest own time, wraps undone [s]
-        self._wrap_s = wrap_s
-        self._arrival = 0.0  # of the newest
-        self._anchored = 0.0
-        self._latest = float("-inf")  # newest fleet time given out
-        self._suspects = 0
-        self._least = self._least_before = 0.0
-        self._bucket = 0.0
-
-    def fleet(self, raw_s: float, arrival: float, latest: float = float("-inf")) -> float | None:
-        """Give the fleet time of a message [s since 1970]; None while a jump is suspected.
-
-        Args:
-            raw_s: the message's own time [s]
-            arrival: when it arrived, fleet clock [s since 1970]
-            latest: newest fleet time already published; a new anchor never lies before it [s since 1970]
-        """
-        if self.newest_s is None:
-            return self._anchor(raw_s, arrival, latest)
-        own = self.unwrap(raw_s)
-        step, passed = own - self.newest_s, arrival - self._arrival
-        if step < -BACK_S or step > passed + LEAP_S:
-            self._suspects += 1
-            if self._suspects < CONFIRM:
-                return None
-            self.jumps += 1
-            return self._anchor(raw_s, arrival, max(latest, self._latest))
-        self._suspects = 0
-        if step > 0:
-            self._follow(arrival - own, arrival, passed)
-            self.newest_s, self._arrival = own, arrival
-        return self.at(own)
-
-    def unwrap(self, raw_s: float) -> float:
-        """Undo wraps: the value nearest to the newest own time [s]."""
-        if not self._wrap_s or self.newest_s is None:
-            return raw_s
-        return raw_s + round((self.newest_s - raw_s) / self._wrap_s) * self._wrap_s
-
-    def at(self, own_s: float) -> float:
-        """Map an own time with its wraps undone, learning nothing from it."""
-        t = own_s + self.offset_s
-        self._latest = max(self._latest, t)
-        return t
-
-    def now(self, arrival: float) -> float:
-        """Give the fleet time of a message without a time of its own: the newest, moved on by at most 0.5 s."""
-        if self.newest_s is None:
-            return arrival
-        return self.at(self.newest_s + min(max(arrival - self._arrival, 0.0), 0.5))
-
-    def _anchor(self, own: float, arrival: float, latest: float) -> float:
-        self.offset_s = max(arrival, latest + 1e-3) - own
-        self.newest_s, self._arrival, self._anchored, self._bucket = own, arrival, arrival, arrival
-        self._least = self._least_before = arrival - own
-        self._suspects = 0
-        return self.at(own)
-
-    def _follow(self, delay: float, arrival: float, passed: float) -> None:
-        if arrival - self._bucket > BUCKET_S:
-            self._least_before, self._least, self._bucket = self._least, delay, arrival
-        self._least = min(self._least, delay)
-        error = min(self._least, self._least_before) - self.offset_s
-        if arrival - self._anchored < WARM_UP_S:
-            self.offset_s += min(error, 0.0)
-            return
-        most = max(passed, 0.0) * (SLEW_FAST if error < -PLAIN_S else SLEW)
-        self.offset_s += min(max(error, -most), most)
+(
+    OFFSET,  # fleet time minus own time [s]
+    NEWEST,  # newest own time, wraps undone; nan before any [s]
+    JUMPS,  # jumps noticed
+    WRAP,  # own time wraps after this; 0: never [s]
+    ARRIVAL,  # of the newest
+    ANCHORED,  # arrival at the last anchor
+    LATEST,  # newest fleet time given out
+    SUSPECTS,  # messages in a row that hint at a jump
+    LEAST,  # least delay of this bucket [s]
+    LEAST_BEFORE,  # and of the one before [s]
+    BUCKET,  # arrival at which this bucket began
+    LENGTH,
+) = range(12)
+BOOT, USEC, USEC32, NONE = range(4)
+"""Where the time of a message comes from: time_boot_ms, time_usec, time_usec cut to 32 bit, nowhere."""
 
 
-class Clocks:
-    """The clocks of one aircraft: boot, and those of `time_usec` where it does not count from boot."""
+def new_clock(wrap_s: float = 0.0) -> np.ndarray:
+    """Make the state of one clock, (LENGTH,)."""
+    clock = np.zeros(LENGTH)
+    clock[NEWEST], clock[LATEST], clock[WRAP] = nan, -inf, wrap_s
+    return clock
 
-    def __init__(self) -> None:
-        self.boot = Clock(WRAP_BOOT_S)
-        self._usec = {Tick.USEC: Clock(), Tick.USEC32: Clock(WRAP_USEC_S)}
-        self._latest = float("-inf")
 
-    @property
-    def jumps(self) -> int:
-        """Count the jumps noticed."""
-        return max(clock.jumps for clock in (self.boot, *self._usec.values()))
+def new_clocks() -> np.ndarray:
+    """Make the clocks of one aircraft, (3, LENGTH): boot, and those of `time_usec` that does not count from boot."""
+    return np.stack([new_clock(WRAP_BOOT_S), new_clock(), new_clock(WRAP_USEC_S)])
 
-    def fleet(self, tick: Tick, raw_s: float, arrival: float) -> float | None:
-        """Give the fleet time of a message [s since 1970]; None while a jump is suspected."""
-        t = self._fleet(tick, raw_s, arrival)
-        if t is not None:
-            self._latest = max(self._latest, t)
-        return t
 
-    def _fleet(self, tick: Tick, raw_s: float, arrival: float) -> float | None:
-        if tick is Tick.NONE:
-            return self.boot.now(arrival)
-        if tick is Tick.BOOT_MS:
-            return self.boot.fleet(raw_s, arrival, self._latest)
-        if self.boot.newest_s is not None:
-            own = raw_s
-            if tick is Tick.USEC32:
-                own += round((self.boot.newest_s - raw_s) / WRAP_USEC_S) * WRAP_USEC_S
-            if abs(own - self.boot.newest_s) < BACK_S:
-                return self.boot.at(own)
-        return self._usec[tick].fleet(raw_s, arrival, self._latest)
+@nb.njit(cache=True)
+def read(clock, raw_s, arrival, latest):
+    """Give the fleet time of a message [s since 1970]; nan while a jump is suspected.
+
+    Args:
+        clock: state, changed in place, (LENGTH,)
+        raw_s: the message's own time [s]
+        arrival: when it arrived, fleet clock [s since 1970]
+        latest: newest fleet time already given out; a new anchor never lies before it [s since 1970]
+    """
+    if isnan(clock[NEWEST]):
+        return _anchor(clock, raw_s, arrival, latest)
+    own = unwrap(clock, raw_s)
+    step, passed = own - clock[NEWEST], arrival - clock[ARRIVAL]
+    if step < -BACK_S or step > passed + LEAP_S:
+        clock[SUSPECTS] += 1
+        if clock[SUSPECTS] < CONFIRM:
+            return nan
+        clock[JUMPS] += 1
+        return _anchor(clock, raw_s, arrival, max(latest, clock[LATEST]))
+    clock[SUSPECTS] = 0
+    if step > 0:
+        _follow(clock, arrival - own, arrival, passed)
+        clock[NEWEST], clock[ARRIVAL] = own, arrival
+    return _at(clock, own)
+
+
+@nb.njit(cache=True)
+def unwrap(clock, raw_s):
+    """Undo wraps: the value nearest to the newest own time [s]."""
+    if clock[WRAP] == 0.0 or isnan(clock[NEWEST]):
+        return raw_s
+    return raw_s + np.rint((clock[NEWEST] - raw_s) / clock[WRAP]) * clock[WRAP]
+
+
+@nb.njit(cache=True)
+def _at(clock, own_s):
+    t = own_s + clock[OFFSET]
+    clock[LATEST] = max(clock[LATEST], t)
+    return t
+
+
+@nb.njit(cache=True)
+def now(clock, arrival):
+    """Give the fleet time of a message without a time of its own: the newest, moved on by at most 0.5 s."""
+    if isnan(clock[NEWEST]):
+        clock[LATEST] = max(clock[LATEST], arrival)
+        return arrival
+    return _at(clock, clock[NEWEST] + min(max(arrival - clock[ARRIVAL], 0.0), 0.5))
+
+
+@nb.njit(cache=True)
+def _anchor(clock, own, arrival, latest):
+    clock[OFFSET] = max(arrival, latest + 1e-3) - own
+    clock[NEWEST], clock[ARRIVAL], clock[ANCHORED], clock[BUCKET] = own, arrival, arrival, arrival
+    clock[LEAST], clock[LEAST_BEFORE], clock[SUSPECTS] = arrival - own, arrival - own, 0
+    return _at(clock, own)
+
+
+@nb.njit(cache=True)
+def _follow(clock, delay, arrival, passed):
+    if arrival - clock[BUCKET] > BUCKET_S:
+        clock[LEAST_BEFORE], clock[LEAST], clock[BUCKET] = clock[LEAST], delay, arrival
+    clock[LEAST] = min(clock[LEAST], delay)
+    error = min(clock[LEAST], clock[LEAST_BEFORE]) - clock[OFFSET]
+    if arrival - clock[ANCHORED] < WARM_UP_S:
+        clock[OFFSET] += min(error, 0.0)
+        return
+    most = max(passed, 0.0) * (SLEW_FAST if error < -PLAIN_S else SLEW)
+    clock[OFFSET] += min(max(error, -most), most)
+
+
+@nb.njit(cache=True)
+def tell(clocks, tick, raw_s, arrival):
+    """Give the fleet time of one message of an aircraft [s since 1970]; nan while a jump is suspected.
+
+    Args:
+        clocks: states, changed in place, (3, LENGTH)
+        tick: BOOT, USEC, USEC32 or NONE
+        raw_s: the message's own time [s]
+        arrival: when it arrived, fleet clock [s since 1970]
+    """
+    boot = clocks[BOOT]
+    latest = max(clocks[BOOT, LATEST], clocks[USEC, LATEST], clocks[USEC32, LATEST])
+    if tick == NONE:
+        return now(boot, arrival)
+    if tick == BOOT:
+        return read(boot, raw_s, arrival, latest)
+    if not isnan(boot[NEWEST]):
+        own = raw_s
+        if tick == USEC32:
+            own += np.rint((boot[NEWEST] - raw_s) / WRAP_USEC_S) * WRAP_USEC_S
+        if abs(own - boot[NEWEST]) < BACK_S:
+            return _at(boot, own)
+    return read(clocks[tick], raw_s, arrival, latest)
+
+
+def jumps(clocks: np.ndarray) -> int:
+    """Count the jumps noticed."""
+    return int(clocks[:, JUMPS].max())

@@ -56,3 +56,14 @@ def mode(heartbeat: Any) -> str:
 def armed(heartbeat: Any) -> bool:
     """Tell whether the motors may turn."""
     return bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+
+
+def firmware(version: Any) -> str:
+    """Read AUTOPILOT_VERSION, e.g. 4.7.0."""
+    number = version.flight_sw_version
+    return f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}"
+
+
+def names_firmware(words: str) -> bool:
+    """Tell whether a text names autopilot and version, e.g. ArduPlane V4.7.0-dev (d55cb382)."""
+    return words.startswith(("ArduPlane V", "ArduCopter V", "APM:", "PX4 v", "Blimp V", "ArduRover V"))

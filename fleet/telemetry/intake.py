@@ -1,22 +1,30 @@
 """Everything between the bytes of one link and contract messages: no sockets, no wall clock."""
 
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Hashable
+from functools import partial
 from typing import Any
 
+import numpy as np
+
 from fleet.contract import Mission, Params, Sample, Status
+from fleet.telemetry.batch import lay
 from fleet.telemetry.craft import LOST_S, Craft
-from fleet.telemetry.decode import Decoder
+from fleet.telemetry.decode import IDS, Decoder, Frames, Piece
 from fleet.telemetry.heartbeat import is_aircraft
 from fleet.telemetry.route import MESSAGES
+from fleet.telemetry.scan import COMPONENT, EXTRA, ID, SEQ, SYSTEM
 
 MOST_UAVS = 250
 SECOND = "second sender for a live id"
+NOT_YET = "no aircraft heartbeat yet"
 MOST_EARLY = 4096  # messages of one system kept until its first heartbeat; a recording may begin anywhere
-MOST_SENDERS = 512  # addresses with a decoder of their own on one link
 
 News = Sample | Status | Mission | Params
 EARLY = MESSAGES | {"PARAM_VALUE"}  # said once, so worth keeping; rows come again
+SINGLE = np.zeros(len(EXTRA), bool)  # by message id: heard one by one; all others are rows, or only counted
+SINGLE[[IDS[name] for name in (*EARLY, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
+SINGLE[IDS["MISSION_CURRENT"]] = True  # a row too
 Claims = dict[int, Craft]
 """Which aircraft holds a UAV id, over all links of a gateway."""
 
@@ -33,56 +41,83 @@ class Intake:
         self.offset = offset
         self.refused: Counter[str] = Counter()  # good frames refused, by reason
         self.crafts: dict[int, Craft] = {}  # by MAVLink system id
+        self.decoder = Decoder()
         self._claims: Claims = {} if claims is None else claims
-        self._decoders: OrderedDict[Hashable, Decoder] = OrderedDict()
+        self._pieces: list[Piece] = []
+        self._born: dict[int, int] = {}  # in this batch: by system, the frame of its first heartbeat
         self._rivals: set[int] = set()  # systems whose UAV id another link holds
         self._early: dict[int, list[tuple[float, Any]]] = {}  # before the first heartbeat, by system id
-        self._gone: Counter[str] = Counter()  # counters of decoders no longer kept
 
     def hear(self, arrival: float, data: bytes, source: Hashable = None) -> None:
-        """Take bytes that arrived together.
+        """Take bytes that arrived together; they are worked through at the next `flush`.
 
         Args:
             arrival: fleet time of arrival [s since 1970]
             data: any bytes
             source: who sent them, e.g. the UDP address; None on a stream with a single far end
         """
-        for message in self._decoder(source).feed(data):
-            self._route(arrival, message, source)
+        self._pieces.append((arrival, source, data))
 
     def flush(self, now: float) -> list[News]:
         """Hand over what is new; `now` is fleet time [s since 1970]."""
+        if self._pieces:
+            self.digest(self.decoder.feed(self._pieces))
+            self._pieces.clear()
+        return self.take(now)
+
+    def take(self, now: float) -> list[News]:
+        """Hand over what had arrived up to `now` of what was digested; `now` is fleet time [s since 1970]."""
         mine = [craft for craft in self.crafts.values() if self._claims.get(craft.uav) is craft]
         return [news for craft in mine for news in craft.take(now)]
 
+    def digest(self, frames: Frames) -> None:
+        """Work through a batch of frames; what they say is handed over by `take`."""
+        if not len(frames.at):
+            return
+        for i in np.flatnonzero(SINGLE[frames.at[:, ID]]).tolist():
+            message = frames.message(i)
+            if message is not None:
+                self._route(i, float(frames.arrival[i]), message, frames.senders[frames.sender[i]])
+        owner = np.full(len(frames.at), -1)
+        crafts = list(self.crafts.values())
+        for which in _by_speaker(frames):
+            craft = self._speaker(frames, which)
+            if craft is not None:
+                which = which[which >= self._born.get(craft.system, 0)]
+                if len(which):
+                    craft.note(frames.arrival[which], frames.names(which), frames.at[which, SEQ])
+                    owner[which] = crafts.index(craft)
+        self._born.clear()
+        lay(frames, owner, crafts)
+
     def counters(self) -> Counter[str]:
         """Give messages, bad_bytes and bad_frames over all senders."""
-        total = Counter(self._gone)
-        for decoder in self._decoders.values():
-            total.update(_counters(decoder))
-        return total
+        return self.decoder.counters()
 
-    def _decoder(self, source: Hashable) -> Decoder:
-        decoder = self._decoders.get(source)
-        if decoder is None:
-            if len(self._decoders) >= MOST_SENDERS:
-                self._gone.update(_counters(self._decoders.popitem(last=False)[1]))
-            decoder = self._decoders[source] = Decoder()
-        self._decoders.move_to_end(source)
-        return decoder
+    def _speaker(self, frames: Frames, which: np.ndarray) -> Craft | None:
+        """Tell whose frames these are, all from one component of one sender; count them where they are nobody's."""
+        system, component = frames.at[which[0], (SYSTEM, COMPONENT)].tolist()
+        source, arrival = frames.senders[frames.sender[which[0]]], float(frames.arrival[which[-1]])
+        craft = self.crafts.get(system)
+        rows = int((~SINGLE[frames.at[which, ID]]).sum())
+        if craft is not None and craft.component == component:
+            return craft if self._may_speak(craft, source, arrival, rows) else None
+        if rows:
+            self.refused[SECOND if system in self._rivals else "not an autopilot" if craft else NOT_YET] += rows
+        return None
 
-    def _route(self, arrival: float, message: Any, source: Hashable) -> None:
+    def _route(self, i: int, arrival: float, message: Any, source: Hashable) -> None:
         system, component = message.get_srcSystem(), message.get_srcComponent()
         craft = self.crafts.get(system)
         if craft is not None and craft.component == component:
             if self._may_speak(craft, source, arrival):
-                craft.hear(arrival, message)
+                craft.queue(arrival, craft.hear, message)
         elif craft is None and message.get_type() == "HEARTBEAT" and is_aircraft(message):
-            self._meet(arrival, message, source)
+            self._meet(i, arrival, message, source)
         else:
             self._overhear(arrival, message)
 
-    def _meet(self, arrival: float, message: Any, source: Hashable) -> None:
+    def _meet(self, i: int, arrival: float, message: Any, source: Hashable) -> None:
         system = message.get_srcSystem()
         uav = system + self.offset
         holder = self._claims.get(uav)
@@ -97,33 +132,34 @@ class Intake:
             self._rivals.discard(system)
             craft = Craft(uav, system, message.get_srcComponent(), source)
             self.crafts[system] = self._claims[uav] = craft
-            craft.hear(arrival, message)
-            for when, early in self._early.pop(system, ()):
+            self._born[system] = i
+            craft.meet(message)
+            for early_arrival, early in self._early.pop(system, ()):
                 if early.get_srcComponent() == craft.component:
-                    craft.hear(when, early)
+                    craft.queue(early_arrival, craft.hear, early)
+            craft.queue(arrival, craft.hear, message)
 
-    def _may_speak(self, craft: Craft, source: Hashable, arrival: float) -> bool:
+    def _may_speak(self, craft: Craft, source: Hashable, arrival: float, count: int = 1) -> bool:
         """Tell whether this is the one sender of its id; another takes over once that one is silent."""
         holder = self._claims.get(craft.uav, craft)
         if holder is craft and craft.source == source:
             return True
         if arrival - holder.heard < LOST_S:
-            self._alarm(holder, arrival)
+            self._alarm(holder, arrival, count)
             return False
         self._claims[craft.uav], craft.source = craft, source
         return True
 
-    def _alarm(self, craft: Craft, arrival: float) -> None:
-        self.refused[SECOND] += 1
-        craft.say(
-            "a second sender uses this id and was refused; give every aircraft its own MAVLink system id", arrival
-        )
+    def _alarm(self, craft: Craft, arrival: float, count: int = 1) -> None:
+        self.refused[SECOND] += count
+        words = "a second sender uses this id and was refused; give every aircraft its own MAVLink system id"
+        craft.queue(arrival, partial(craft.say, words))
 
     def _overhear(self, arrival: float, message: Any) -> None:
         name = message.get_type()
         target = self.crafts.get(getattr(message, "target_system", 0))
         if name in MESSAGES and target is not None:
-            target.route.hear(message, up=True, now=arrival)
+            target.queue(arrival, target.overhear, message)
         elif name == "HEARTBEAT":
             reason = "a second autopilot on one system id" if is_aircraft(message) else "not an aircraft"
             self.refused[reason] += 1
@@ -140,8 +176,11 @@ class Intake:
         if len(kept) < MOST_EARLY and message.get_type() in EARLY:
             kept.append((arrival, message))
         else:
-            self.refused["no aircraft heartbeat yet"] += 1
+            self.refused[NOT_YET] += 1
 
 
-def _counters(decoder: Decoder) -> dict[str, int]:
-    return {"messages": decoder.messages, "bad_bytes": decoder.bad_bytes, "bad_frames": decoder.bad_frames}
+def _by_speaker(frames: Frames) -> list[np.ndarray]:
+    """Sort frames by sender, system and component: the numbers of each one's frames, in order."""
+    key = (frames.sender << 16) + (frames.at[:, SYSTEM] << 8) + frames.at[:, COMPONENT]
+    order = np.argsort(key, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(key[order])) + 1)

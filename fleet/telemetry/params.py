@@ -36,6 +36,10 @@ class ParamBook:
                 self._changed = True
             if message.param_index < self._count:
                 self._indices.add(message.param_index)
+        self.put(name, value)
+
+    def put(self, name: str, value: float) -> None:
+        """Take one parameter by name, whoever told."""
         if not name or not name.isprintable() or (len(self.values) >= MOST and name not in self.values):
             self.rejected += 1
         elif not isfinite(value):

@@ -1,152 +1,152 @@
-"""Recordings as timed bytes: `.tlog` and `.tlog.xz`, whole, cut short or damaged.
-
-A .tlog repeats: 8 bytes big-endian microseconds since 1970, one MAVLink frame.
-"""
+"""Recordings as news of the aircraft in them: whatever was recorded, in the order and at the time it happened."""
 
 import logging
-import lzma
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO
 
-from fleet.telemetry.decode import frame_length
+import numpy as np
+
+from fleet.telemetry.craft import Craft
+from fleet.telemetry.decode import frames_of
 from fleet.telemetry.intake import Intake, News
-from fleet.telemetry.restamp import Record, backlog_offset, restamped
+from fleet.telemetry.onboard_log import OnboardLog
+from fleet.telemetry.onboard_news import UNDATED_S, craft_of, log_steps
+from fleet.telemetry.opening import COMPRESSED, Source
+from fleet.telemetry.scan import STAMP, START, STOP
+from fleet.telemetry.steps import Steps
+from fleet.telemetry.tlog import Tlog
 
-SUFFIXES = (".tlog", ".tlog.xz")
-CHUNK = 1 << 16
-FLUSH_S = 0.1  # recorded time between two publications [s]
-EARLIEST, LATEST = 3e8, 4e9  # believable stamps [s since 1970]
-LONGEST_GAP_S = 86_400.0
+KINDS = {".tlog": "telemetry log", ".bin": "DataFlash log", ".log": "DataFlash text log", ".ulg": "ULog"}
+_HEAD = 1 << 16  # bytes looked at to tell the kind
 
 _log = logging.getLogger("parauav.recordings")
 
 
-def records(path: Path | str) -> Iterator[Record]:
-    """Read a recording: (when it was received [s since 1970], frame bytes), as it stands in the file.
+class Recording:
+    """One recording, opened: what kind it is, who is in it, what could not be read.
 
-    Damage is skipped up to the next stamp that fits; what follows is still read. A sentence goes to the log.
-
+    Args:
+        path: a recording of one of `KINDS`, possibly compressed
+        offset: UAV id = MAVLink system id + offset
     Raises:
-        ValueError: when it is no .tlog or holds not a single frame.
+        ValueError: when it is no recording, or holds nothing.
         OSError: when it cannot be opened.
     """
-    path = Path(path)
-    if not path.name.endswith(SUFFIXES):
-        raise ValueError(
-            f"{path.name}: found {path.suffix or 'no suffix'}, expected {' or '.join(SUFFIXES)}; convert it"
-        )
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: found no such file, expected a recording; check the path")
-    reader = _Reader(path.name)
-    for chunk in _chunks(path):
-        yield from reader.feed(chunk)
-    yield from reader.feed(b"", last=True)
-    if not reader.count:
-        raise ValueError(f"{path.name}: found no MAVLink frame, expected a telemetry log; check the file")
-    if reader.skipped:
-        _log.warning("%s: %d damaged bytes skipped, %d frames read", path.name, reader.skipped, reader.count)
+
+    def __init__(self, path: Path | str, offset: int = 0) -> None:
+        self.source = Source(path)
+        self.name, self.offset = self.source.name, offset
+        self._told: list[str] = []
+        self.suffix = self._recognise()
+        self.crafts: dict[int, Craft] = {}  # by UAV id, filled while reading
+        self._log: OnboardLog | None = None
+        self._tlog: Tlog | None = None
+
+    @property
+    def kind(self) -> str:
+        """Name the kind of recording."""
+        return KINDS[self.suffix]
+
+    @property
+    def share(self) -> float:
+        """Tell how far reading has come, 0..1."""
+        return self.source.share
+
+    @property
+    def skipped(self) -> list[str]:
+        """Say what was skipped, where, and what was assumed; whole once read to the end."""
+        opened = self._log or self._tlog
+        found = [*self._told, *(opened.skipped if opened else ()), self.source.trouble]
+        return [f"{self.name}: {sentence}" for sentence in found if sentence]
+
+    def steps(self) -> Iterator[tuple[float, list[News]]]:
+        """Give the recording in steps of 0.1 s: (end of the step [s since 1970], news).
+
+        Raises:
+            ValueError: when there is nothing in it.
+        """
+        steps = self._mavlink() if self.suffix == ".tlog" else self._onboard()
+        count = 0
+        for now, news in steps:
+            count += len(news)
+            yield now, news
+        if not count:
+            said = "; ".join(self.skipped) or f"{self.name}: found no aircraft in it"
+            raise ValueError(f"{said}; expected the {self.kind} of a flight; check the file")
+
+    def _mavlink(self) -> Iterator[tuple[float, list[News]]]:
+        self._tlog = Tlog(self.source)
+        intake = Intake(self.offset)
+        steps = Steps(intake.take)
+        for frames in self._tlog.batches():
+            intake.digest(frames)
+            self.crafts.update((craft.uav, craft) for craft in intake.crafts.values())
+            yield from steps.upto(frames.arrival)
+        yield from steps.last()
+
+    def _onboard(self) -> Iterator[tuple[float, list[News]]]:
+        self._log = _READERS[self.suffix](self.source.open, self.name)
+        craft = craft_of(self._log, self.offset)
+        self.crafts[craft.uav] = craft
+        if self._log.epoch_s is None:
+            self._told.append(f"no date in it: times count from {UNDATED_S:.0f} s since 1970, the year 2000")
+        yield from log_steps(self._log, craft)
+
+    def _recognise(self) -> str:
+        """Tell the kind by the content, else by the name."""
+        with self.source.open() as stream:
+            head = stream.read(_HEAD) or b""
+        path = self.source.path
+        named = (path.with_suffix("") if path.suffix in COMPRESSED else path).suffix.lower()
+        if not head:
+            raise ValueError(f"{self.name}: {self.source.trouble or 'is empty'}; expected a recording; check the file")
+        found = _by_content(head)
+        if found and named in KINDS and found != named:
+            self._told.append(f"is a {KINDS[found]} by its content, whatever its name says; read as that")
+        if not found and named not in KINDS:
+            kinds = ", ".join(f"{KINDS[suffix]} ({suffix})" for suffix in KINDS)
+            raise ValueError(f"{self.name}: found no recording in it, expected one of {kinds}; convert it")
+        return found or named
 
 
-def timed(path: Path | str) -> Iterator[Record]:
-    """Read a recording in the time the flight took, even where a backlog arrived in a rush.
-
-    Raises:
-        ValueError: when it is no recording.
-    """
-    offset_s = backlog_offset(records(path))
-    return records(path) if offset_s is None else restamped(records(path), offset_s)
-
-
-def _chunks(path: Path) -> Iterator[bytes]:
-    with _open(path) as stream:
-        while True:
-            try:
-                chunk = stream.read(CHUNK)
-            except (EOFError, lzma.LZMAError) as error:
-                _log.warning("%s: the compressed file is damaged (%s); what came before is used", path.name, error)
-                return
-            if not chunk:
-                return
-            yield chunk
+def _by_content(head: bytes) -> str:
+    """Tell the suffix whose content this is; empty where nothing is recognised."""
+    if head.startswith(b"ULog\x01\x12"):
+        return ".ulg"
+    buf = np.frombuffer(head, np.uint8)
+    at, _, _ = frames_of(buf, np.array([[0, len(head)]]), np.zeros(3, np.int64), STAMP)
+    found = {
+        ".tlog": int((at[:, STOP] - at[:, START]).sum()) + STAMP * len(at),
+        ".bin": 89 * head.count(b"\xa3\x95\x80"),
+        ".log": sum(map(len, [line for line in head.split(b"\n") if line.startswith((b"FMT,", b"PARM,"))])),
+    }
+    best = max(found, key=lambda suffix: found[suffix])
+    return best if found[best] else ""
 
 
-def _open(path: Path) -> IO[bytes]:
-    return lzma.open(path, "rb") if path.suffix == ".xz" else path.open("rb")
+_READERS: dict[str, Callable[..., OnboardLog]] = {}
 
 
-class _Reader:
-    """Cut the byte stream of a .tlog into records."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self.count = self.skipped = 0
-        self._buf = bytearray()
-        self._t: float | None = None
-
-    def feed(self, chunk: bytes, last: bool = False) -> Iterator[Record]:
-        self._buf += chunk
-        buf, at = self._buf, 0
-        while len(buf) - at >= 11:
-            length = self._fits(at)
-            if not length:
-                at += 1
-                self.skipped += 1
-                continue
-            end = at + 8 + length
-            if end > len(buf) or (end + 9 > len(buf) and not last):
-                break
-            t = int.from_bytes(buf[at : at + 8], "big") * 1e-6
-            self._t = t
-            self.count += 1
-            yield t, bytes(buf[at + 8 : end])
-            at = end
-        if last:
-            self.skipped += len(buf) - at
-            at = len(buf)
-        del buf[:at]
-
-    def _fits(self, at: int) -> int:
-        """Give the frame length when a record starts at `at`, else 0."""
-        length = frame_length(self._buf, at + 8)
-        if length <= 0:
-            return 0
-        t = int.from_bytes(self._buf[at : at + 8], "big") * 1e-6
-        if self._t is None:
-            return length if EARLIEST < t < LATEST else 0
-        return length if abs(t - self._t) < LONGEST_GAP_S else 0
-
-
-def ticks(path: Path | str) -> Iterator[tuple[float, list[Record]]]:
-    """Read a recording in steps of 0.1 s: (end of the step [s since 1970], what arrived within it).
-
-    Raises:
-        ValueError: when it is no recording.
-    """
-    due: float | None = None
-    heard: list[Record] = []
-    for record in timed(path):
-        due = record[0] + FLUSH_S if due is None else due
-        while record[0] >= due:
-            yield due, heard
-            due, heard = due + FLUSH_S, []
-        heard.append(record)
-    if due is not None:
-        yield due, heard
-
-
-def replay_messages(path: Path | str, offset: int = 0, intake: Intake | None = None) -> Iterator[News]:
+def replay_messages(
+    path: Path | str, offset: int = 0, crafts: dict[int, Craft] | None = None, skipped: list[str] | None = None
+) -> Iterator[News]:
     """Read a recording as the gateway would have heard it, in time order; fleet time is the recording's own.
 
     Args:
-        path: .tlog or .tlog.xz
+        path: a recording of one of `KINDS`, possibly compressed
         offset: UAV id = MAVLink system id + offset
-        intake: one of your own, to read its counters afterwards
+        crafts: filled by UAV id with what is known of each aircraft
+        skipped: filled with sentences at the end
     Raises:
         ValueError: when it is no recording.
+        OSError: when it cannot be opened.
     """
-    intake = Intake(offset) if intake is None else intake
-    for now, heard in ticks(path):
-        for t, frame in heard:
-            intake.hear(t, frame)
-        yield from intake.flush(now)
+    recording = Recording(path, offset)
+    if crafts is not None:
+        recording.crafts = crafts
+    for _, news in recording.steps():
+        yield from news
+    for sentence in recording.skipped:
+        _log.warning(sentence)
+    if skipped is not None:
+        skipped += recording.skipped

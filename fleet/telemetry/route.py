@@ -61,6 +61,12 @@ class RouteBook:
         elif name == "MISSION_CLEAR_ALL" and up:
             self.stale = True
 
+    def adopt(self, items: tuple[Item, ...]) -> None:
+        """Take a whole mission, as an onboard log tells it."""
+        draft = _Draft(len(items), 0.0)
+        draft.items = dict(enumerate(items))
+        self._adopt(draft)
+
     def missing(self) -> list[int] | None:
         """Give the sequence numbers a download on its way still lacks; None when no count was heard."""
         draft = self._drafts[False]

@@ -1,45 +1,74 @@
-"""Rows of one aircraft between two publications: in time order, the better source first, bounded."""
+"""Rows of one aircraft that wait for their publication: in time order, handed over as far as they had arrived."""
 
-from typing import Any
+from bisect import bisect_right
+
+import numpy as np
 
 from fleet.contract import COLUMNS, Array, Rows, Sample
 
-MOST_ROWS = 2_000  # rows one aircraft may put between two publications
-YIELD_S = 3.0  # a lower-ranked source speaks again after this silence of the better one [s]
+MOST_ROWS = 2_000  # rows of one kind in one publication; more is a flood
 _DTYPE = {"position": "<i4", "leg": "<i4", "target": "<i4"}
 
 
+class _Pile:
+    """Rows of one kind; numbers are packed once, publications cut from the bytes."""
+
+    def __init__(self, field: str) -> None:
+        self.dtype = np.dtype(_DTYPE.get(field, "<f4"))
+        self.width = len(COLUMNS[field])
+        self.arrival: list[float] = []
+        self.t: list[float] = []
+        self._t_bytes = self._x_bytes = b""
+        self._start = 0
+
+    def lay(self, arrival: np.ndarray, t: np.ndarray, x: np.ndarray) -> None:
+        start, row = self._start, self.width * self.dtype.itemsize
+        self.arrival = self.arrival[start:] + arrival.tolist()
+        self.t = self.t[start:] + t.tolist()
+        self._t_bytes = self._t_bytes[8 * start :] + t.astype("<f8").tobytes()
+        self._x_bytes = self._x_bytes[row * start :] + x[:, : self.width].astype(self.dtype).tobytes()
+        self._start = 0
+
+    def take(self, now: float) -> tuple[Rows | None, int]:
+        """Hand over what arrived up to `now`; and how many rows were too many."""
+        start = self._start
+        stop = bisect_right(self.arrival, now, start)
+        if stop == start:
+            return None, 0
+        self._start = stop
+        cut = min(stop, start + MOST_ROWS)
+        row = self.width * self.dtype.itemsize
+        t = Array("<f8", (cut - start,), self._t_bytes[8 * start : 8 * cut])
+        x = Array(self.dtype.str, (cut - start, self.width), self._x_bytes[row * start : row * cut])
+        return Rows(t=t, x=x), stop - cut
+
+
 class Shelf:
-    """Collect rows per `Sample` field, then hand them over as one `Sample`."""
+    """Rows per `Sample` field."""
 
     def __init__(self) -> None:
-        self._rows: dict[str, list[tuple[float, tuple[float, ...]]]] = {field: [] for field in COLUMNS}
-        self._last = dict.fromkeys(COLUMNS, float("-inf"))
-        self._best = dict.fromkeys(COLUMNS, (-1, float("-inf")))
-        self._count = 0
+        self.refused = 0  # rows beyond `MOST_ROWS`
+        self._piles = {field: _Pile(field) for field in COLUMNS}
 
-    def put(self, field: str, rank: int, t: float, values: tuple[float, ...]) -> bool:
-        """Add one row; False when it is not newer than the last of its field, or the shelf is full."""
-        best, when = self._best[field]
-        if rank < best and t < when + YIELD_S:
-            return True
-        self._best[field] = (rank, t)
-        if t <= self._last[field] or self._count >= MOST_ROWS:
-            return False
-        self._last[field] = t
-        self._rows[field].append((t, values))
-        self._count += 1
-        return True
+    def lay(self, field: str, arrival: np.ndarray, t: np.ndarray, x: np.ndarray) -> None:
+        """Add rows of one kind.
 
-    def take(self, uav: int) -> Sample | None:
-        """Hand over what was collected since the last call; None where nothing was."""
-        if not self._count:
-            return None
-        made: dict[str, Any] = {}
-        for field, rows in self._rows.items():
-            if rows:
-                values = Array.of([v for _, v in rows], _DTYPE.get(field, "<f4"))
-                made[field] = Rows(t=Array.of([t for t, _ in rows], "<f8"), x=values)
-                rows.clear()
-        self._count = 0
-        return Sample(uav=uav, t=max(self._last[field] for field in made), **made)
+        Args:
+            field: of `Sample`
+            arrival: when they were heard, never falling, (n,) [s since 1970]
+            t: fleet time, rising and newer than what was laid before, (n,) [s since 1970]
+            x: values, (n, k); columns beyond those of the field are left out
+        """
+        self._piles[field].lay(arrival, t, x)
+
+    def take(self, uav: int, now: float) -> Sample | None:
+        """Hand over what was heard up to `now` and not handed over before; None where nothing was."""
+        made: dict[str, Rows] = {}
+        newest = float("-inf")
+        for field, pile in self._piles.items():
+            rows, refused = pile.take(now)
+            if rows is not None:
+                made[field] = rows
+                newest = max(newest, pile.t[pile._start - 1 - refused])
+                self.refused += refused
+        return Sample(uav=uav, t=newest, **made) if made else None  # type: ignore[arg-type]

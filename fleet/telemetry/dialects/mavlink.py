@@ -4,25 +4,16 @@ The only place where degrees, centimetres, milli-g and per cent become SI, NED, 
 Source: MAVLink common.xml; for what ArduPilot really sends, its GCS_Common.cpp and GCS_MAVLink_Plane.cpp.
 """
 
-from enum import Enum
 from math import pi
 from typing import Any
 
 import numpy as np
 
+from fleet.telemetry.clock import BOOT, NONE, USEC, USEC32
 from fleet.telemetry.dialects.row import Row
 
 DEG = pi / 180  # [rad/deg]
 MILLI_G = 9.80665e-3  # [m/s2 per milli-g]
-
-
-class Tick(Enum):
-    """Where the time of a message comes from."""
-
-    BOOT_MS = "time_boot_ms, wraps after 49.7 days"
-    USEC = "time_usec, 64 bit, since boot or since 1970"
-    USEC32 = "time_usec cut to 32 bit, wraps after 71.6 minutes"
-    NONE = "no time: the newest boot time heard from the same aircraft"
 
 
 def _imu_milli(m: Any) -> tuple[Any, ...]:
@@ -60,52 +51,51 @@ TABLE: tuple[Row, ...] = (
         "ATTITUDE",
         "attitude",
         lambda m: (m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed),
-        Tick.BOOT_MS,
+        BOOT,
     ),
-    Row("HIGHRES_IMU", "imu", lambda m: (m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro), Tick.USEC, rank=3),
-    Row("SCALED_IMU", "imu", _imu_milli, Tick.BOOT_MS, rank=2),
-    Row("RAW_IMU", "imu", _imu_milli, Tick.USEC, rank=1, autopilots=("ardupilot",)),  # elsewhere raw has no unit
-    Row("GLOBAL_POSITION_INT", "position", lambda m: (m.lat, m.lon, m.alt), Tick.BOOT_MS, when=_has_fix),
+    Row("HIGHRES_IMU", "imu", lambda m: (m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro), USEC, rank=3),
+    Row("SCALED_IMU", "imu", _imu_milli, BOOT, rank=2),
+    Row("RAW_IMU", "imu", _imu_milli, USEC, rank=1, autopilots=("ardupilot",)),  # elsewhere raw has no unit
+    Row("GLOBAL_POSITION_INT", "position", lambda m: (m.lat, m.lon, m.alt), BOOT, when=_has_fix),
     Row(
         "GLOBAL_POSITION_INT",
         "velocity",
         lambda m: (m.vx * 1e-2, m.vy * 1e-2, m.vz * 1e-2),
-        Tick.BOOT_MS,
+        BOOT,
         when=_has_fix,
     ),
-    Row("VFR_HUD", "air", lambda m: (m.airspeed, m.throttle * 1e-2, m.climb), Tick.NONE),
-    Row("SERVO_OUTPUT_RAW", "servo", _servo, Tick.USEC32, when=lambda m: m.port == 0),
+    Row("VFR_HUD", "air", lambda m: (m.airspeed, m.throttle * 1e-2, m.climb), NONE),
+    Row("SERVO_OUTPUT_RAW", "servo", _servo, USEC32, when=lambda m: m.port == 0),
     Row(
         "NAV_CONTROLLER_OUTPUT",
         "command",
         lambda m: _command(m, m.aspd_error * 1e-2),  # ArduPilot sends cm/s, not the m/s of common.xml
-        Tick.NONE,
+        NONE,
         autopilots=("ardupilot",),
     ),
     Row(
         "NAV_CONTROLLER_OUTPUT",
         "command",
         lambda m: _command(m, m.aspd_error),
-        Tick.NONE,
+        NONE,
         autopilots=("px4", "generic"),
     ),
-    Row("MISSION_CURRENT", "leg", lambda m: (np.where(m.seq == _NO_ITEM, -1.0, m.seq),), Tick.NONE),
-    Row("WIND", "wind", _wind, Tick.NONE, rank=1),
-    Row("WIND_COV", "wind", lambda m: (m.wind_x, m.wind_y), Tick.USEC, rank=2),
+    Row("MISSION_CURRENT", "leg", lambda m: (np.where(m.seq == _NO_ITEM, -1.0, m.seq),), NONE),
+    Row("WIND", "wind", _wind, NONE, rank=1),
+    Row("WIND_COV", "wind", lambda m: (m.wind_x, m.wind_y), USEC, rank=2),
     Row(
         "POSITION_TARGET_GLOBAL_INT",
         "target",
         lambda m: (m.lat_int, m.lon_int, m.alt * 1e3),
-        Tick.BOOT_MS,
+        BOOT,
         when=lambda m: ((m.coordinate_frame == 0) | (m.coordinate_frame == 5)) & _somewhere(m.lat_int, m.lon_int),
     ),
 )
 
-ROWS: dict[str, tuple[Row, ...]] = {
-    name: tuple(row for row in TABLE if row.message == name) for name in {row.message for row in TABLE}
-}
+_OWN_TIME = {BOOT: lambda m: m.time_boot_ms * 1e-3, USEC: lambda m: m.time_usec * 1e-6, NONE: lambda m: 0.0}
+_OWN_TIME[USEC32] = _OWN_TIME[USEC]
 
 
-def raw_seconds(tick: Tick, message: Any) -> float:
-    """Read the message's own time [s] on whatever clock it counts; only for ticks other than NONE."""
-    return message.time_boot_ms * 1e-3 if tick is Tick.BOOT_MS else message.time_usec * 1e-6
+def own_seconds(row: Row, message: Any) -> Any:
+    """Read the messages' own time on whatever clock the row names [s]; 0 where it names none."""
+    return _OWN_TIME[row.tick](message)

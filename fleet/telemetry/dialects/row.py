@@ -15,7 +15,7 @@ class Row(NamedTuple):
     message: str  # its name in the dialect
     field: str  # field of `Sample`; columns as in `contract.COLUMNS`
     columns: Callable[[Any], tuple[Any, ...]]
-    tick: Any = None  # MAVLink: the clock its time comes from
+    tick: int = 0  # MAVLink: the clock its time comes from, BOOT, USEC, USEC32 or NONE of `telemetry.clock`
     rank: int = 0  # among rows of one field the highest rank that flows wins
     autopilots: tuple[str, ...] = ()  # empty: any
     when: Callable[[Any], Any] | None = None  # which messages of that name count

@@ -1,0 +1,56 @@
+"""An onboard log as news of its aircraft, in the same steps as a telemetry recording."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from fleet.telemetry.craft import Craft
+from fleet.telemetry.intake import News
+from fleet.telemetry.onboard_log import Chunk, OnboardLog
+from fleet.telemetry.steps import Steps
+
+UNDATED_S = 946_684_800.0  # 2000-01-01, where a log never heard of the date [s since 1970]
+
+
+def craft_of(log: OnboardLog, offset: int) -> Craft:
+    """Make the aircraft that wrote this log; UAV id = its MAVLink system id + `offset`."""
+    craft = Craft(log.system + offset, log.system, 1)
+    craft.autopilot, craft.vehicle, craft.firmware = log.autopilot, log.vehicle, log.firmware
+    return craft
+
+
+def log_steps(log: OnboardLog, craft: Craft) -> Iterator[tuple[float, list[News]]]:
+    """Read a log in steps of 0.1 s: (end of the step [s since 1970], news)."""
+    epoch_s = UNDATED_S if log.epoch_s is None else log.epoch_s
+    steps = Steps(craft.take)
+    newest: dict[str, float] = {}
+    for chunk in log.chunks():
+        times = [said.t for said in chunk.said] + [edge for t, _ in chunk.rows.values() for edge in t]
+        if times:
+            _digest(chunk, craft, epoch_s, newest)
+            yield from steps.upto(np.sort(np.array(times)) + epoch_s)
+    yield from steps.last()
+
+
+def _digest(chunk: Chunk, craft: Craft, epoch_s: float, newest: dict[str, float]) -> None:
+    _note(chunk, craft, epoch_s)
+    for field, (t, x) in chunk.rows.items():
+        fresh = t > newest.get(field, -np.inf)
+        if fresh.any():
+            newest[field] = float(t[-1])
+            craft.shelf.lay(field, t[fresh] + epoch_s, t[fresh] + epoch_s, x[fresh])
+    for said in chunk.said:
+        craft.queue(said.t + epoch_s, craft.told, said)
+
+
+def _note(chunk: Chunk, craft: Craft, epoch_s: float) -> None:
+    """Count the messages of the chunk as if each kind had come evenly."""
+    edges = [t[k] for t, _ in chunk.rows.values() if len(t) for k in (0, -1)] or [said.t for said in chunk.said]
+    if not edges:
+        return
+    times = {name: np.linspace(min(edges), max(edges), n) for name, n in chunk.counts.items() if n}
+    arrival = np.concatenate(list(times.values())) if times else np.empty(0)
+    if len(arrival):
+        names = np.repeat(np.array(list(times)), [len(t) for t in times.values()])
+        order = np.argsort(arrival, kind="stable")
+        craft.note(arrival[order] + epoch_s, names[order].tolist(), np.arange(len(arrival)) + 1 & 0xFF)

@@ -1,0 +1,90 @@
+"""A recording's bytes, compressed or not: read in pieces, with how far one has come, and never without an end."""
+
+import bz2
+import gzip
+import lzma
+import stat
+from collections.abc import Callable
+from io import RawIOBase
+from pathlib import Path
+from typing import IO, Any
+
+_OPENERS: dict[str, Callable[..., Any]] = {".xz": lzma.open, ".gz": gzip.open, ".bz2": bz2.open}
+COMPRESSED = tuple(_OPENERS)
+_BROKEN = (EOFError, lzma.LZMAError, OSError)  # what a damaged archive raises
+
+
+class Source:
+    """One recording as a file: opens as often as wanted, and remembers what was wrong with it.
+
+    Raises:
+        OSError: when it is no file that can be read.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.name = self.path.name
+        self.trouble = ""
+        try:
+            found = self.path.stat()
+        except OSError as error:
+            reason = error.strerror or "not there"
+            raise OSError(f"{self.path}: found no such file ({reason}), expected a recording; check the path") from None
+        if not stat.S_ISREG(found.st_mode):
+            raise OSError(f"{self.path}: found no regular file, expected a recording; copy it into one")
+        self.size = found.st_size
+        self._raw: IO[bytes] | None = None
+
+    @property
+    def share(self) -> float:
+        """Tell how far the newest reading has come, 0..1 of the file."""
+        if self._raw is None or not self.size:
+            return 0.0
+        return 1.0 if self._raw.closed else min(self._raw.tell() / self.size, 1.0)
+
+    def open(self) -> "Bytes":
+        """Open from the beginning.
+
+        Raises:
+            OSError: when it cannot be opened; the sentence says why.
+        """
+        try:
+            self._raw = self.path.open("rb")
+        except OSError as error:
+            raise OSError(f"{self.path}: cannot be read ({error.strerror}); check its permissions") from None
+        opener = _OPENERS.get(self.path.suffix)
+        return Bytes(self, opener(self._raw) if opener else self._raw)
+
+
+class Bytes(RawIOBase):
+    """The bytes of a source; where its archive is damaged they end, and the source says so."""
+
+    def __init__(self, source: Source, stream: Any) -> None:
+        self._source, self._stream = source, stream
+
+    def readable(self) -> bool:
+        """Tell that this can be read."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill a buffer; 0 at the end."""
+        filled = 0
+        while filled < len(buffer):
+            try:
+                data = self._stream.read1(len(buffer) - filled)
+            except _BROKEN as error:
+                self._source.trouble = f"the compressed file is damaged ({error}); what came before is used"
+                break
+            if not data:
+                break
+            buffer[filled : filled + len(data)] = data
+            filled += len(data)
+        return filled
+
+    def close(self) -> None:
+        """Close the file too."""
+        if not self.closed:
+            self._stream.close()
+            if self._source._raw is not None:
+                self._source._raw.close()
+        super().close()
