@@ -158,7 +158,7 @@ def test_a_recording_played_live_says_what_it_says_offline(tmp_path):
     live = [m for m in ear.news if not isinstance(m, Account)]
     assert live == list(replay_messages(path))
     assert len(live) > 200
-    assert ear.of(Account)[-1].t == pytest.approx(T0 + 20, abs=3.0)
+    assert ear.of(Account)[-1].t == pytest.approx(T0 + 20, abs=0.2)
 
 
 def test_a_recording_keeps_its_pace(tmp_path):

@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from fleet.contract import Status
+
 STEP_S = 0.1  # recorded time between two publications [s]
 SILENT_STEPS = 100  # steps made after the last message of a gap; by then everybody knows of the silence
 SETTLE_S = 2.5  # after the end: what waited for more is handed over [s]
@@ -40,4 +42,5 @@ class Steps:
         if self._first is not None:
             now = self._first + (self._number + 1) * STEP_S
             yield now, self._take(now)
-            yield now + SETTLE_S, self._take(now + SETTLE_S)
+            settled = self._take(now + SETTLE_S)
+            yield now + SETTLE_S, [news for news in settled if not isinstance(news, Status)]  # the link is not silent
