@@ -114,7 +114,9 @@ class Sieve:
         yield self._header()
         out, good = bytearray(), self._offset
         while self._fill(3):
-            message = self._run() or self._next()
+            message = self._run()
+            if not message and self._fill(3):
+                message = self._next()
             if message is None:
                 if self._offset - good > HOPELESS:
                     self._say(f"{HOPELESS >> 20} MiB without a message from byte {good} on, the rest was left unread")
@@ -139,7 +141,7 @@ class Sieve:
         self._now_us = self.start_us or None
         return MAGIC + b"\x01" + struct.pack("<Q", self.start_us)
 
-    def _run(self) -> bytes:
+    def _run(self) -> bytes | None:
         """Step over the rows that follow as long as all is well: nearly all of a log, so it is kept lean."""
         raw, at, end, topics, now = self._raw, self._at, len(self._raw), self.formats.topics, self._now_us
         out = bytearray()
@@ -234,10 +236,11 @@ class Sieve:
         """Give the bytes that may pass: empty for a good message nobody needs, None for a bad one."""
         if kind == _DATA:
             return self._data(body)
+        if kind == ord("B") and self.messages == 0 and 40 <= len(body) < 100:  # anywhere else it is damage
+            self._flags(body)
+            return b""
         if not _is_good(kind, body, self.formats):
             return None
-        if kind == ord("B"):
-            self._flags(body)
         if kind == ord("F") and not self._in_data:
             self.formats.learn(body)
         elif kind == ord("A"):
@@ -303,4 +306,4 @@ def _is_good(kind: int, body: bytes, formats: Formats) -> bool:
         return formats.is_value(body)
     if kind in b"MQ":
         return formats.is_value(body[1:])
-    return {"S": body == _SYNC, "O": len(body) == 2, "R": len(body) == 2, "B": len(body) >= 40}[chr(kind)]
+    return {"S": body == _SYNC, "O": len(body) == 2, "R": len(body) == 2, "B": False}[chr(kind)]

@@ -11,7 +11,7 @@ _STRAY_S = 1.0  # a stamp this far from its neighbours in the file is damaged [s
 
 
 class Topic:
-    """One topic: `t` [s], and each field of it an attribute; `q[0]`, `q[1]` … are one tuple, `current.lat` is nested."""
+    """One topic: `t` [s], and each field an attribute; `q[0]`, `q[1]` … make one tuple, `current.lat` nests."""
 
     def __init__(self, t: np.ndarray, data: Mapping[str, np.ndarray], others: Mapping[str, "Topic"]) -> None:
         self.t, self._data, self._others = t, data, others
