@@ -1,17 +1,14 @@
-"""The ULog reader: a real log, the table release by release, damage, and the same numbers as plain pyulog."""
+"""The ULog reader: a real log, the table release by release, and the same numbers as plain pyulog."""
 
 import csv
 import io
-import random
-import struct
 import tarfile
-from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from pyulog import ULog
-from ulog_writer import MAGIC, START_US, TRUTH, UTC_US, flight, message, release, ulog
+from ulog_writer import START_US, TRUTH, UTC_US, flight, read, release, rows, said, ulog
 
 from fleet.contract import COLUMNS
 from fleet.telemetry import ulog_sieve
@@ -21,24 +18,6 @@ from fleet.telemetry.ulog_topic import Topic, in_order
 
 VERSIONS = ((1, 6), (1, 8), (1, 11), (1, 13), (1, 14), (1, 16))
 SAMPLE = "real/px4_vtol_cubeorange_6s_reader_test.ulg"
-
-
-def read(data: bytes, name: str = "x.ulg") -> UlogLog:
-    return UlogLog(lambda: io.BytesIO(data), name)
-
-
-def rows(log: UlogLog) -> dict:
-    """All chunks put together."""
-    chunks = list(log.chunks())
-    fields = {field for chunk in chunks for field in chunk.rows}
-    return {
-        field: tuple(np.concatenate([chunk.rows[field][i] for chunk in chunks if field in chunk.rows]) for i in (0, 1))
-        for field in fields
-    }
-
-
-def said(log: UlogLog, what: str) -> list:
-    return [s.value for chunk in log.chunks() for s in chunk.said if s.what == what]
 
 
 # --- the real log -------------------------------------------------------------------------------------------------
@@ -289,138 +268,3 @@ def test_the_table_reads_the_columns_of_a_px4_1_13_flight(recordings):
 def _all(candidates, topics) -> list:
     laid = [_lay(row, topics[row.message]) for row in candidates if row.message in topics]
     return [x for x in laid if x is not None]
-
-
-# --- damage -------------------------------------------------------------------------------------------------------
-
-ODD = {
-    "empty": b"",
-    "garbage": random.Random(1).randbytes(200_000),
-    "zeros": bytes(100_000),
-    "header only": MAGIC + struct.pack("<Q", 5),
-    "half a header": MAGIC,
-    "a format that contains itself": MAGIC + bytes(8) + message("F", b"a:a[9] b;") + message("A", b"\0\0\0a"),
-    "a subscription without a format": MAGIC + bytes(8) + message("A", b"\0\0\0vehicle_status"),
-}
-
-
-@pytest.mark.parametrize("what", ODD)
-def test_a_file_with_nothing_in_it_gives_no_chunks_and_says_so(what):
-    log = read(ODD[what])
-    assert list(log.chunks()) == []
-    assert any("check the file" in sentence for sentence in log.skipped)
-    assert len(log.skipped) < 40
-    assert (log.system, log.vehicle, log.epoch_s) == (1, "unknown", None)
-
-
-def test_a_log_cut_anywhere_is_read_up_to_the_cut():
-    data = ulog(flight((1, 11), seconds=2.0), params={"A": 1})
-    whole = len(rows(read(data))["imu"][0])
-    begins = data.index(message("A", b"")[2:3] + b"\0\0\0sensor_combined")
-    for share in (0.1, 0.33, 0.5, 0.77, 0.999):
-        cut = begins + int(share * (len(data) - begins))
-        got = rows(read(data[:cut])).get("imu", ([], []))
-        assert abs(len(got[0]) - share * whole) <= 0.05 * whole + 12
-    for cut in range(0, begins, 97):
-        read(data[:cut])
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_hundred_flipped_bits_cost_little(seed):
-    clean = ulog(flight((1, 11), seconds=20.0), params={f"P{i}": i for i in range(50)})
-    begins = clean.index(message("D", b"")[2:3], clean.index(b"mission_result", clean.index(b"A\0")))
-    dice, data = random.Random(seed), bytearray(clean)
-    for _ in range(100):
-        at = dice.randrange(begins, len(data))
-        data[at] ^= 1 << dice.randrange(8)
-    log = read(bytes(data))
-    before, after = rows(read(clean)), rows(log)
-    for field in before:
-        t, values = after[field]
-        assert len(t) > 0.85 * len(before[field][0]), field
-        assert (np.diff(t) > 0).all()
-        right = np.isclose(values, TRUTH[field], rtol=1e-5, atol=1e-4).all(axis=1)
-        assert right.mean() > 0.9, field
-    assert 0 < len(log.skipped) < 40
-    assert len(list(log.chunks())) <= 4
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_bits_flipped_anywhere_raise_nothing(seed, sample_bytes):
-    dice, data = random.Random(seed), bytearray(sample_bytes)
-    for _ in range(100):
-        data[dice.randrange(len(data))] ^= 1 << dice.randrange(8)
-    log = read(bytes(data))
-    assert len(rows(log).get("imu", ([], []))[0]) > 1000
-    assert len(log.skipped) < 40
-
-
-def test_a_hole_and_a_run_of_garbage_are_stepped_over_and_their_place_is_said():
-    data = ulog(flight((1, 11), seconds=20.0))
-    middle = len(data) // 2
-    log = read(data[:middle] + random.Random(2).randbytes(30_000) + data[middle + 5000 :])
-    t = rows(log)["imu"][0] - START_US * 1e-6
-    assert t[-1] > 19.9
-    assert len(t) > 0.9 * 2000
-    assert any("stepped over" in sentence and str(middle)[:3] in sentence for sentence in log.skipped)
-
-
-def test_data_appended_after_a_crash_are_read():
-    data = ulog(flight((1, 11), seconds=4.0), texts=[(START_US + 3_990_000, 3, "late")])
-    place = len(data) - 7  # the last message of the flight was cut short
-    flags = bytes(8) + b"\1" + bytes(7) + struct.pack("<3Q", place, 0, 0)
-    text = message("L", struct.pack("<BQ", ord("3"), START_US + 3_995_000) + b"appended")
-    log = read(data[:16] + message("B", flags) + data[16 + 43 : place] + text)
-    assert (3, "appended") in said(log, "text")
-
-
-class Endless(io.RawIOBase):
-    """A log that never ends: its last rows again and again, or noise."""
-
-    def __init__(self, head: bytes, tail: bytes) -> None:
-        self.head, self.tail, self.given = head, tail, 0
-
-    def read(self, n: int = -1) -> bytes:
-        self.given += n
-        out, self.head = self.head[:n], self.head[n:]
-        return out + (self.tail * (n // len(self.tail) + 1))[: n - len(out)]
-
-
-@pytest.mark.parametrize("noise", [bytes(1000), random.Random(3).randbytes(4096)])
-def test_an_endless_stream_is_read_up_to_a_size_and_that_is_said(noise, monkeypatch):
-    monkeypatch.setattr(ulog_sieve, "LARGEST", 3 << 20)
-    stream = Endless(ulog(flight((1, 11))), noise)
-    log = UlogLog(lambda: stream, "endless.ulg")
-    assert stream.given <= 4 << 20
-    assert any("longer than 3 MiB" in sentence for sentence in log.skipped)
-    assert len(rows(log)["imu"][0]) >= 490
-
-
-def test_after_much_noise_the_rest_is_left_unread(monkeypatch):
-    monkeypatch.setattr(ulog_sieve, "HOPELESS", 3 << 20)
-    stream = Endless(ulog(flight((1, 11))), bytes(1000))
-    log = UlogLog(lambda: stream, "endless.ulg")
-    assert any("the rest was left unread" in sentence for sentence in log.skipped)
-
-
-@pytest.mark.parametrize("error", [OSError("gone"), EOFError("cut")])
-def test_a_file_that_breaks_while_it_is_read_keeps_what_came_before(error):
-    class Breaks(io.BytesIO):
-        def read(self, n: int = -1) -> bytes:
-            data = super().read(20_000)
-            if not data:
-                raise error
-            return data
-
-    data = ulog(flight((1, 11)))
-    log = UlogLog(lambda: Breaks(data), "x.ulg")
-    assert len(rows(log)["imu"][0]) >= 490
-    assert any(str(error) in sentence for sentence in log.skipped)
-
-
-def test_an_opener_that_fails_is_said():
-    def opener() -> io.BytesIO:
-        raise PermissionError("not yours")
-
-    make: Callable[[], UlogLog] = lambda: UlogLog(opener, "x.ulg")  # noqa: E731
-    assert any("not yours" in sentence for sentence in make().skipped)

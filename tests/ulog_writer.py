@@ -1,8 +1,11 @@
-"""Write ULog bytes as PX4's logger does, and one steady flight as four releases named things."""
+"""Write ULog bytes as PX4's logger does, one steady flight as its releases named things, and read it back."""
 
+import io
 import struct
 
 import numpy as np
+
+from fleet.telemetry.ulog import UlogLog
 
 MAGIC = b"ULog\x01\x12\x35\x01"
 START_US = 10_000_000
@@ -186,3 +189,24 @@ def _tecs(version: tuple[int, int]) -> dict:
     else:
         return {"altitudeSp": 520.0, "altitude_filtered": 500.0, "airspeedSp": 17.0, "airspeed_filtered": 15.0}
     return {"altitude_sp": 520.0, "altitude_filtered": 500.0} | speeds
+
+
+# --- reading it back --------------------------------------------------------------------------------------------------
+
+
+def read(data: bytes, name: str = "x.ulg") -> UlogLog:
+    return UlogLog(lambda: io.BytesIO(data), name)
+
+
+def rows(log: UlogLog) -> dict:
+    """All chunks put together."""
+    chunks = list(log.chunks())
+    fields = {field for chunk in chunks for field in chunk.rows}
+    return {
+        field: tuple(np.concatenate([chunk.rows[field][i] for chunk in chunks if field in chunk.rows]) for i in (0, 1))
+        for field in fields
+    }
+
+
+def said(log: UlogLog, what: str) -> list:
+    return [s.value for chunk in log.chunks() for s in chunk.said if s.what == what]

@@ -36,7 +36,7 @@ class UlogLog:
         self.params = {k: float(v) for k, v in log.initial_parameters.items() if _is_number(v)}
         self._topics = self._sorted(log, start_us)
         self._t0 = max(start_us * 1e-6, 0.0) if start_us else min((t.t[0] for t in self._topics.values()), default=0.0)
-        self._rows, self._rowless = self._fill()
+        self._rows = self._fill()
         self.system = system(self.params, self._topics)
         self.vehicle = vehicle(self.params, self._topics)
         self.firmware = firmware(log.msg_info_dict)
@@ -93,19 +93,17 @@ class UlogLog:
 
     # --- rows ---
 
-    def _fill(self) -> tuple[Table, list[str]]:
+    def _fill(self) -> Table:
         table: Table = {}
-        absent: list[str] = []
         for field in FIELDS:
             found = self._best(field)
             if found is None:
-                absent.append(field)
                 continue
             row, t, values = found
             table[field] = (t, values)
             if row.message in CALCULATED:
                 self.skipped.append(CALCULATED[row.message])
-        return table, absent
+        return table
 
     def _best(self, field: str) -> tuple[Row, np.ndarray, np.ndarray] | None:
         """Give the row of highest rank that flows, else the one that says most."""
