@@ -145,3 +145,20 @@ def test_an_opener_that_fails_is_said():
 
     make: Callable[[], UlogLog] = lambda: UlogLog(opener, "x.ulg")  # noqa: E731
     assert any("not yours" in sentence for sentence in make().skipped)
+
+
+@pytest.mark.parametrize("bit", [3, 25, 29, 40, 63])
+def test_a_damaged_start_stamp_costs_next_to_nothing(bit):
+    data = ulog(flight((1, 11), seconds=20.0), params={"A": 1})
+    start = struct.pack("<Q", START_US ^ 1 << bit)
+    log = read(data[:8] + start + data[16:])
+    assert len(rows(log)["imu"][0]) > 1900
+    assert len(list(log.chunks())) <= 2
+    assert said(log, "param") == [("A", 1.0)]
+
+
+def test_a_log_whose_clock_leaps_a_century_has_few_chunks():
+    topics = flight((1, 11), seconds=20.0)
+    for columns in topics.values():
+        columns["timestamp"][len(columns["timestamp"]) // 2 :] += np.uint64(3_000_000_000_000_000)
+    assert len(list(read(ulog(topics)).chunks())) <= 3

@@ -11,7 +11,7 @@ from fleet.contract import COLUMNS
 from fleet.telemetry.dialects.row import Row, believable
 from fleet.telemetry.dialects.ulog import CALCULATED, FIELDS, FLOWS_HZ, HELD, ROWS, TOPICS
 from fleet.telemetry.onboard_log import Chunk, Said, Table
-from fleet.telemetry.ulog_sieve import Sieve
+from fleet.telemetry.ulog_sieve import JUMP_US, LATEST_US, Sieve
 from fleet.telemetry.ulog_topic import Topic, in_order
 from fleet.telemetry.ulog_words import epoch, firmware, release, said_by_topics, system, vehicle
 
@@ -33,6 +33,7 @@ class UlogLog:
         self.name, self.autopilot = name, "px4"
         self.skipped: list[str] = []
         log, start_us = _read(opener, self.skipped)
+        start_us = _believed_start(log, start_us, self.skipped)
         self.params = {k: float(v) for k, v in log.initial_parameters.items() if _is_number(v)}
         self._topics = self._sorted(log, start_us)
         self._t0 = max(start_us * 1e-6, 0.0) if start_us else min((t.t[0] for t in self._topics.values()), default=0.0)
@@ -52,8 +53,9 @@ class UlogLog:
             return
         first = min([t[0] for t in times] + [self._said[0].t] if self._said else [t[0] for t in times])
         last = max([t[-1] for t in times] + [self._said[-1].t] if self._said else [t[-1] for t in times])
-        for begin in np.arange(first, last + 1e-9, CHUNK_S):
-            chunk = self._cut(begin, begin + CHUNK_S)
+        told = [*times, np.array([s.t for s in self._said]), np.array([last])]
+        for number in np.unique(np.concatenate([(t - first) // CHUNK_S for t in told])):  # no chunks of a long silence
+            chunk = self._cut(first + number * CHUNK_S, first + (number + 1) * CHUNK_S)
             if chunk.rows or chunk.said or chunk.counts:
                 yield chunk
 
@@ -153,6 +155,18 @@ def _read(opener: Callable[[], IO[bytes]], skipped: list[str]) -> tuple[ULog, in
     except Exception as error:  # the sieve passes nothing that should raise; a reader must not, all the same
         skipped.append(f"could not be read ({type(error).__name__}: {error}); check the file")
         return ULog(None), 0
+
+
+def _believed_start(log: ULog, start_us: int, skipped: list[str]) -> int:
+    """Give when the log began [us]; not the stamp in its header where that does not fit its rows."""
+    stamps = np.concatenate([data.data["timestamp"].astype(np.int64) for data in log.data_list] or [np.zeros(0, int)])
+    if len(stamps) == 0:
+        return start_us if start_us < LATEST_US else 0
+    early, first = float(np.mean(stamps < start_us - EARLY_S * 1e6)), int(np.quantile(stamps, 0.01))
+    if early < 0.05 and first - start_us < JUMP_US:
+        return start_us
+    skipped.append(f"its header says it began at {start_us * 1e-6:.1f} s, its rows do not; its first row counts")
+    return int(stamps.min())
 
 
 def _is_number(value: Any) -> bool:

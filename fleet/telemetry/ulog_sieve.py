@@ -20,6 +20,7 @@ HEADER = 16  # bytes: magic, version, start stamp
 LARGEST = 1 << 29  # bytes read of one file; more is left unread and said
 HOPELESS = 1 << 26  # bytes without a good message after which the rest is left unread
 JUMP_US = 60_000_000  # a stamp this far from the last one is believed only in company
+LATEST_US = 1 << 52  # no stamp is later than a century of flight
 COMPANY = 20  # as many in a row that jump
 _BLOCK = 1 << 20
 _WIDEST = 3 + 0xFFFF  # bytes of the largest message
@@ -138,7 +139,7 @@ class Sieve:
             self._at = HEADER
         elif head:
             self._say(f"begins with {head[:7].hex(' ')}, expected {MAGIC.hex(' ')} of a ULog; searched for messages")
-        self._now_us = self.start_us or None
+        self._now_us = self.start_us if 0 < self.start_us < LATEST_US else None
         return MAGIC + b"\x01" + struct.pack("<Q", self.start_us)
 
     def _run(self) -> bytes | None:
@@ -264,11 +265,11 @@ class Sieve:
 
     def _in_time(self, stamp: int) -> bool:
         """Tell whether a stamp goes on from the last one, or many agree that time jumped."""
-        if self._now_us is None or abs(stamp - self._now_us) < JUMP_US:
+        if stamp < LATEST_US and (self._now_us is None or abs(stamp - self._now_us) < JUMP_US):
             self._now_us = stamp if self._now_us is None else max(stamp, self._now_us)
             self._strangers = 0
             return True
-        self._strangers += 1
+        self._strangers += stamp < LATEST_US
         if self._strangers >= COMPANY:
             self._now_us, self._strangers = stamp, 0
         return False
