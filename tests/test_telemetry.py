@@ -67,11 +67,19 @@ def test_hud_throttle_is_a_share():
     assert got == pytest.approx({"Va": 22.5, "delta_t": 0.55, "climb": -1.5})
 
 
-@pytest.mark.parametrize(("autopilot", "error"), [("ardupilot", 1.5), ("px4", 150.0)])
-def test_commands_are_radians_and_ardupilot_speaks_centimetres(autopilot, error):
+@pytest.mark.parametrize(
+    ("autopilot", "height", "speed"), [("ardupilot", 4.0, 1.5), ("px4", -4.0, -150.0), ("generic", 4.0, 150.0)]
+)
+def test_commands_are_radians_and_each_autopilot_has_its_units_and_signs(autopilot, height, speed):
     sent = mav.MAVLink_nav_controller_output_message(30.0, -10.0, 0, 0, 0, 4.0, 150.0, -7.0)
     got = columns("NAV_CONTROLLER_OUTPUT", "command", sent, autopilot)
-    want = {"phi_c": math.pi / 6, "theta_c": -math.pi / 18, "xtrack_error": -7.0, "alt_error": 4.0, "Va_error": error}
+    want = {
+        "phi_c": math.pi / 6,
+        "theta_c": -math.pi / 18,
+        "xtrack_error": -7.0,
+        "alt_error": height,
+        "Va_error": speed,
+    }
     assert got == pytest.approx(want)
 
 

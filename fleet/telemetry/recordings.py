@@ -15,6 +15,7 @@ from fleet.telemetry.opening import COMPRESSED, Source
 from fleet.telemetry.scan import STAMP, START, STOP
 from fleet.telemetry.steps import Steps
 from fleet.telemetry.tlog import Tlog
+from fleet.telemetry.ulog import UlogLog
 
 KINDS = {".tlog": "telemetry log", ".bin": "DataFlash log", ".log": "DataFlash text log", ".ulg": "ULog"}
 _HEAD = 1 << 16  # bytes looked at to tell the kind
@@ -124,7 +125,7 @@ def _by_content(head: bytes) -> str:
     return best if found[best] else ""
 
 
-_READERS: dict[str, Callable[..., OnboardLog]] = {}
+_READERS: dict[str, Callable[..., OnboardLog]] = {".ulg": UlogLog}
 
 
 def replay_messages(

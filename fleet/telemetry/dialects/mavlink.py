@@ -21,8 +21,8 @@ def _imu_milli(m: Any) -> tuple[Any, ...]:
     return (*acc, m.xgyro * 1e-3, m.ygyro * 1e-3, m.zgyro * 1e-3)
 
 
-def _command(m: Any, va_error: Any) -> tuple[Any, ...]:
-    return (m.nav_roll * DEG, m.nav_pitch * DEG, m.xtrack_error, m.alt_error, va_error)
+def _command(m: Any, alt_error: Any, va_error: Any) -> tuple[Any, ...]:
+    return (m.nav_roll * DEG, m.nav_pitch * DEG, m.xtrack_error, alt_error, va_error)
 
 
 def _servo(m: Any) -> tuple[Any, ...]:
@@ -69,16 +69,23 @@ TABLE: tuple[Row, ...] = (
     Row(
         "NAV_CONTROLLER_OUTPUT",
         "command",
-        lambda m: _command(m, m.aspd_error * 1e-2),  # ArduPilot sends cm/s, not the m/s of common.xml
+        lambda m: _command(m, m.alt_error, m.aspd_error * 1e-2),  # ArduPilot sends cm/s, not the m/s of common.xml
         NONE,
         autopilots=("ardupilot",),
     ),
     Row(
         "NAV_CONTROLLER_OUTPUT",
         "command",
-        lambda m: _command(m, m.aspd_error),
+        lambda m: _command(m, -m.alt_error, -m.aspd_error),  # PX4 sends flown minus wanted
         NONE,
-        autopilots=("px4", "generic"),
+        autopilots=("px4",),
+    ),
+    Row(
+        "NAV_CONTROLLER_OUTPUT",
+        "command",
+        lambda m: _command(m, m.alt_error, m.aspd_error),
+        NONE,
+        autopilots=("generic",),
     ),
     Row("MISSION_CURRENT", "leg", lambda m: (np.where(m.seq == _NO_ITEM, -1.0, m.seq),), NONE),
     Row("WIND", "wind", _wind, NONE, rank=1),
