@@ -6,6 +6,7 @@ Damage of any kind is skipped, counted and said; what is good is read. Source: A
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -18,7 +19,7 @@ from fleet.telemetry.dataflash_rows import Rows, Survey, origins
 from fleet.telemetry.dataflash_said import Identity, Talk
 from fleet.telemetry.dialects.dataflash import ROWS
 from fleet.telemetry.dialects.row import Row
-from fleet.telemetry.onboard_log import Chunk, Table
+from fleet.telemetry.onboard_log import Chunk
 
 Opener = Callable[[], IO[bytes]]
 _HEAD = 1 << 16  # bytes that tell binary from text
@@ -44,12 +45,8 @@ class DataflashLog:
         Raises:
             OSError: when it cannot be opened.
         """
-        self._open: Opener = source if callable(source) else Path(source).open
-        if not callable(source):
-            path = Path(source)
-            self._open = lambda: path.open("rb")
-            name = name or path.name
-        self.name = name
+        self._open: Opener = source if callable(source) else partial(_opened, Path(source))
+        self.name = name = name or ("log" if callable(source) else Path(source).name)
         self.skipped: list[str] = []
         with self._open() as stream:
             head = next(dataflash_binary.pieces(stream, Damage("byte")), b"")[:_HEAD]
@@ -118,6 +115,10 @@ class DataflashLog:
         return Clock(damage, frozenset(ROWS) - {"CMD", "MISE"}, getattr(self, "_start", 0.0), self._weekly)
 
 
+def _opened(path: Path) -> IO[bytes]:
+    return path.open("rb")
+
+
 def _is_text(head: bytes, name: str) -> bool:
     binary = head.find(bytes((*dataflash_binary.MAGIC, dataflash_binary.FMT)))
     text = head.find(b"FMT,")
@@ -151,12 +152,3 @@ class _Epoch:
 def utc(gps: float) -> float:
     """Take the leap seconds off a GPS time [s since 1970]."""
     return next((gps - leap for since, leap in _LEAPS if gps - leap >= since), gps)
-
-
-def tables(log: DataflashLog) -> Table:
-    """Read a whole log's rows at once."""
-    found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-    for chunk in log.chunks():
-        for field, rows in chunk.rows.items():
-            found.setdefault(field, []).append(rows)
-    return {f: (np.concatenate([t for t, _ in p]), np.concatenate([x for _, x in p])) for f, p in found.items()}

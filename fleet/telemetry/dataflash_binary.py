@@ -145,9 +145,8 @@ class Walk:
         if new is None:
             self._damage.note("formats that contradict themselves", self._base + at)
             return
-        if self._formats[kind] is not None and self._formats[kind] != new:
-            if (records := self._records(kind)) is not None:
-                self._done.append(records)
+        if self._formats[kind] != new and (records := self._records(kind)) is not None:
+            self._done.append(records)
         self._formats[kind], self._lengths[kind] = new, length
 
     def _records(self, kind: int) -> Records | None:

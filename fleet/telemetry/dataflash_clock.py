@@ -118,9 +118,11 @@ class Clock:
         for r in counted:
             held = self._held.pop(r.form, None)
             self._held[r.form] = r if held is None else held.and_then(r)
+        if not len(places):  # no stamp at all: count from before the file
+            places, times = np.array([-1.0]), np.array([self.start])
         for form, r in list(self._held.items()):
-            n = len(r) if final or not len(places) else int(np.searchsorted(r.place, places[-1]))
-            t = counted_times(r.place, places, times) if len(places) else self.start + PERIOD_S * np.arange(len(r))
+            n = len(r) if final else int(np.searchsorted(r.place, places[-1]))
+            t = counted_times(r.place, places, times)
             ready = r.taken(np.arange(n))
             ready.t = t[:n]
             yield ready

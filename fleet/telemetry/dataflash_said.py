@@ -160,7 +160,7 @@ def _tell_errors(r: Records) -> Iterator[Said]:
 def _tell_texts(r: Records) -> Iterator[Said]:
     for t, text in zip(r.t, r.texts("Message"), strict=True):
         if text.startswith(("Throttle armed", "Throttle disarmed", "Arming motors", "Disarming motors")):
-            yield Said(float(t), "armed", "isarm" not in text and "disarm" not in text)
+            yield Said(float(t), "armed", "disarm" not in text.lower())
         if text:
             yield Said(float(t), "text", (SEVERITY_TEXT, text))
 

@@ -41,6 +41,10 @@ def _gyro(m: Any) -> tuple[Any, ...]:
     return (m.GyrX, m.GyrY, m.GyrZ)
 
 
+def _rate(m: Any, unit: Any) -> tuple[Any, ...]:
+    return (m.R * unit, m.P * unit, m.Y * unit)
+
+
 def _imu(m: Any) -> tuple[Any, ...]:
     return (m.AccX, m.AccY, m.AccZ, m.GyrX, m.GyrY, m.GyrZ)
 
@@ -109,7 +113,8 @@ TABLE: tuple[Row, ...] = (
     Row("IMU", "attitude: rates", _gyro, rank=4, when=lambda m: m.I == 0),
     Row("IMU", "attitude: rates", _gyro, rank=3),
     Row("GYR", "attitude: rates", _gyro, rank=2, when=lambda m: m.I == 0),
-    Row("RATE", "attitude: rates", lambda m: (m.R * DEG, m.P * DEG, m.Y * DEG), rank=1),
+    Row("RATE", "attitude: rates", lambda m: _rate(m, DEG + 0.0 * m.AOutSlew), rank=1),
+    Row("RATE", "attitude: rates", lambda m: _rate(m, DEG / 100 + 0.0 * m.TimeMS), rank=1),  # between: either unit
     Row("IMU", "imu", _imu, rank=2, when=lambda m: m.I == 0),
     Row("IMU", "imu", _imu, rank=1),
     Row("POS", "position", _place, rank=4, when=_somewhere),
