@@ -7,7 +7,7 @@ messages of a steady rate are counted between the fixes, and an event has the ti
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.ndimage import median_filter
+from numpy.lib.stride_tricks import sliding_window_view
 
 from fleet.telemetry.dataflash_records import Damage, Format, Records
 
@@ -15,7 +15,8 @@ LEAP_S = 1.0  # a stamp further from its neighbours in the file is damage
 BACK_S = 5.0  # further back than this from the newest: another start in the same file
 LONGEST_GAP_S = 86_400.0
 PERIOD_S = 0.1  # of messages without time, where no stamp tells
-_REACH = 4  # neighbours looked at on each side
+PAUSE_S = 30.0  # so long may the log pause where a block ends and nothing can confirm it
+_REACH, _QUORUM = 5, 3  # neighbours asked on each side, and how few will do
 
 
 def stamp_of(form: Format, weekly: bool = False) -> tuple[str, float] | None:
@@ -98,9 +99,10 @@ class Clock:
 
     def _believed(self, t: np.ndarray, place: np.ndarray) -> np.ndarray:
         known = np.where(np.isfinite(t), t, -1.0)
-        around = np.concatenate([self._recent, known])
-        middle = median_filter(around, 2 * _REACH + 1, mode="mirror")[len(self._recent) :]
-        leaps = (np.abs(known - middle) > LEAP_S) | (known < 0)
+        before, after = neighbours(np.concatenate([self._recent, known]))
+        before, after = before[len(self._recent) :], after[len(self._recent) :]
+        after = np.where(np.isfinite(after), after + LEAP_S, before + PAUSE_S)
+        leaps = ~((before - LEAP_S <= known) & ((known <= after) | ~np.isfinite(before + after))) | (known < 0)
         back = ~leaps & (known < self.newest - BACK_S)
         if np.isfinite(self.newest):
             leaps |= known > self.newest + LONGEST_GAP_S
@@ -129,6 +131,18 @@ class Clock:
             del self._held[form]
             if n < len(r):
                 self._held[form] = r.taken(np.arange(n, len(r)))
+
+
+def neighbours(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Give for each stamp the median of those before and of those after it; infinite where there are too few."""
+    n = len(t)
+    before, after = np.full(n, -np.inf), np.full(n, np.inf)
+    if n > _REACH:
+        middle = np.sort(sliding_window_view(t, _REACH), axis=-1)[:, _REACH // 2]
+        before[_REACH:], after[:-_REACH] = middle[:-1], middle[1:]
+    for few in range(_QUORUM, min(_REACH, n)):
+        before[few], after[n - 1 - few] = np.median(t[:few]), np.median(t[n - few :])
+    return before, after
 
 
 def counted_times(place: np.ndarray, places: np.ndarray, times: np.ndarray) -> np.ndarray:
