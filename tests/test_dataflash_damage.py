@@ -59,12 +59,12 @@ def test_a_message_goes_when_its_own_header_breaks_and_no_other() -> None:
 def test_times_that_leap_are_skipped_and_not_the_rest() -> None:
     writer = Writer().fmt("IMU", "Qffffff", "TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
     for i in range(200):
-        t = {50: 10**18, 60: 0, 70: 3_600_000_000}.get(i, 10_000_000 + 10_000 * i)
+        t = {0: 10**12, 50: 10**18, 60: 0, 70: 3_600_000_000, 199: 10**9}.get(i, 10_000_000 + 10_000 * i)
         writer.say("IMU", t, 0.0, 0.0, 0.0, 0.0, 0.0, -9.8)
     log = writer.log()
     t, _ = read(log)[0]["imu"]
-    assert len(t) == 197 and t[-1] == pytest.approx(11.99)
-    assert any("time leaps: 3" in s for s in log.skipped)
+    assert len(t) == 195 and t[-1] == pytest.approx(11.98)
+    assert any("time leaps: 5" in s for s in log.skipped)
 
 
 def test_a_second_start_in_one_file_is_left_out_and_said(s02: bytes) -> None:

@@ -101,8 +101,9 @@ class Clock:
         known = np.where(np.isfinite(t), t, -1.0)
         before, after = neighbours(np.concatenate([self._recent, known]))
         before, after = before[len(self._recent) :], after[len(self._recent) :]
-        after = np.where(np.isfinite(after), after + LEAP_S, before + PAUSE_S)
-        leaps = ~((before - LEAP_S <= known) & ((known <= after) | ~np.isfinite(before + after))) | (known < 0)
+        unconfirmed = np.isfinite(before) & ~np.isfinite(after)
+        latest = np.where(unconfirmed, before + PAUSE_S, after + LEAP_S)
+        leaps = (known < before - LEAP_S) | (known > latest) | (known < 0)
         back = ~leaps & (known < self.newest - BACK_S)
         if np.isfinite(self.newest):
             leaps |= known > self.newest + LONGEST_GAP_S
