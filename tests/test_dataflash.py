@@ -212,6 +212,32 @@ def test_a_listed_mission_is_no_leg_and_what_is_begun_is() -> None:
     assert rows["leg"][0].tolist() == [5.0, 9.0] and rows["leg"][1].ravel().tolist() == [1.0, 3.0]
 
 
+def test_without_a_time_since_boot_the_week_of_the_satellites_serves() -> None:
+    writer = Writer(text=True).fmt("ATT", "ccc", "Roll,Pitch,Yaw")
+    writer.fmt("GPS", "BIHLLeee", "Status,TimeMS,Week,Lat,Lng,Alt,Spd,GCrs")
+    for i in range(30):
+        writer.say("GPS", 3, 109_216_000 + 200 * i, 1774, 47.0, 8.5, 500.0, 1.0, 0.0)
+        writer.say("ATT", 1.0, 2.0, 3.0).say("ATT", 1.0, 2.0, 3.0)
+    log = writer.log()
+    t, _ = read(log)[0]["attitude"]
+    np.testing.assert_allclose(np.diff(t), 0.1, atol=1e-6)
+    assert log.epoch_s == pytest.approx(315964800 + 1774 * 604800 - 16, abs=1e-3)
+
+
+def test_the_vehicle_is_guessed_from_what_only_one_kind_logs() -> None:
+    def kind(name: str, columns: str, *params: str) -> str:
+        writer = Writer().fmt(name, "Q" + "f" * columns.count(","), columns).fmt("PARM", "QNf", "TimeUS,Name,Value")
+        writer.say(name, 10**6, *(0.0,) * columns.count(","))
+        for param in params:
+            writer.say("PARM", 10**6, param, 1.0)
+        return writer.log().vehicle
+
+    assert kind("CTUN", "TimeUS,NavRoll,Roll") == "fixed_wing"
+    assert kind("CTUN", "TimeUS,NavRoll,Roll", "Q_ENABLE") == "quadplane"
+    assert kind("CTUN", "TimeUS,ABst,ThO") == kind("MOT", "TimeUS,Mot1") == "multirotor"
+    assert kind("XYZ", "TimeUS,A", "FRAME_CLASS") == "multirotor" and kind("XYZ", "TimeUS,A") == "unknown"
+
+
 @pytest.mark.parametrize(
     ("gps", "leap"),
     [(1448150400.0, 17), (1388989200.0, 16), (1763600000.0, 18), (1483228817.0, 17), (1483228818.0, 18)],

@@ -14,9 +14,10 @@ import numpy as np
 
 from fleet.telemetry import dataflash_binary, dataflash_text
 from fleet.telemetry.dataflash_clock import Clock
+from fleet.telemetry.dataflash_identity import Identity
 from fleet.telemetry.dataflash_records import Damage, Records
 from fleet.telemetry.dataflash_rows import Rows, Survey, origins
-from fleet.telemetry.dataflash_said import Identity, Talk
+from fleet.telemetry.dataflash_said import Talk
 from fleet.telemetry.dialects.dataflash import ROWS
 from fleet.telemetry.dialects.row import Row
 from fleet.telemetry.onboard_log import Chunk
