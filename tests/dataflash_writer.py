@@ -17,7 +17,7 @@ LETTERS = DFReader.FORMAT_TO_STRUCT
 
 
 class Writer:
-    """Write a small log, the same messages in either form."""
+    """A small log, the same messages in either form."""
 
     def __init__(self, text: bool = False) -> None:
         self.text = text
