@@ -1,0 +1,146 @@
+"""What both forms of a DataFlash log are cut into: `Records`, all messages of one format in a stretch of the log."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from pymavlink.DFReader import FORMAT_TO_STRUCT
+
+MOST_PLACES = 3  # named for each kind of damage
+MOST_KINDS = 40
+_TEXT = "nNZ"
+_WHOLE = "bBhHiIqQM"
+
+
+class Format(NamedTuple):
+    """One FMT: how messages of a type are laid out."""
+
+    name: str
+    codes: str  # one letter a column, FORMAT_TO_STRUCT
+    columns: tuple[str, ...]
+    length: int  # of the whole message, header included [bytes]
+    layout: np.dtype | None  # of a binary message, header included; None: text
+
+    def scale(self, i: int) -> float:
+        """Give what the numbers of column `i` are to be divided by."""
+        factor = FORMAT_TO_STRUCT[self.codes[i]][1]
+        return 1.0 if factor is None else round(1.0 / factor)
+
+
+def form(name: str, codes: str, columns: str, length: int = 0) -> Format | None:
+    """Understand one FMT; with a `length`, a binary one. None: it contradicts itself."""
+    names = tuple(c.strip() for c in columns.split(",")) if columns.strip() else ()
+    if not name.isidentifier() or len(names) != len(codes) or not all(c in FORMAT_TO_STRUCT for c in codes):
+        return None
+    if not length:
+        return Format(name, codes, names, 0, None)
+    kinds = [FORMAT_TO_STRUCT[c][0] for c in codes]
+    types = [f"S{kind[:-1]}" if kind.endswith("s") else f"<{kind}" for kind in kinds]
+    layout = np.dtype([("", "V3"), *(("", t) for t in types)])
+    return Format(name, codes, names, length, layout) if layout.itemsize == length else None
+
+
+class Records:
+    """The messages of one format, column by column: `records.Roll` is a float array, whatever the form of the log."""
+
+    def __init__(self, form: Format, place: np.ndarray, rows: Any) -> None:
+        self.form = form
+        self.place = place  # (n,) byte offset or line number, rising
+        self.t = np.zeros(0)  # (n,) log time [s], once the clock has stamped them
+        self._rows = rows  # structured array, or a list of lists of bytes
+        self._seen: dict[str, np.ndarray] = {}
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    def __getattr__(self, column: str) -> np.ndarray:
+        if column not in self._seen:
+            self._seen[column] = self._numbers(column)
+        return self._seen[column]
+
+    def has(self, *columns: str) -> bool:
+        """Tell whether the format has all these columns."""
+        return all(c in self.form.columns for c in columns)
+
+    def whole(self, column: str) -> bool:
+        """Tell whether the format counts this column in whole numbers."""
+        return self.has(column) and self.form.codes[self.form.columns.index(column)] in _WHOLE
+
+    def taken(self, which: np.ndarray) -> "Records":
+        """Give some of them: a mask or indices."""
+        rows = self._rows[which] if self.form.layout is not None else _picked(self._rows, which)
+        found = Records(self.form, self.place[which], rows)
+        found.t = self.t[which] if len(self.t) else self.t
+        return found
+
+    def and_then(self, later: "Records") -> "Records":
+        """Join what follows of the same format."""
+        binary = self.form.layout is not None
+        rows = np.concatenate([self._rows, later._rows]) if binary else self._rows + later._rows
+        return Records(self.form, np.concatenate([self.place, later.place]), rows)
+
+    def texts(self, column: str) -> list[str]:
+        """Give a column as words, up to the first zero byte, unprintable bytes dropped."""
+        i = self.form.columns.index(column)
+        cells = (row[i] for row in self._rows) if self.form.layout is None else self._rows[f"f{i + 1}"].tolist()
+        return [_words(cell) for cell in cells]
+
+    def _numbers(self, column: str) -> np.ndarray:
+        try:
+            i = self.form.columns.index(column)
+        except ValueError:
+            raise AttributeError(column) from None
+        if self.form.layout is None:
+            return _floats([row[i] for row in self._rows])
+        if self.form.codes[i] in "anNZ":
+            return np.full(len(self), np.nan)
+        values = self._rows[f"f{i + 1}"].astype(float)
+        scale = self.form.scale(i)
+        return values if scale == 1.0 else values / scale
+
+
+def _picked(rows: list[Any], which: np.ndarray) -> list[Any]:
+    return [rows[i] for i in (np.flatnonzero(which) if which.dtype == bool else which)]
+
+
+def _words(cell: Any) -> str:
+    raw = cell if isinstance(cell, bytes) else str(cell).encode()
+    text = raw.split(b"\0")[0].decode("utf-8", "replace").strip()
+    return "".join(c for c in text if c.isprintable() and c != "\ufffd")
+
+
+def _floats(cells: list[bytes]) -> np.ndarray:
+    try:
+        return np.array(list(map(float, cells)))
+    except ValueError:
+        return np.array([_float(cell) for cell in cells])
+
+
+def _float(cell: bytes) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return float("nan")
+
+
+class Damage:
+    """What could not be read, merged by kind: the first places and the total."""
+
+    def __init__(self, unit: str) -> None:
+        self.unit = unit  # byte or line
+        self._kinds: dict[str, tuple[int, list[int]]] = {}
+
+    def note(self, kind: str, place: int, n: int = 1) -> None:
+        """Count `n` more of a kind of damage that begins at `place`; bounded in memory whatever comes."""
+        if kind not in self._kinds and len(self._kinds) >= MOST_KINDS:
+            kind = "other damage"
+        total, places = self._kinds.get(kind, (0, []))
+        self._kinds[kind] = (total + n, places if len(places) >= MOST_PLACES else [*places, int(place)])
+
+    def sentences(self) -> list[str]:
+        """Say it, one sentence a kind."""
+        return [self._sentence(*found) for found in self._kinds.items()]
+
+    def _sentence(self, kind: str, found: tuple[int, list[int]]) -> str:
+        total, places = found
+        where = ", ".join(map(str, places))
+        return f"{kind}: {total}, first at {self.unit} {where}; skipped"
