@@ -1,7 +1,7 @@
 """What `fleet inspect` says of one aircraft, as plain figures: the keys of its JSON, each with its unit."""
 
 from collections import Counter
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -143,6 +143,16 @@ class Findings(msgspec.Struct, frozen=True, kw_only=True):
     events: tuple[Happened, ...] = ()
     events_lost: Annotated[int, Meta(description="events beyond the most that are kept")] = 0
     abilities: tuple[Can, ...] = ()
+
+
+class File(msgspec.Struct, frozen=True, kw_only=True):
+    """One recording; `fleet inspect --json` gives a list of these under the key `files`."""
+
+    file: str
+    bytes: int = 0
+    sentences: Annotated[tuple[str, ...], Meta(description="what was skipped, damaged or not to be read")] = ()
+    aircraft: tuple[Findings, ...] = ()
+    twin: Annotated[dict[str, Any] | None, Meta(description="with --twin: what a twin made of it, by UAV id")] = None
 
 
 def findings(known: Survey, facts: Facts) -> Findings:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from fleet.contract import COLUMNS, Item, Link, Message, Mission, Params, Rows, Sample, Status
@@ -22,7 +23,8 @@ BUDGET = 5_000_000  # rows kept over all aircraft and kinds
 FAST = 6.0  # no small aircraft is on the ground at this speed [m/s]
 _HIGH = 5.0  # above the lowest of the recording: in the air, where armed [m]
 _BRIDGE_S, _HOP_S = 10.0, 5.0  # shorter landings and flights are none [s]
-_COUNTERS = ("STAT_",)  # parameters that count by themselves
+_SAME_FRAME = {5: 0, 6: 3, 11: 10}  # MAV_FRAME: ..._INT
+_BY_ITSELF = ("STAT_", "BARO1_GND_", "BARO2_GND_", "BARO3_GND_", "GND_ABS_")  # parameters nobody set
 
 
 class Event(NamedTuple):
@@ -132,12 +134,18 @@ def hear(known: Survey, message: Message) -> None:
     elif isinstance(message, Status):
         _hear_status(known, message)
     elif isinstance(message, Mission):
-        if message.items[1:] != known.items[1:] or not known.missions:  # item 0 is home, which moves
+        if _course(message) != _course(known.mission) or not known.missions:
             known.missions += bool(message.items)
             known.note(message.t, "mission", f"{len(message.items)} items" + ("" if message.complete else ", not all"))
         known.mission = message
     elif isinstance(message, Params):
         _hear_params(known, message)
+
+
+def _course(mission: Mission | None) -> list[Item]:
+    """Give the items but home, which moves; some autopilots send back another name of the same frame."""
+    items = mission.items[1:] if mission else ()
+    return [msgspec.structs.replace(item, frame=_SAME_FRAME.get(item.frame, item.frame)) for item in items]
 
 
 def _share(found: dict[int, Survey]) -> None:
@@ -197,7 +205,7 @@ def _hear_status(known: Survey, status: Status) -> None:
 
 def _hear_params(known: Survey, params: Params) -> None:
     before = known.values
-    changed = {n: v for n, v in params.values.items() if before.get(n, v) != v and not n.startswith(_COUNTERS)}
+    changed = {n: v for n, v in params.values.items() if before.get(n, v) != v and not n.startswith(_BY_ITSELF)}
     if changed and known.armings and known.armings[-1][1]:
         said = [f"{name} {before[name]:g} to {value:g}" for name, value in list(changed.items())[:3]]
         more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
