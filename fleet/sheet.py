@@ -49,7 +49,10 @@ def lines(told: Findings) -> list[tuple[str, str]]:
         ("link", _link(told)),
         ("modes", ", ".join(f"{name} {seconds:.0f} s" for name, seconds in mode_seconds(told).items()) or "none told"),
         ("rows", ", ".join(f"{name} {kind.rate_hz:.1f} Hz" for name, kind in told.rows.items() if kind.rows)),
-        ("missing", ", ".join(name for name, kind in told.rows.items() if not kind.rows) or "no kind of row"),
+        (
+            "no rows of",
+            ", ".join(name for name, kind in told.rows.items() if not kind.rows) or "no kind, all are there",
+        ),
         ("gaps", _gaps(told.rows)),
         ("mission", _mission(told)),
         ("parameters", f"{told.params:,}" + (", all of them" if told.params_complete else ", not all")),

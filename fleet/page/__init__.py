@@ -3,6 +3,7 @@
 import textwrap
 import warnings
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,9 +42,11 @@ _STYLE: Any = {
     "legend.handlelength": 1.4,
     "svg.hashsalt": "parauav",
 }
-_HEADINGS = ("link", "modes", "mission", "parameters", "servo map", "airspeed", "wind", "missing")
+_HEADINGS = ("link", "modes", "mission", "parameters", "servo map", "airspeed", "wind", "no rows of")
 _WIDTH = 62  # letters of a line of the text beside the map
 _MOST_LINES = 4  # of one fact
+_LEFT = 0.585  # where that text begins [share of the page]
+_SMALL: Any = {"size": 6.6, "va": "top", "parse_math": False}
 
 
 class Sheet(NamedTuple):
@@ -85,11 +88,11 @@ def page(sheet: Sheet) -> Figure:
         0.06, 0.972, plain(f"uav-{told.uav}   {sheet.name}"), size=14, weight="bold", va="top", parse_math=False
     )
     for row, heading in enumerate(("aircraft", "time")):
-        words = plain(said[heading])
+        words = plain(said[heading]).removeprefix(f"uav-{told.uav}, ")
         figure.text(0.06, 0.951 - 0.0125 * row, words, size=8, color=MUTED, va="top", parse_math=False)
-    ground = figure.add_axes((0.095, 0.635, 0.455, 0.27))
+    ground = figure.add_axes((0.095, 0.65, 0.455, 0.255))
     ground_track(ground, known, told, colours)
-    ground.legend(loc="upper left", bbox_to_anchor=(0.0, -0.14), ncols=6)
+    ground.legend(loc="upper left", bbox_to_anchor=(0.0, -0.145), ncols=6)
     _facts(figure, told, said)
     _over_time(figure, sheet, colours)
     figure.text(0.94, 0.012, "parauav: fleet inspect", size=6, color=MUTED, ha="right")
@@ -99,7 +102,7 @@ def page(sheet: Sheet) -> Figure:
 def _over_time(figure: Figure, sheet: Sheet, colours: dict[str, str]) -> None:
     known, told = sheet.known, sheet.told
     grid = figure.add_gridspec(
-        6, 1, left=0.125, right=0.925, top=0.575, bottom=0.05, hspace=0.24, height_ratios=(1, 1, 1.1, 1.2, 0.62, 1.0)
+        6, 1, left=0.125, right=0.905, top=0.568, bottom=0.05, hspace=0.24, height_ratios=(1, 1, 1.1, 1.2, 0.62, 1.0)
     )
     axes = [figure.add_subplot(grid[0])]
     axes += [figure.add_subplot(grid[row], sharex=axes[0]) for row in range(1, 6)]
@@ -124,25 +127,27 @@ def _facts(figure: Figure, told: Findings, said: dict[str, str]) -> None:
     """Write what is in the recording and what the twin can do beside the map."""
     y = 0.916
     for heading in _HEADINGS:
-        y = _paragraph(figure, y, heading, plain(said[heading]), MUTED)
-    y = _paragraph(figure, y - 0.006, "What the twin can do with it", "", INK)
-    for can in told.abilities:
-        mark, colour = ("yes", GOOD) if can.can else ("no", BAD)
-        y = _paragraph(figure, y, f"{mark}  {can.name}", plain(can.why), colour)
+        figure.text(_LEFT, y, heading, color=MUTED, weight="bold", **_SMALL)
+        y = _words(figure, y, _LEFT + 0.083, plain(said[heading]), _WIDTH - 16)
+    y -= 0.007
+    figure.text(_LEFT, y, "What the twin can do with it", weight="bold", **_SMALL)
+    y -= 0.0125
+    for why, same in groupby(told.abilities, key=lambda can: (can.can, can.why)):
+        names = ", ".join(can.name for can in same)
+        mark, colour = ("yes", GOOD) if why[0] else ("no", BAD)
+        figure.text(_LEFT, y, f"{mark}  {names}", color=colour, weight="bold", **_SMALL)
+        y = _words(figure, y - 0.0093, _LEFT, plain(why[1]), _WIDTH)
 
 
-def _paragraph(figure: Figure, y: float, heading: str, words: str, colour: str) -> float:
-    """Write a heading and its lines from `y` down; give where the next may begin."""
-    style: dict[str, Any] = {"size": 6.6, "va": "top", "parse_math": False}
-    figure.text(0.585, y, heading, color=colour, weight="bold", **style)
-    y -= 0.0093
-    found = textwrap.wrap(words, _WIDTH)
+def _words(figure: Figure, y: float, x: float, words: str, width: int) -> float:
+    """Write words in lines from `y` down, with an end where there are too many; give where the next may begin."""
+    found = textwrap.wrap(words, width)
     if len(found) > _MOST_LINES:
-        found = [*found[: _MOST_LINES - 1], found[_MOST_LINES - 1][: _WIDTH - 2] + " …"]
+        found = [*found[: _MOST_LINES - 1], found[_MOST_LINES - 1][: width - 2] + " …"]
     for line in found:
-        figure.text(0.585, y, line, **style)
+        figure.text(x, y, line, **_SMALL)
         y -= 0.0088
-    return y - 0.0016
+    return y - 0.002
 
 
 def _free(path: Path, sheet: Sheet, taken: Sequence[Path]) -> Path:

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from matplotlib.patheffects import withStroke
 
 from fleet.frames import Origin, to_ned
 from fleet.mission import KIND, LOITER_TIME, LOITER_TO_ALT, LOITER_TURNS, LOITER_UNLIMITED, P_E, P_N, RADIUS, SEQ, route
@@ -13,6 +14,7 @@ from fleet.telemetry.thinned import inside
 
 _CIRCLES = (LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT)
 _FAR = 2.0  # waypoints further out than this times the flown extent are not shown [-]
+_HALO = [withStroke(linewidth=2.0, foreground="white")]
 _USUAL_RADIUS = 60.0  # ArduPlane's default WP_LOITER_RAD [m]
 
 
@@ -84,6 +86,7 @@ def _route(ax: Any, legs: list[np.ndarray], known: Survey) -> None:
             color=ROUTE,
             size=7,
             zorder=5,
+            path_effects=_HALO,
         )
         if int(leg[KIND]) in _CIRCLES:
             radius = abs(leg[RADIUS]) or abs(known.values.get("WP_LOITER_RAD", _USUAL_RADIUS))
@@ -94,9 +97,12 @@ def _route(ax: Any, legs: list[np.ndarray], known: Survey) -> None:
 def _frame(ax: Any, p: np.ndarray) -> None:
     """Frame the path and the waypoints with equal scales."""
     low, high = p.min(axis=0), p.max(axis=0)
-    more = 0.06 * max(*(high - low), 50.0)
-    ax.set(xlim=(low[1] - more, high[1] + more), ylim=(low[0] - more, high[0] + more))
-    ax.set_aspect("equal", adjustable="datalim")
+    middle, size = 0.5 * (low + high), 1.12 * np.maximum(high - low, 25.0)
+    box = ax.get_position()
+    width, height = ax.figure.get_size_inches() * (box.width, box.height)
+    scale = max(size[1] / width, size[0] / height)
+    east, north = 0.5 * scale * width, 0.5 * scale * height
+    ax.set(xlim=(middle[1] - east, middle[1] + east), ylim=(middle[0] - north, middle[0] + north), aspect="equal")
     ax.set_xlabel("east [m]")
     ax.set_ylabel("north [m]")
 
@@ -118,8 +124,8 @@ def _wind(ax: Any, told: Findings) -> None:
     if told.wind is None or told.wind.speed < 0.1:
         return
     to = np.radians(told.wind.from_deg + 180)
-    tip = np.array([np.sin(to), np.cos(to)]) * 14
-    arrow = {"arrowstyle": "-|>", "color": MUTED, "lw": 1.4, "shrinkA": 0, "shrinkB": 0}
-    middle = {"xycoords": "axes fraction", "textcoords": "offset points"}
-    ax.annotate("", (0.93, 0.93), xytext=tuple(-2 * tip), arrowprops=arrow, zorder=6, **middle)
-    ax.annotate(f"wind {told.wind.speed:.0f} m/s", (0.99, 0.82), (0, 0), ha="right", color=MUTED, size=7, **middle)
+    size = {"units": "inches", "scale_units": "inches", "scale": 1 / 0.36, "width": 0.022}
+    place = {"transform": ax.transAxes, "pivot": "middle", "angles": "uv", "zorder": 6}
+    ax.quiver([0.93], [0.92], [np.sin(to)], [np.cos(to)], color=MUTED, **size, **place)
+    words = f"wind {told.wind.speed:.1f} m/s"
+    ax.text(0.985, 0.815, words, ha="right", color=MUTED, size=7, transform=ax.transAxes, path_effects=_HALO, zorder=6)

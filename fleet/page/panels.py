@@ -30,7 +30,7 @@ def altitude(ax: Any, known: Survey) -> None:
         return _none(ax, "altitude")
     there = inside(t, airborne(known))
     ax.set_ylim(*spread((x[there] if there.any() else x)[:, 2] * 1e-3, least=10.0))
-    _label(ax, "altitude\n[m above sea]")
+    _label(ax, "altitude\n[m above sea]", columns=0)
     return None
 
 
@@ -62,11 +62,14 @@ def angles(ax: Any, known: Survey) -> None:
 def servos(ax: Any, known: Survey, told: Findings) -> None:
     """Draw the pulses of the channels that move; the throttle where there are none."""
     moving = [servo for servo in told.servos if servo.moves]
+    low, high = 3_000.0, 0.0
     for servo in moving:
         colour = LINES[(servo.channel - 1) % len(LINES)]
         label = f"{servo.channel} {servo.surface}".strip()
+        low, high = min(low, servo.low_us), max(high, servo.high_us)
         _line(ax, known, "servo", servo.channel - 1, colour=colour, label=label, lw=0.8)
     if moving:
+        ax.set_ylim(*spread(np.array([low, high])))  # of the flight: before it some say 0
         return _label(ax, "servo\n[us]", columns=8)
     if not _line(ax, known, "air", 1, scale=100.0, label="throttle"):
         return _none(ax, "servo" if not told.servos else "moving servo")
@@ -156,7 +159,8 @@ def _since(known: Survey, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.
 
 def _label(ax: Any, text: str, columns: int = 4) -> None:
     ax.set_ylabel(text)
-    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=columns)
+    if columns:
+        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=columns)
 
 
 def _none(ax: Any, what: str) -> None:

@@ -138,7 +138,7 @@ def _identify(name: str, known: Survey, starved: str, swing: dict[str, float], n
     said = ", ".join(
         f"{_WORD[each]} varies by {swing[each]:.0%} of its throw" for each in needed if swing[each] >= _STILL
     )
-    said += f"; but {still[0]} never moves" if still else ""
+    said += f"; {still[0]} never moves" if still else ""
     slow = [f"{kind} at {hz:.1f} Hz" for kind in ("attitude", "servo") if (hz := known.rows[kind].rate_hz) < _GOOD_HZ]
     if slow:
         said += f"; but {' and '.join(slow)} show fast motion badly, {_GOOD_HZ:.0f} Hz or more is good"

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
 from fleet.contract import COLUMNS, Item, Link, Message, Mission, Params, Rows, Sample, Status
@@ -23,7 +22,6 @@ BUDGET = 5_000_000  # rows kept over all aircraft and kinds
 FAST = 6.0  # no small aircraft is on the ground at this speed [m/s]
 _HIGH = 5.0  # above the lowest of the recording: in the air, where armed [m]
 _BRIDGE_S, _HOP_S = 10.0, 5.0  # shorter landings and flights are none [s]
-_SAME_FRAME = {5: 0, 6: 3, 11: 10}  # MAV_FRAME: ..._INT
 _BY_ITSELF = ("STAT_", "BARO1_GND_", "BARO2_GND_", "BARO3_GND_", "GND_ABS_")  # parameters nobody set
 
 
@@ -142,10 +140,9 @@ def hear(known: Survey, message: Message) -> None:
         _hear_params(known, message)
 
 
-def _course(mission: Mission | None) -> list[Item]:
-    """Give the items but home, which moves; some autopilots send back another name of the same frame."""
-    items = mission.items[1:] if mission else ()
-    return [msgspec.structs.replace(item, frame=_SAME_FRAME.get(item.frame, item.frame)) for item in items]
+def _course(mission: Mission | None) -> list[tuple[int, int, int, float]]:
+    """Give what is flown: not home, which moves, nor frames and spare numbers, which autopilots send back changed."""
+    return [(i.command, i.lat_e7, i.lon_e7, i.alt_m) for i in (mission.items[1:] if mission else ())]
 
 
 def _share(found: dict[int, Survey]) -> None:
