@@ -27,7 +27,7 @@ _MANY = 12  # items in a row that are still listed
 
 def table(file: File) -> RenderableType:
     """Lay out one recording, aircraft by aircraft."""
-    parts: list[RenderableType] = [Text(f"{file.file}  {file.bytes / 1e6:.1f} MB", style="bold")]
+    parts: list[RenderableType] = [Text(f"{plain(file.file)}  {file.bytes / 1e6:.1f} MB", style="bold")]
     parts += [Text(f"  {plain(sentence)}", style="red") for sentence in file.sentences]
     for told in file.aircraft:
         parts += [_aircraft(told, _twin(file.twin, told.uav)), Text("")]

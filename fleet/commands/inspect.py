@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
         for made in write(args.plot, [Sheet(*sheet) for sheet in sheets]):
             print(f"fleet inspect: wrote {made}", file=sys.stderr)
-    return 1 if any(file.sentences or not file.aircraft for file in told) else 0
+    return 1 if any(file.sentences or not file.aircraft or "sentence" in (file.twin or {}) for file in told) else 0
 
 
 def keys() -> str:

@@ -246,5 +246,7 @@ def _bridged(t: np.ndarray, on: np.ndarray) -> list[Span]:
 
 def spells(known: Survey) -> list[tuple[Span, str]]:
     """Give the modes with the stretch each was in force."""
+    if not known.modes:
+        return []
     ends = [*(t for t, _ in known.modes[1:]), known.newest]
     return [(Span(t, stop), mode) for (t, mode), stop in zip(known.modes, ends, strict=True)]

@@ -35,11 +35,11 @@ class Thinned:
 
     def __init__(self, longest: float, most: int = MOST, dtype: str = "<f4") -> None:
         self.longest, self.most, self.dtype = longest, most, dtype
-        self.count = self.stride = 0
+        self._count, self._stride = 0, 1
         self._pending: list[tuple[np.ndarray, np.ndarray]] = []
         self._waiting = 0
         self._kept: list[tuple[np.ndarray, np.ndarray]] = []
-        self._first = self._last = self._open = np.nan
+        self._last = self._open = np.nan
         self._intervals, self._seconds = np.zeros(_BINS), np.zeros(_BINS)
         self._wide: list[tuple[float, float]] = []  # (length, start)
         self._stretches: list[Span] = []
@@ -61,10 +61,16 @@ class Thinned:
         return self._kept[0]
 
     @property
-    def span(self) -> Span:
-        """Give the first and the last time; nan before any row."""
+    def count(self) -> int:
+        """Give how many rows came, kept or not."""
         self._settle()
-        return Span(float(self._first), float(self._last))
+        return self._count
+
+    @property
+    def stride(self) -> int:
+        """Give of how many rows one is kept."""
+        self._settle()
+        return self._stride
 
     @property
     def rate_hz(self) -> float:
@@ -105,8 +111,8 @@ class Thinned:
         t, x = t[good], x[good].astype(self.dtype)
         if not len(t):
             return
-        if not self.count:
-            self._first = self._last = self._open = t[0]
+        if not self._count:
+            self._last = self._open = t[0]
         self._look(t)
         self._keep(t, x)
         self._last = t[-1]
@@ -130,14 +136,13 @@ class Thinned:
         self._open = starts[-1]
 
     def _keep(self, t: np.ndarray, x: np.ndarray) -> None:
-        self.stride = self.stride or 1
-        taken = slice(-self.count % self.stride, None, self.stride)
+        taken = slice(-self._count % self._stride, None, self._stride)
         self._kept.append((t[taken], x[taken]))
-        self.count += len(t)
+        self._count += len(t)
         while sum(len(kept) for kept, _ in self._kept) > self.most:
             whole_t, whole_x = (np.concatenate([pair[i] for pair in self._kept]) for i in (0, 1))
             self._kept = [(whole_t[::2].copy(), whole_x[::2].copy())]
-            self.stride *= 2
+            self._stride *= 2
 
 
 def _edges() -> np.ndarray:
