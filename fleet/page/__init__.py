@@ -42,9 +42,10 @@ _STYLE: Any = {
     "legend.handlelength": 1.4,
     "svg.hashsalt": "parauav",
 }
-_HEADINGS = ("link", "modes", "mission", "parameters", "servo map", "airspeed", "wind", "no rows of")
+_HEADINGS = ("link", "modes", "mission", "parameters", "servo map", "airspeed", "wind")
+_TROUBLE = ("text", "clock", "link", "gap")
 _WIDTH = 62  # letters of a line of the text beside the map
-_MOST_LINES = 4  # of one fact
+_MOST_LINES = 3  # of one fact
 _LEFT = 0.585  # where that text begins [share of the page]
 _SMALL: Any = {"size": 6.6, "va": "top", "parse_math": False}
 
@@ -126,9 +127,13 @@ def _over_time(figure: Figure, sheet: Sheet, colours: dict[str, str]) -> None:
 def _facts(figure: Figure, told: Findings, said: dict[str, str]) -> None:
     """Write what is in the recording and what the twin can do beside the map."""
     y = 0.916
-    for heading in _HEADINGS:
+    facts = {heading: said[heading] for heading in _HEADINGS}
+    if any(not kind.rows for kind in told.rows.values()):
+        facts["no rows of"] = said["no rows of"]
+    facts["trouble"] = "; ".join(f"{e.t_s:.0f} s {e.text}" for e in told.events if e.kind in _TROUBLE) or "none told"
+    for heading, words in facts.items():
         figure.text(_LEFT, y, heading, color=MUTED, weight="bold", **_SMALL)
-        y = _words(figure, y, _LEFT + 0.083, plain(said[heading]), _WIDTH - 16)
+        y = _words(figure, y, _LEFT + 0.083, plain(words), _WIDTH - 16)
     y -= 0.007
     figure.text(_LEFT, y, "What the twin can do with it", weight="bold", **_SMALL)
     y -= 0.0125
