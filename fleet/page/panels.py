@@ -92,7 +92,7 @@ def happenings(ax: Any, known: Survey, facts: Facts, colours: dict[str, str]) ->
         if event.kind == "item":
             ax.plot([at, at], [0.65, 1.35], color=INK, lw=0.8)
             if at - edge > 0.02 * length:
-                ax.text(at, 1, f" {event.text.split()[1]}", ha="left", va="center", size=6.5)
+                ax.text(at, 1, f" {event.text.split()[1]}", ha="left", va="center", size=6.5, clip_on=True)
                 edge = at
         elif event.kind in _MARKS:
             mark, colour = _MARKS[event.kind]
