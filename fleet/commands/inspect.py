@@ -1,0 +1,188 @@
+"""Tell what is in a recording, and what a twin can do with it: table, JSON, a page to print."""
+
+import argparse
+import json
+import logging
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+from rich.console import Console
+
+from fleet.commands.schema import fields_of, parts_of, summary
+from fleet.sheet import table
+from fleet.telemetry.findings import Facts, File, Findings, findings
+from fleet.telemetry.recordings import replay_messages
+from fleet.telemetry.survey import Survey, survey
+
+EXAMPLES = """
+  fleet inspect flight.tlog
+  fleet inspect monday/*.tlog.xz --plot monday.pdf     a page for every aircraft
+  fleet inspect flight.tlog --json flight.json --plot flight.png
+  fleet inspect flight.tlog --twin                     also let a twin fly it, and count what it could do
+  fleet inspect --keys                                 what the keys of the JSON mean
+"""
+PLOTS = (".png", ".svg", ".pdf")
+_LOGGER = "parauav.recordings"
+
+
+class Heard(NamedTuple):
+    """One recording, read."""
+
+    file: File
+    surveys: dict[int, Survey]
+    facts: dict[int, Facts]
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("file", nargs="*", type=Path, metavar="FILE", help="recordings, also compressed")
+    parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="JSON to FILE, or instead of the table")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="a page for every aircraft: .png, .svg or .pdf")
+    parser.add_argument("--twin", action="store_true", help="let a twin fly the recording and tell how it did")
+    parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
+    parser.add_argument("--keys", action="store_true", help="explain every key of the JSON and stop")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show every recording; exit code 1 where something was skipped, damaged or of no use, 2 for wrong use."""
+    if args.keys:
+        print(keys())
+        return 0
+    _check(args)
+    told: list[File] = []
+    sheets: list[tuple[Survey, Findings, Facts, str]] = []
+    console = Console()
+    for path in args.file:
+        heard = read(path, args.offset)
+        file = msgspec.structs.replace(heard.file, twin=_twin(path)) if args.twin else heard.file
+        told.append(file)
+        if args.json != "-":
+            console.print(table(file))
+        if args.plot:
+            known = heard.surveys.values()
+            sheets += [
+                (k, t, heard.facts.get(k.uav, Facts()), path.name) for k, t in zip(known, file.aircraft, strict=True)
+            ]
+    if args.json:
+        _write_json(told, args.json)
+    if args.plot and sheets:
+        from fleet.page import Sheet, write  # loads matplotlib: not for --help
+
+        for made in write(args.plot, [Sheet(*sheet) for sheet in sheets]):
+            print(f"fleet inspect: wrote {made}", file=sys.stderr)
+    return 1 if any(file.sentences or not file.aircraft or "sentence" in (file.twin or {}) for file in told) else 0
+
+
+def keys() -> str:
+    """Explain the JSON, key by key."""
+    lines = ['{"files": [File, ...]}']
+    for part in (File, *parts_of(File)):
+        lines += ["", f"{part.__name__}: {summary(part)}", *fields_of(part)]
+    return "\n".join(lines)
+
+
+def read(path: Path, offset: int = 0) -> Heard:
+    """Read one recording; whatever is wrong with it becomes a sentence."""
+    surveys: dict[int, Survey] = {}
+    facts: dict[int, Facts] = {}
+    with _said() as said, _progress(path.name) as progress:
+        try:
+            surveys = survey(_messages(path, offset, facts), progress)
+        except (ValueError, OSError) as error:
+            said.append(str(error))
+    if not surveys and not said:
+        said.append(f"{path.name}: found no aircraft, expected at least one heartbeat of one; check the file")
+    aircraft = tuple(findings(known, facts.get(uav, Facts())) for uav, known in surveys.items())
+    said = [sentence.removeprefix(f"{path.name}: ") for sentence in dict.fromkeys(said)]
+    return Heard(File(file=str(path), bytes=_size(path), sentences=tuple(said), aircraft=aircraft), surveys, facts)
+
+
+def _messages(path: Path, offset: int, facts: dict[int, Facts]) -> Iterator[Any]:
+    """Open the stream of messages, and fill the facts that messages lack as it is read."""
+    return replay_messages(path, offset)
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse wrong use before anything is read.
+
+    Raises:
+        ValueError: when an option makes no sense; the sentence says which.
+    """
+    if not args.file:
+        raise ValueError("FILE: found none, expected at least one recording; name one")
+    for path in args.file:
+        if not path.is_file():
+            raise ValueError(f"FILE: found no recording {str(path)!r}, expected a file; check the path")
+    if args.plot and args.plot.suffix not in PLOTS:
+        raise ValueError(f"--plot: found {args.plot.name!r}, expected a name in {' '.join(PLOTS)}; change the suffix")
+    for option, name in (("--plot", args.plot), ("--json", args.json)):
+        if name and not Path(name).absolute().parent.is_dir():
+            raise ValueError(f"{option}: found no folder {str(Path(name).parent)!r}, expected one; make it first")
+        if name and any(path.exists() and Path(name).exists() and path.samefile(name) for path in args.file):
+            raise ValueError(f"{option}: found the recording {str(name)!r} itself, expected another file; rename it")
+
+
+@contextmanager
+def _said() -> Iterator[list[str]]:
+    """Collect what the readers say of damage, instead of printing it between the tables."""
+    said: list[str] = []
+    ear = logging.Handler(logging.WARNING)
+    ear.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
+    logger = logging.getLogger(_LOGGER)
+    before, logger.propagate = logger.propagate, False
+    logger.addHandler(ear)
+    try:
+        yield said
+    finally:
+        logger.removeHandler(ear)
+        logger.propagate = before
+
+
+@contextmanager
+def _progress(name: str) -> Iterator[Any]:
+    """Show how much of the recorded time has been read, where somebody watches."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda _: None
+        return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} s of flight"))
+    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
+        task = bar.add_task(f"reading {name}", total=None)  # nobody knows how long the flight is before its end
+        yield lambda seconds: bar.update(task, completed=seconds)
+
+
+def _twin(path: Path) -> dict[str, Any]:
+    """Let a twin fly the recording in a process of its own; give its figures by UAV id, or a sentence."""
+    with tempfile.TemporaryDirectory() as folder:
+        answer = Path(folder) / "twin.json"
+        command = [sys.executable, "-m", "twin_worker.replay", str(path), "--json", str(answer)]
+        child = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
+        try:
+            told = json.loads(answer.read_text())
+        except (OSError, ValueError):
+            last = (child.stderr.strip().splitlines() or ["no reason given"])[-1]
+            return {"sentence": f"the twin ended with code {child.returncode}: {last}"}
+    return told if isinstance(told, dict) else {"sentence": "the twin's answer was no object"}
+
+
+def _write_json(told: list[File], name: str) -> None:
+    text = json.dumps({"files": msgspec.to_builtins(told)}, indent=1) + "\n"
+    if name == "-":
+        sys.stdout.write(text)
+    else:
+        Path(name).write_text(text)

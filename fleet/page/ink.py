@@ -1,0 +1,57 @@
+"""Colours and lines of the page; the colours go with the light theme of the viewer."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+INK, MUTED, GRID = "#17212E", "#64748B", "#E2E8EF"
+ROUTE, BAD, GOOD = "#7A6BB8", "#B93A00", "#00795A"
+LINES = ("#0072B2", "#B93A00", "#00795A", "#A67C00", "#6A2C7A", "#56B4E9", "#334155", "#D55E9B")
+_MODES = {
+    "AUTO": "#0072B2",
+    "MISSION": "#0072B2",
+    "AUTO.MISSION": "#0072B2",
+    "GUIDED": "#6A2C7A",
+    "OFFBOARD": "#6A2C7A",
+    "RTL": "#B93A00",
+    "AUTO.RTL": "#B93A00",
+    "QRTL": "#B93A00",
+    "MANUAL": "#6B7280",
+    "LOITER": "#00795A",
+    "AUTO.LOITER": "#00795A",
+    "FBWA": "#A67C00",
+    "STABILIZE": "#A67C00",
+}
+_OTHERS = ("#56B4E9", "#D55E9B", "#2BC49A", "#8C6D46", "#334155", "#9A8FD0")
+_MOST_POINTS = 3_000  # of one line; more would not be seen
+
+
+def mode_colours(modes: Iterable[str]) -> dict[str, str]:
+    """Give every mode its colour; the usual ones keep theirs on every page."""
+    names = list(dict.fromkeys(modes))
+    free = [name for name in names if name not in _MODES]
+    return {name: _MODES.get(name) or _OTHERS[free.index(name) % len(_OTHERS)] for name in names}
+
+
+def drawn(t: np.ndarray, y: np.ndarray, widest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Make a line of few points that keeps every peak and is broken by nan where an interval is wider than `widest`.
+
+    Args:
+        t: times, (n,) [s]
+        y: values, (n,)
+        widest: an interval wider than this is no line [s]
+    """
+    if len(t) > _MOST_POINTS:
+        parts = np.array_split(np.arange(len(t)), _MOST_POINTS // 2)
+        picked = np.sort(np.concatenate([[p[np.argmin(y[p])], p[np.argmax(y[p])]] for p in parts]))
+        widest = max(widest, 2.5 * (t[-1] - t[0]) / len(parts))
+        t, y = t[picked], y[picked]
+    after = np.flatnonzero(np.diff(t) > widest) + 1
+    return np.insert(t, after, t[after] if len(after) else []), np.insert(np.asarray(y, float), after, np.nan)
+
+
+def spread(values: np.ndarray, room: float = 0.08, least: float = 1.0) -> tuple[float, float]:
+    """Give the limits of an axis that shows all values with some room."""
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    more = max(room * (high - low), 0.5 * least)
+    return low - more, high + more

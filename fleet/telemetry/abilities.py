@@ -1,0 +1,228 @@
+"""What a twin can do with a recording, and why not: what it needs, held against what is there.
+
+The figures are those the twin itself works by; a test holds both equal.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet.airframe import ServoMap, servo_map
+from fleet.mission import route
+from fleet.telemetry.survey import LONGEST_S, Survey, airborne, spells
+from fleet.telemetry.thinned import Span, inside, overlap, seconds
+from fleet.window import INPUTS
+
+NEEDED = tuple(LONGEST_S)
+LEAST_S = 30.0  # shortest stretch worth identifying [s]
+WINDOW_S = 140.0  # longest stretch one identification uses [s]
+UNBROKEN_S = 4.0  # shortest unbroken stretch a model is tested on [s]
+RECENT_S = 2.0  # what a turn-rate prediction starts from [s]
+ROUTE_S = 5.0  # on one route before it is predicted [s]
+QUIET_PHI, QUIET_Q = 0.04, 0.02  # less than this is steady flight [rad, rad/s]
+LEAST_VA, PAIRED_S = 3.0, 0.5  # airspeed, and age of the rows that go with a ground velocity [m/s, s]
+PAIRS = 50  # wind triangles before the estimate is guarded
+ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
+NO_WINGS = ("multirotor", "helicopter")
+_GOOD_HZ = 10.0  # below this the twin works, but sees fast motion badly
+_STILL = 0.005  # an input that varies less never moves, share of its throw [-]
+_WORD = {"delta_a": "aileron", "delta_e": "elevator", "delta_r": "rudder", "delta_t": "throttle"}
+
+
+class Ability(NamedTuple):
+    """One thing a twin does: whether it can with this recording, and why, with figures found and needed."""
+
+    name: str
+    can: bool
+    why: str
+
+
+def abilities(known: Survey) -> list[Ability]:
+    """Judge everything a twin does, in the order it does them."""
+    flown = airborne(known)
+    whole = whole_spans(known)
+    starved = _wings(known) or _starved(known, flown, whole)
+    swing = swings(known, overlap(whole, flown))
+    axes = (
+        _identify("identify longitudinal", known, starved, swing, ("delta_e", "delta_t")),
+        _identify("identify lateral", known, starved, swing, ("delta_a", "delta_r")),
+    )
+    unidentified = _unidentified(axes)
+    verified = _verify(known, unidentified, overlap(whole, flown))
+    wind = _wind(known)
+    return [
+        *axes,
+        verified,
+        _on_route(known, unidentified, flown),
+        _by_turn_rate(known, whole),
+        wind,
+        _diagnose(unidentified, verified, wind),
+    ]
+
+
+def _unidentified(axes: tuple[Ability, Ability]) -> str:
+    """Say which axis cannot be identified, or nothing."""
+    broken = [axis.name.split()[-1] for axis in axes if not axis.can]
+    if not broken:
+        return ""
+    return "neither axis can be identified" if len(broken) == 2 else f"the {broken[0]} axis cannot be identified"
+
+
+def whole_spans(known: Survey) -> list[Span]:
+    """Give the stretches in which no needed kind of row has an interval too wide to fill."""
+    whole = [Span(-np.inf, np.inf)]
+    for name in NEEDED:
+        whole = overlap(whole, known.rows[name].stretches())
+    return whole
+
+
+def swings(known: Survey, spans: list[Span]) -> dict[str, float]:
+    """Give how much each input varies there, one standard deviation, share of its throw [-]."""
+    t, pulses = known.rows["servo"].rows()
+    there = inside(t, spans)
+    if there.sum() < 2:
+        return dict.fromkeys(INPUTS, 0.0)
+    u = servo_map(known.values).inputs(pulses[there])
+    return dict(zip(INPUTS, u.std(axis=0).tolist(), strict=True))
+
+
+def most_within(spans: list[Span], length: float) -> float:
+    """Give the most that any `length` seconds hold of the spans [s]."""
+    best = 0.0
+    for last in spans:
+        start = last.stop - length
+        best = max(best, seconds(overlap(spans, [Span(start, last.stop)])))
+    return best
+
+
+def _wings(known: Survey) -> str:
+    return f"a {known.vehicle} is not modelled, turn rate only" if known.vehicle in NO_WINGS else ""
+
+
+def _starved(known: Survey, flown: list[Span], whole: list[Span]) -> str:
+    """Say what the data lack for an identification, or nothing."""
+    if lack := _lacking(known):
+        return lack
+    if not flown:
+        return "never in the air: no 5 s faster than 6 m/s"
+    for name in NEEDED:
+        covered = seconds(overlap(known.rows[name].stretches(), flown))
+        if covered < 0.5 * seconds(flown):
+            return (
+                f"{name} at {known.rows[name].rate_hz:.1f} Hz is unbroken for {covered:.0f} of {seconds(flown):.0f} s "
+                f"in the air; no interval over {LONGEST_S[name]:g} s is needed, {_GOOD_HZ:.0f} Hz or more is good"
+            )
+    parts = overlap(whole, flown)
+    have = most_within(parts, WINDOW_S)
+    if have < LEAST_S:
+        return f"{have:.0f} s of whole data in the air, {LEAST_S:.0f} s are needed"
+    longest = max(part.seconds for part in parts)
+    if longest < UNBROKEN_S:
+        return f"the longest unbroken stretch is {longest:.1f} s, {UNBROKEN_S:.0f} s are needed"
+    return ""
+
+
+def _lacking(known: Survey) -> str:
+    """Name the needed kinds of row that are not there at all."""
+    none = [name for name in NEEDED if known.rows[name].count < 8]
+    return f"no {', '.join(none)} rows in the recording" if none else ""
+
+
+def _identify(name: str, known: Survey, starved: str, swing: dict[str, float], needed: tuple[str, ...]) -> Ability:
+    if starved:
+        return Ability(name, False, starved)
+    still = [_WORD[each] for each in needed if swing[each] < _STILL]
+    servos = servo_map(known.values)
+    if len(still) == len(needed):
+        return Ability(name, False, f"{' and '.join(still)} never move in the air{_assumed(servos)}")
+    said = ", ".join(
+        f"{_WORD[each]} varies by {swing[each]:.0%} of its throw" for each in needed if swing[each] >= _STILL
+    )
+    said += f"; {still[0]} never moves" if still else ""
+    slow = [f"{kind} at {hz:.1f} Hz" for kind in ("attitude", "servo") if (hz := known.rows[kind].rate_hz) < _GOOD_HZ]
+    if slow:
+        said += f"; but {' and '.join(slow)} show fast motion badly, {_GOOD_HZ:.0f} Hz or more is good"
+    if known.rows["air"].count == 0:
+        said += "; no airspeed rows: wind is taken as none"
+    return Ability(name, True, said + _assumed(servos))
+
+
+def _assumed(servos: ServoMap) -> str:
+    return " (servo map assumed)" if servos.sentence else ""
+
+
+def _verify(known: Survey, unidentified: str, spans: list[Span]) -> Ability:
+    if unidentified:
+        return Ability("verify", False, unidentified)
+    t, x = known.rows["attitude"].rows()
+    there = x[inside(t, spans)]
+    phi, q = float(there[:, 0].std()), float(there[:, 4].std())
+    found = f"bank varies by {np.degrees(phi):.1f} deg, pitch rate by {np.degrees(q):.1f} deg/s"
+    if phi < QUIET_PHI and q < QUIET_Q:
+        need = f"{np.degrees(QUIET_PHI):.1f} deg or {np.degrees(QUIET_Q):.1f} deg/s are needed"
+        return Ability("verify", False, f"steady flight shows nothing: {found}, {need}")
+    return Ability("verify", True, found)
+
+
+def _on_route(known: Survey, unidentified: str, flown: list[Span]) -> Ability:
+    name = "predict on the route"
+    if unidentified:
+        return Ability(name, False, unidentified)
+    following = overlap([span for span, mode in spells(known) if mode in ROUTE_MODES], flown)
+    flew = seconds(following)
+    if flew < ROUTE_S:
+        modes = ", ".join(dict.fromkeys(mode for _, mode in spells(known))) or "no mode"
+        return Ability(
+            name, False, f"{flew:.0f} s in a mode that follows a mission, {ROUTE_S:.0f} s are needed ({modes})"
+        )
+    origin = known.origin()
+    if not known.items or origin is None:
+        return Ability(
+            name, False, "no mission list in the recording; let the ground station download it while recording"
+        )
+    if not len(route(known.items, seq=1, origin=origin, params=known.values).legs):
+        return Ability(name, False, f"the mission of {len(known.items)} items has no legs to fly")
+    if not known.rows["leg"].count:
+        return Ability(name, False, "the mission item in force is not in the recording (MISSION_CURRENT)")
+    autopilot = known.status.autopilot if known.status else "unknown"
+    law = "" if autopilot == "ardupilot" else f"; autopilot {autopilot} is flown by ArduPlane's law, not its own"
+    items = f"{len(known.items)} mission items" + ("" if known.mission and known.mission.complete else ", not all")
+    return Ability(name, True, f"{flew:.0f} s on the route, {items}; take-off and landing are not modelled{law}")
+
+
+def _by_turn_rate(known: Survey, whole: list[Span]) -> Ability:
+    name = "predict by turn rate"
+    if lack := _lacking(known):
+        return Ability(name, False, lack)
+    longest = max((span.seconds for span in whole), default=0.0)
+    if longest < RECENT_S:
+        rates = ", ".join(f"{kind} {known.rows[kind].rate_hz:.1f} Hz" for kind in NEEDED)
+        return Ability(name, False, f"never {RECENT_S:.0f} s of whole data: {rates}; 2 Hz without gaps are the least")
+    return Ability(name, True, f"{seconds([s for s in whole if s.seconds >= RECENT_S]):.0f} s of whole data")
+
+
+def _wind(known: Survey) -> Ability:
+    name = "estimate wind"
+    none = [kind for kind in ("velocity", "air", "attitude") if not known.rows[kind].count]
+    if none:
+        return Ability(name, False, f"no {', '.join(none)} rows in the recording")
+    t, fresh = known.rows["velocity"].rows()[0], []
+    t_air, air = known.rows["air"].rows()
+    for kind in ("air", "attitude"):
+        rows = known.rows[kind]
+        other = rows.rows()[0]
+        before = np.searchsorted(other, t) - 1
+        limit = max(PAIRED_S, 1.5 * rows.stride / max(rows.rate_hz, 1e-3)) if rows.stride > 1 else PAIRED_S
+        fresh.append((before >= 0) & (t - other[np.clip(before, 0, None)] < limit))
+    fast = air[np.clip(np.searchsorted(t_air, t) - 1, 0, None), 0] >= LEAST_VA
+    pairs = int((fresh[0] & fresh[1] & fast).sum())
+    if pairs < PAIRS:
+        most = float(air[:, 0].max())
+        return Ability(name, False, f"{pairs} wind triangles, {PAIRS} are needed; airspeed reaches {most:.1f} m/s")
+    return Ability(name, True, f"{pairs} wind triangles of ground velocity, airspeed and heading")
+
+
+def _diagnose(unidentified: str, verified: Ability, wind: Ability) -> Ability:
+    lack = unidentified or ("" if verified.can else verified.why) or ("" if wind.can else f"no wind: {wind.why}")
+    data = f"the data would not do: {lack}" if lack else "the data would do"
+    return Ability("diagnose", False, f"missing physics is not named yet; {data}")
