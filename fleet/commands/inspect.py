@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import logging
 import subprocess
 import sys
 import tempfile
@@ -17,7 +16,7 @@ from rich.console import Console
 from fleet.commands.schema import fields_of, parts_of, summary
 from fleet.sheet import table
 from fleet.telemetry.findings import Facts, File, Findings, findings
-from fleet.telemetry.recordings import replay_messages
+from fleet.telemetry.recordings import Recording
 from fleet.telemetry.survey import Survey, survey
 
 EXAMPLES = """
@@ -28,7 +27,6 @@ EXAMPLES = """
   fleet inspect --keys                                 what the keys of the JSON mean
 """
 PLOTS = (".png", ".svg", ".pdf")
-_LOGGER = "parauav.recordings"
 
 
 class Heard(NamedTuple):
@@ -50,7 +48,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show every recording; exit code 1 where something was skipped, damaged or of no use, 2 for wrong use."""
+    """Show every recording; exit code 1 where something was skipped, assumed or of no use, 2 for wrong use."""
     if args.keys:
         print(keys())
         return 0
@@ -91,21 +89,20 @@ def read(path: Path, offset: int = 0) -> Heard:
     """Read one recording; whatever is wrong with it becomes a sentence."""
     surveys: dict[int, Survey] = {}
     facts: dict[int, Facts] = {}
-    with _said() as said, _progress(path.name) as progress:
-        try:
-            surveys = survey(_messages(path, offset, facts), progress)
-        except (ValueError, OSError) as error:
-            said.append(str(error))
+    said: list[str] = []
+    try:
+        recording = Recording(path, offset)
+        with _progress(recording) as progress:
+            surveys = survey((news for _, step in recording.steps() for news in step), progress)
+        facts = {uav: Facts(craft.firmware, tuple(craft.texts)) for uav, craft in recording.crafts.items()}
+        said += recording.skipped
+    except (ValueError, OSError) as error:
+        said.append(str(error))
     if not surveys and not said:
         said.append(f"{path.name}: found no aircraft, expected at least one heartbeat of one; check the file")
     aircraft = tuple(findings(known, facts.get(uav, Facts())) for uav, known in surveys.items())
     said = [sentence.removeprefix(f"{path.name}: ") for sentence in dict.fromkeys(said)]
     return Heard(File(file=str(path), bytes=_size(path), sentences=tuple(said), aircraft=aircraft), surveys, facts)
-
-
-def _messages(path: Path, offset: int, facts: dict[int, Facts]) -> Iterator[Any]:
-    """Open the stream of messages, and fill the facts that messages lack as it is read."""
-    return replay_messages(path, offset)
 
 
 def _size(path: Path) -> int:
@@ -136,34 +133,18 @@ def _check(args: argparse.Namespace) -> None:
 
 
 @contextmanager
-def _said() -> Iterator[list[str]]:
-    """Collect what the readers say of damage, instead of printing it between the tables."""
-    said: list[str] = []
-    ear = logging.Handler(logging.WARNING)
-    ear.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
-    logger = logging.getLogger(_LOGGER)
-    before, logger.propagate = logger.propagate, False
-    logger.addHandler(ear)
-    try:
-        yield said
-    finally:
-        logger.removeHandler(ear)
-        logger.propagate = before
-
-
-@contextmanager
-def _progress(name: str) -> Iterator[Any]:
-    """Show how much of the recorded time has been read, where somebody watches."""
+def _progress(recording: Recording) -> Iterator[Any]:
+    """Show how much of the file has been read, where somebody watches."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield lambda _: None
         return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} s of flight"))
-    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as bar:
-        task = bar.add_task(f"reading {name}", total=None)  # nobody knows how long the flight is before its end
-        yield lambda seconds: bar.update(task, completed=seconds)
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(f"reading {recording.name}", total=1.0)
+        yield lambda _: bar.update(task, completed=recording.share)
 
 
 def _twin(path: Path) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fleet.telemetry.craft import Craft
+from fleet.telemetry.dataflash import DataflashLog
 from fleet.telemetry.decode import frames_of
 from fleet.telemetry.intake import Intake, News
 from fleet.telemetry.onboard_log import OnboardLog
@@ -58,7 +59,7 @@ class Recording:
         """Say what was skipped, where, and what was assumed; whole once read to the end."""
         opened = self._log or self._tlog
         found = [*self._told, *(opened.skipped if opened else ()), self.source.trouble]
-        return [f"{self.name}: {sentence}" for sentence in found if sentence]
+        return [f"{self.name}: {sentence.removeprefix(f'{self.name}: ')}" for sentence in found if sentence]
 
     def steps(self) -> Iterator[tuple[float, list[News]]]:
         """Give the recording in steps of 0.1 s: (end of the step [s since 1970], news).
@@ -125,7 +126,7 @@ def _by_content(head: bytes) -> str:
     return best if found[best] else ""
 
 
-_READERS: dict[str, Callable[..., OnboardLog]] = {".ulg": UlogLog}
+_READERS: dict[str, Callable[..., OnboardLog]] = {".bin": DataflashLog, ".log": DataflashLog, ".ulg": UlogLog}
 
 
 def replay_messages(
