@@ -1,0 +1,102 @@
+"""Whatever a file has suffered, whatever its kind: what is good is read, what was skipped is said, nothing raises."""
+
+import lzma
+import re
+import resource
+
+import numpy as np
+import pytest
+
+from fleet.contract import COLUMNS, Sample
+from fleet.telemetry.opening import Source
+from fleet.telemetry.recordings import Recording
+
+FILES = {
+    "tlog": "sitl/s02_nominal_light_wind.tlog.xz",
+    "bin": "real/dronekit_copter_log171_crash.bin",
+    "log": "real/ardupilot_mechanical_fail_quad.log",
+    "ulg": "real/px4_vtol_cubeorange_6s_reader_test.ulg",
+}
+SEEDS = range(20)
+MOST = 1_000_000  # bytes of each file used
+LONGEST = 96 << 20  # of an endless one
+
+
+def read(path) -> tuple[int, list[str]]:
+    """Rows and sentences of a recording; a sentence alone where it is none."""
+    recording, rows = Recording(path), 0
+    try:
+        for _, news in recording.steps():
+            for sample in news:
+                if isinstance(sample, Sample):
+                    rows += sum(len(getattr(sample, f).t.numpy()) for f in COLUMNS if getattr(sample, f) is not None)
+    except ValueError as error:
+        assert not rows
+        return 0, [str(error)]
+    return rows, recording.skipped
+
+
+@pytest.fixture(scope="module", params=list(FILES))
+def good(request, recordings) -> tuple[str, bytes]:
+    with Source(recordings / FILES[request.param]).open() as stream:
+        return request.param, stream.read(MOST)
+
+
+def test_flipped_bits_cost_what_they_hit(good, tmp_path):
+    kind, data = good
+    path = tmp_path / f"flight.{kind}"
+    path.write_bytes(data)
+    whole, before = read(path)
+    assert whole > 1000
+    said, kept = [], []
+    for seed in SEEDS:
+        rng, damaged = np.random.default_rng(seed), bytearray(data)
+        for at in rng.integers(0, len(data), 100):
+            damaged[at] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        rows, skipped = read(path)
+        kept.append(rows / whole)
+        said += [sentence for sentence in skipped if sentence not in before]
+    assert np.median(kept) > 0.9, kept
+    assert min(kept) > 0.3, kept
+    assert len(said) >= len(SEEDS) // 2
+    assert any(re.search(r"(byte|line)s? \d+", sentence) for sentence in said), said[:5]
+
+
+def test_a_file_cut_anywhere_keeps_what_came_before(good, tmp_path):
+    kind, data = good
+    path = tmp_path / f"flight.{kind}"
+    path.write_bytes(data)
+    whole, _ = read(path)
+    found = []
+    for share in (0.0003, 0.02, 0.3, 0.77, 0.9999):
+        path.write_bytes(data[: int(share * len(data))])
+        found.append(read(path)[0])
+    assert found == sorted(found)
+    assert whole * 0.9 < found[-1] <= whole
+    assert found[3] > 0.5 * whole
+
+
+def test_another_suffix_changes_nothing(good, tmp_path):
+    kind, data = good
+    other = {"tlog": "bin", "bin": "log", "log": "ulg", "ulg": "tlog"}[kind]
+    for suffix in (kind, other, "dat"):
+        (tmp_path / f"flight.{suffix}").write_bytes(data)
+    (rows, _), (same, said), (again, _) = (read(tmp_path / f"flight.{suffix}") for suffix in (kind, other, "dat"))
+    assert rows == same == again
+    assert "by its content" in said[0]
+
+
+@pytest.mark.parametrize("kind", list(FILES))
+@pytest.mark.parametrize("content", ["zeros", "noise"])
+def test_an_endless_file_is_given_up_in_bounded_memory(kind, content, tmp_path):
+    path = tmp_path / f"endless.{kind}.xz"
+    block = bytes(1 << 20) if content == "zeros" else np.random.default_rng(1).bytes(1 << 20)
+    with lzma.open(path, "wb", preset=0) as file:
+        for _ in range(LONGEST // len(block) if content == "zeros" else 8):
+            file.write(block)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    rows, said = read(path)
+    assert rows == 0
+    assert said and f"endless.{kind}.xz" in said[0] and "expected" in said[0]
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 * 1024  # kB
