@@ -76,6 +76,8 @@ class Twin:
     state: State = State.WAITING
     tries: int = 0
     since: float = -np.inf  # last change of mode, mission or parameters
+    data_t: float = -np.inf  # newest time in any message
+    turned_t: float = -np.inf  # data time of the last turn of the loop
     wind_t: float = -np.inf
     identify_t: float = -np.inf
     predict_t: float = -np.inf
@@ -162,6 +164,7 @@ def _hear_status(twin: Twin, status: Status) -> None:
     if status.clock_jumps != before.clock_jumps:
         twin.history.clear()
         twin.wind.t = twin.wind_t = twin.identify_t = twin.score_t = -np.inf  # the new time may lie before
+        twin.data_t = twin.turned_t = -np.inf
         _event(twin, status.t)
     elif status.mode != before.mode:
         _event(twin, status.t)
