@@ -119,8 +119,8 @@ def _score(twin: Twin) -> None:
 
 def fleet_row(twin: Twin, now: float, **claim: object) -> FleetRow:
     """Give the aircraft's line of the fleet table; `now` is data time, `claim` names worker and epoch."""
-    t10, censored, n = twin.record.t10("paper")
     made = twin.prediction
+    t10, censored, n = twin.record.t10(made.method if made and made.method != "imm" else "paper")
     return FleetRow(
         uav=twin.uav,
         state=twin.state,
