@@ -38,7 +38,7 @@ def foresee(twin: Twin, now: float) -> list[Message]:
     t = t0 + float(ahead[0])
     twin.prediction = msgspec.structs.replace(prediction, t=t, seq=made.seq, sentence=said, coast_s=coast, law=made.law)
     if not twin.lost:
-        speed = float(np.hypot(*flown.v[-1, :2]))
+        speed = float(np.linalg.norm(flown.v[-1]))
         twin.record.keep(Made(t0, made.method, made.path, twin.prediction.tube.numpy().astype(float), speed))
     return [twin.prediction]
 

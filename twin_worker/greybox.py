@@ -22,6 +22,7 @@ _SYNC_S = 60.0  # flight the guidance is synchronised on [s]
 _BACK_S, _EVERY_S, _OVER_S = 80.0, 8.0, 20.0  # flight compared with; between starts; how far each looks [s]
 _PERIODS = (9.0, 12.0, 16.0, 20.0, 26.0)  # NAVL1_PERIOD tried where it is not known [s]
 _LAGS = (0.4, 0.8, 1.4)  # bank lags tried [s]
+_SPEED_S = 20.0  # airspeed is the mean over as much [s]
 _SLOWEST = 5.0  # a wing flies no slower [m/s]
 _RIDGE = 5.0  # usual wind, before it is seen [m/s]
 
@@ -71,7 +72,7 @@ def air_of(track: Track, wind: np.ndarray | None) -> tuple[np.ndarray, float]:
         middle = np.array([0.0, 0.0, np.mean(np.sum(v * v, axis=1))])
         w = np.linalg.solve(A.T @ A + ridge, A.T @ (np.sum(v * v, axis=1)) + ridge @ middle)[:2]
         w = w * min(1.0, 15.0 / max(float(np.hypot(*w)), 1e-6))
-    recent = track.v[track.ok][-int(40 / STEP) :]
+    recent = track.v[track.ok][-int(_SPEED_S / STEP) :]
     return w, float(np.mean(np.linalg.norm(recent - [*w, 0.0], axis=1)))
 
 

@@ -43,7 +43,7 @@ class Made:
     method: str
     path: np.ndarray  # NED, (61, 3) [m]
     tube: np.ndarray  # half-axes, (61, 3) [m]
-    speed: float  # ground speed at t [m/s]
+    speed: float  # over ground at t, climb included [m/s]
 
 
 def track_frame(path: np.ndarray) -> np.ndarray:

@@ -113,6 +113,9 @@ def fly_kind(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
         return nothing(f"vehicle {twin.vehicle}: no law known to fly it by")
     if why := twin.why_no_route():
         return nothing(why)
+    if twin.vehicle == QUADPLANE:
+        hung = np.flatnonzero(lifted(whole.t, twin.history, _params(twin), twin.modes))
+        whole = whole.part(int(hung[-1]) + 1 if len(hung) else 0, len(whole))
     seq = rotor.items_in_force(whole.t, twin.history.rows("leg"), twin.mission)
     made = wing.fly(whole, seq, _wing_board(twin), twin.grey, ahead)
     if made.path is None:

@@ -65,6 +65,8 @@ def lay(
         segments (n, N_SEGMENT), and what was wrong with the mission
     """
     way = m.route(items, seq=seq, origin=origin, params=params, limit=_LEGS)
+    if len(way.legs) and int(way.legs[0, m.KIND]) == m.LAND and np.isfinite(way.start).all():
+        way.start[2] = p[2]  # it comes in at the height it has
     waits = {item.seq: item.param1 for item in items if item.command in (16, 82) and 0 < item.param1 < 1e5}
     returns = {item.seq for item in items if item.command == _RETURN}
     laid = _Laid(way.start if np.isfinite(way.start).all() else np.array(p, float), [])
@@ -97,6 +99,8 @@ def _lay_leg(laid: _Laid, leg: np.ndarray, wait: float, ground: float, params: M
         laid.to(np.array([*laid.at[:2], b[2]]), seq, STOP)
     elif kind == m.LAND:
         laid.to(np.array([*b[:2], laid.at[2]]), seq, STOP, leg[m.VA_C])
+        if laid.rows:  # a quadplane brakes for it more gently than it sets off
+            laid.rows[-1][copter.ACC] = max(params.get("Q_TRANS_DECEL", 0.0), 0.0)
         _down(laid, ground, seq)
     elif kind == m.LOITER_TURNS:
         _circle(laid, leg, params)
@@ -162,7 +166,8 @@ def paced(laid: np.ndarray, limit: Limits) -> np.ndarray:
         level = row[copter.SPEED] if row[copter.SPEED] > 0 else limit.speed
         down = limit.land if row[copter.SPEED] < 0 else limit.down
         row[copter.SPEED] = min(copter.along(level, limit.up, down, t[k]), 100.0)
-        row[copter.ACC] = min(copter.along(limit.acc, limit.acc_z, limit.acc_z, t[k]), 20.0)
+        level = min(limit.acc, row[copter.ACC]) if row[copter.ACC] > 0 else limit.acc
+        row[copter.ACC] = min(copter.along(level, limit.acc_z, limit.acc_z, t[k]), 20.0)
     end = 0.0
     for k in range(len(out) - 1, -1, -1):
         row = out[k]

@@ -28,7 +28,7 @@ _LAGS = (1.0, 1.4, 2.0, 2.8)  # natural frequencies tried [rad/s]
 _SHARES = (0.6, 0.8, 0.9, 1.0, 1.1, 1.25)  # of the limits, tried
 _DOUBT = 0.15  # cost of a share e times the allowed one [m]
 _ZETA = 0.9
-_TRANSITION = 2.0  # acceleration of a quadplane between hovering and flying [m/s2]
+_TRANSITION = 4.0  # acceleration of a quadplane between hovering and flying [m/s2]
 _STILL = 0.8  # slower than this it waits [m/s]
 
 
@@ -177,6 +177,11 @@ def _begin(track: Track, segments: np.ndarray, seq: int, wn: float) -> np.ndarra
     off = np.linalg.norm(a + t * s[:, None] - p, axis=1)
     off[segments[:, copter.SEQ] != seq] += 1e6
     k = int(np.argmin(off))
+    if 2.0 < off[k] % 1e6 and length[k] > 2.0:  # not on its line: it flies to the end from where it is
+        segments[k, copter.A_N : copter.A_N + 3] = p
+        way = b[k] - p
+        length[k], s[k] = float(np.linalg.norm(way)), 0.0
+        t[k] = way / max(length[k], 1e-6)
     ref = np.zeros(copter.N_FOLLOW)
     recent = track.v[-min(11, len(track)) :]
     push = (recent[-1] - recent[0]) / max(STEP * (len(recent) - 1), STEP)
