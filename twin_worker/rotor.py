@@ -24,8 +24,9 @@ RETURN_MODES = ("RTL", "AUTO.RTL", "SMART_RTL")
 _LEAST_S = 2.0  # shortest track a flight ahead starts from [s]
 _BACK_S = 60.0  # flight the twin is compared with [s]
 _EVERY_S, _OVER_S = 4.0, 10.0  # between its starts, and how far each looks [s]
-_LAGS = (1.0, 1.4, 2.0, 2.8)  # natural frequencies tried [rad/s]
+_LAGS = (0.7, 1.0, 1.4, 2.0, 2.8)  # natural frequencies tried [rad/s]
 _SHARES = (0.6, 0.8, 0.9, 1.0, 1.1, 1.25)  # of the limits, tried
+_TRIED = (("share", _SHARES), ("wn", _LAGS), ("push", _SHARES))  # one of them each time
 _DOUBT = 0.15  # cost of a share e times the allowed one [m]
 _ZETA = 0.9
 _TRANSITION = 4.0  # acceleration of a quadplane between hovering and flying [m/s2]
@@ -44,6 +45,7 @@ class Rotor:
         wind: NED, where it blows to, (2,) [m/s]
         miss: mean miss over 10 s of past flight [m]; nan before any
         starts: how many flights that is
+        turn: comparisons so far
     """
 
     wn: float = 2.0
@@ -53,6 +55,7 @@ class Rotor:
     wind: tuple[float, float] = (0.0, 0.0)
     miss: float = float("nan")
     starts: int = 0
+    turn: int = 0
 
     def __str__(self) -> str:
         if not self.starts:
@@ -224,10 +227,11 @@ def compare(track: Track, seq: np.ndarray, board: Onboard, rotor: Rotor) -> Roto
         found = [_strays(track, k, laid[seq[k]], int(seq[k]) + board.shift, _Way(board, one)) for k in starts]
         return float(np.mean(found)) + _DOUBT * (abs(np.log(one.share)) + abs(np.log(one.push)))
 
-    for name, tried in (("share", _SHARES), ("wn", _LAGS), ("push", _SHARES)):
-        options = [replace(rotor, **{name: value}) for value in dict.fromkeys((getattr(rotor, name), *tried))]
-        rotor = min(options, key=miss)
-    return replace(rotor, miss=miss(rotor), starts=len(starts))
+    name, tried = _TRIED[rotor.turn % len(_TRIED)]
+    options = [replace(rotor, **{name: value}) for value in dict.fromkeys((getattr(rotor, name), *tried))]
+    found = [miss(one) for one in options]
+    best = int(np.argmin(found))
+    return replace(options[best], miss=found[best], starts=len(starts), turn=rotor.turn + 1)
 
 
 def _starts(track: Track, seq: np.ndarray, board: Onboard) -> list[int]:
