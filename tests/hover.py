@@ -93,7 +93,9 @@ class Flight:
     items: tuple[Item, ...]
 
 
-def mission(rng: np.random.Generator, speed: float) -> tuple[tuple[Item, ...], list[tuple[int, np.ndarray, float, float]]]:
+def mission(
+    rng: np.random.Generator, speed: float
+) -> tuple[tuple[Item, ...], list[tuple[int, np.ndarray, float, float]]]:
     """A random mission, and (item, point, wait, speed) of it."""
     height = float(rng.uniform(20, 40))
     items, points = [item(0), item(1, 22, alt_m=height)], [(1, np.array([0.0, 0.0, -height]), 0.0, 0.0)]
@@ -123,7 +125,10 @@ def legs_of(items: tuple[Item, ...], points: list, p: dict[str, float]) -> list[
         if np.linalg.norm(b - at) > 0.5:
             t = np.abs(b - at) / np.linalg.norm(b - at)
             vertical = (up if b[2] < at[2] else down) / max(t[2], 1e-6)
-            top, push = min(speed / max(hypot(*t[:2]), 1e-6), vertical), min(acc / max(hypot(*t[:2]), 1e-6), 1 / max(t[2], 1e-6))
+            top, push = (
+                min(speed / max(hypot(*t[:2]), 1e-6), vertical),
+                min(acc / max(hypot(*t[:2]), 1e-6), 1 / max(t[2], 1e-6)),
+            )
             legs.append(Leg(at, b, seq, top, push, **more))
             at = b
 

@@ -26,8 +26,9 @@ _BACK_S = 60.0  # flight the twin is compared with [s]
 _EVERY_S, _OVER_S = 4.0, 10.0  # between its starts, and how far each looks [s]
 _LAGS = (0.7, 1.0, 1.4, 2.0, 2.8)  # natural frequencies tried [rad/s]
 _SHARES = (0.6, 0.8, 0.9, 1.0, 1.1, 1.25)  # of the limits, tried
-_TRIED = (("share", _SHARES), ("wn", _LAGS), ("push", _SHARES))  # one of them each time
-_DOUBT = 0.15  # cost of a share e times the allowed one [m]
+_PAUSES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)  # time lost at each stop, tried [s]
+_TRIED = (("share", _SHARES), ("pause", _PAUSES), ("wn", _LAGS), ("push", _SHARES))  # one of them each time
+_DOUBT = 20.0  # cost of a share e times the allowed one, as the sum of so many metres missed [m]
 _ZETA = 0.9
 _TRANSITION = 4.0  # acceleration of a quadplane between hovering and flying [m/s2]
 _STILL = 0.8  # slower than this it waits [m/s]
@@ -41,6 +42,7 @@ class Rotor:
         wn: natural frequency of its lag [rad/s]
         share: made of the allowed speed [-]
         push: made of the allowed acceleration [-]
+        pause: time lost at each stop beyond the wait that the mission asks for [s]
         v_air: airspeed at its largest tilt; nan: not seen [m/s]
         wind: NED, where it blows to, (2,) [m/s]
         miss: mean miss over 10 s of past flight [m]; nan before any
@@ -51,6 +53,7 @@ class Rotor:
     wn: float = 2.0
     share: float = 1.0
     push: float = 1.0
+    pause: float = 0.5
     v_air: float = float("nan")
     wind: tuple[float, float] = (0.0, 0.0)
     miss: float = float("nan")
@@ -161,6 +164,8 @@ class _Way:
 
 def _follow(track: Track, laid: np.ndarray, seq: int, way: _Way, ahead: np.ndarray) -> np.ndarray:
     segments = paced(laid, way.limit)
+    stops = (segments[:, copter.HOLD] > 0) & np.isfinite(segments[:, copter.HOLD])
+    segments[stops, copter.HOLD] += way.rotor.pause
     segments[:, copter.SPEED] *= np.where(laid[:, copter.SPEED] > 0, way.rotor.share, 1.0)
     p, v = track.p[-1].copy(), track.v[-3:].mean(axis=0)
     ref = _begin(track, segments, seq, way.rotor.wn)
@@ -225,7 +230,7 @@ def compare(track: Track, seq: np.ndarray, board: Onboard, rotor: Rotor) -> Roto
 
     def miss(one: Rotor) -> float:
         found = [_strays(track, k, laid[seq[k]], int(seq[k]) + board.shift, _Way(board, one)) for k in starts]
-        return float(np.mean(found)) + _DOUBT * (abs(np.log(one.share)) + abs(np.log(one.push)))
+        return float(np.mean(found)) + _DOUBT / len(starts) * (abs(np.log(one.share)) + 0.3 * abs(np.log(one.push)))
 
     name, tried = _TRIED[rotor.turn % len(_TRIED)]
     options = [replace(rotor, **{name: value}) for value in dict.fromkeys((getattr(rotor, name), *tried))]
