@@ -1,4 +1,4 @@
-"""A multirotor that flies missions, for tests: rigid tilt, quadratic drag, cascaded loops, gusts; not the twin's physics.
+"""A multirotor that flies missions, for tests: limited tilt, quadratic drag, cascaded loops, gusts; not the twin's law.
 
 Its reference is what ArduCopter's resembles: per leg a trapezoid of speed averaged over the jerk time, the next leg
 begun before the last has ended as far as the corner radius allows. Drag grows with the square of the airspeed, tilt

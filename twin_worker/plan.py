@@ -14,6 +14,7 @@ from fleet.contract import Item
 from fleet.frames import Origin
 
 STOP = 1e-3  # a wait that only means: stop there [s]
+_NUDGE_E7 = 108  # 1.2 m north [1e-7 deg]
 _LEGS = 24  # most legs unrolled
 _ROWS = 90  # most segments
 _CORNERS = 12  # segments of one circle
@@ -64,7 +65,7 @@ def lay(
     Returns:
         segments (n, N_SEGMENT), and what was wrong with the mission
     """
-    way = m.route(items, seq=seq, origin=origin, params=params, limit=_LEGS)
+    way = m.route(_apart(items), seq=seq, origin=origin, params=params, limit=_LEGS)
     if len(way.legs) and int(way.legs[0, m.KIND]) == m.LAND and np.isfinite(way.start).all():
         way.start[2] = p[2]  # it comes in at the height it has
     waits = {item.seq: item.param1 for item in items if item.command in (16, 82) and 0 < item.param1 < 1e5}
@@ -82,6 +83,18 @@ def lay(
         laid.rows[-1][copter.HOLD] = inf
     said = tuple(s for s in way.sentences if "ground speed" not in s)  # a multirotor's speeds are over ground
     return np.array(laid.rows).reshape(-1, copter.N_SEGMENT), said
+
+
+def _apart(items: Sequence[Item]) -> list[Item]:
+    """Move a waypoint right above the one before it a little: on wings it is no leg, on rotors it is."""
+    out: list[Item] = []
+    for item in sorted(items, key=lambda i: i.seq):
+        last = out[-1] if out else None
+        above = last is not None and (last.lat_e7, last.lon_e7, last.frame) == (item.lat_e7, item.lon_e7, item.frame)
+        if above and item.command == 16 and last is not None and abs(item.alt_m - last.alt_m) > 1.0:
+            item = msgspec.structs.replace(item, lat_e7=item.lat_e7 + _NUDGE_E7)
+        out.append(item)
+    return out
 
 
 def _home(items: Sequence[Item], origin: Origin) -> np.ndarray:

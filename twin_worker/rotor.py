@@ -185,7 +185,7 @@ def _begin(track: Track, segments: np.ndarray, seq: int, wn: float) -> np.ndarra
     off = np.linalg.norm(a + t * s[:, None] - p, axis=1)
     off[segments[:, copter.SEQ] != seq] += 1e6
     k = int(np.argmin(off))
-    if 2.0 < off[k] % 1e6 and length[k] > 2.0:  # not on its line: it flies to the end from where it is
+    if off[k] % 1e6 > 2.0 and length[k] > 2.0:  # not on its line: it flies to the end from where it is
         segments[k, copter.A_N : copter.A_N + 3] = p
         way = b[k] - p
         length[k], s[k] = float(np.linalg.norm(way)), 0.0
