@@ -6,7 +6,7 @@ import numpy as np
 
 from fleet.autopilots import copter, greybox
 from twin_worker import greybox as wing
-from twin_worker import rotor
+from twin_worker import rotor, rotor_fit
 from twin_worker.lift import SETTLE_S, lifted
 from twin_worker.memory import ROUTE_MODES, Twin
 from twin_worker.track import Track, track
@@ -97,7 +97,7 @@ def compare_with_flight(twin: Twin) -> None:
         return
     seq = rotor.items_in_force(flown.t, twin.history.rows("leg"), twin.mission)
     if twin.vehicle in NO_WINGS:
-        twin.rotor = rotor.compare(flown, seq, _board(twin, flown), twin.rotor)
+        twin.rotor = rotor_fit.compare(flown, seq, _board(twin, flown), twin.rotor)
     elif not hangs(twin):
         twin.grey = wing.compare(flown, seq, _wing_board(twin), twin.grey)
 

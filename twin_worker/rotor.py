@@ -1,34 +1,24 @@
 """The twin of what hovers: it follows the route as fast as its autopilot lets it, behind a lag seen in flight.
 
-Where the flight was, and where this twin would have been, says how fast it answers (its lag), how much of the
-allowed speed and acceleration it makes, and from its tilt which wind it stands against.
-
-Source: ArduCopter and PX4 limits as in `fleet.autopilots.copter`; drag as in Mahony, Kumar & Corke 2012 (linear).
+Its few numbers come from its own flight, see `rotor_fit`.
+Source: ArduCopter and PX4 limits as in `fleet.autopilots.copter`.
 """
 
 from dataclasses import dataclass, replace
-from math import isfinite, tan
+from math import isfinite
 
 import numpy as np
 
 from fleet.autopilots import copter
 from fleet.autopilots.copter import Limits
 from fleet.contract import Item, Mission
-from fleet.frames import G, Origin
+from fleet.frames import Origin
 from twin_worker.plan import home_again, lay, numbered_from_one, paced, stop_from
 from twin_worker.predict import held
 from twin_worker.track import STEP, Track
 
 HOLD_MODES = ("LOITER", "POSHOLD", "BRAKE", "AUTO.LOITER", "QLOITER", "HOLD", "POSCTL")
 RETURN_MODES = ("RTL", "AUTO.RTL", "SMART_RTL")
-_LEAST_S = 2.0  # shortest track a flight ahead starts from [s]
-_BACK_S = 60.0  # flight the twin is compared with [s]
-_EVERY_S, _OVER_S = 4.0, 10.0  # between its starts, and how far each looks [s]
-_LAGS = (0.7, 1.0, 1.4, 2.0, 2.8)  # natural frequencies tried [rad/s]
-_SHARES = (0.6, 0.8, 0.9, 1.0, 1.1, 1.25)  # of the limits, tried
-_PAUSES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)  # time lost at each stop, tried [s]
-_TRIED = (("share", _SHARES), ("pause", _PAUSES), ("wn", _LAGS), ("push", _SHARES))  # one of them each time
-_DOUBT = 20.0  # cost of a share e times the allowed one, as the sum of so many metres missed [m]
 _ZETA = 0.9
 _TRANSITION = 4.0  # acceleration of a quadplane between hovering and flying [m/s2]
 _STILL = 0.8  # slower than this it waits [m/s]
@@ -126,13 +116,13 @@ def fly_route(track: Track, seq: np.ndarray, board: Onboard, rotor: Rotor, ahead
     if not isfinite(seq[-1]):
         return None
     laid, _ = lay(board.items, int(seq[-1]) + board.shift, board.origin, track.p[-1], board.params)
-    return _follow(track, laid, int(seq[-1]) + board.shift, _Way(board, rotor), ahead) if len(laid) else None
+    return fly_segments(track, laid, int(seq[-1]) + board.shift, Way(board, rotor), ahead) if len(laid) else None
 
 
 def fly_home(track: Track, board: Onboard, rotor: Rotor, ahead: np.ndarray) -> np.ndarray | None:
     """Return to launch from the end of the track; None where home is not known."""
     laid = home_again(board.items, board.origin, track.p[-1], board.params)
-    return _follow(track, laid, -1, _Way(board, rotor), ahead) if len(laid) else None
+    return fly_segments(track, laid, -1, Way(board, rotor), ahead) if len(laid) else None
 
 
 def hold_still(track: Track, board: Onboard, rotor: Rotor, ahead: np.ndarray) -> np.ndarray:
@@ -140,11 +130,11 @@ def hold_still(track: Track, board: Onboard, rotor: Rotor, ahead: np.ndarray) ->
     p, v = track.p[-1], track.v[-3:].mean(axis=0)
     if np.linalg.norm(v) < 0.5:
         p = track.p[-15:].mean(axis=0)
-    return _follow(track, stop_from(p, v, board.limit), -1, _Way(board, rotor), ahead)
+    return fly_segments(track, stop_from(p, v, board.limit), -1, Way(board, rotor), ahead)
 
 
 @dataclass(frozen=True)
-class _Way:
+class Way:
     """Autopilot and aircraft together."""
 
     board: Onboard
@@ -162,7 +152,8 @@ class _Way:
         return np.array([self.board.limit.jerk, self.rotor.wn, _ZETA, self.rotor.v_air, *self.rotor.wind])
 
 
-def _follow(track: Track, laid: np.ndarray, seq: int, way: _Way, ahead: np.ndarray) -> np.ndarray:
+def fly_segments(track: Track, laid: np.ndarray, seq: int, way: Way, ahead: np.ndarray) -> np.ndarray:
+    """Fly laid segments ahead from the end of the track, item `seq` in force; times `ahead` (k,) [s], path (k, 3) [m]."""
     segments = paced(laid, way.limit)
     stops = (segments[:, copter.HOLD] > 0) & np.isfinite(segments[:, copter.HOLD])
     segments[stops, copter.HOLD] += way.rotor.pause
@@ -215,75 +206,6 @@ def items_in_force(t: np.ndarray, leg: tuple[np.ndarray, np.ndarray], mission: M
     if mission is not None and mission.seq >= 0:
         seq = np.where(np.isfinite(seq), seq, float(mission.seq))
     return seq
-
-
-def compare(track: Track, seq: np.ndarray, board: Onboard, rotor: Rotor) -> Rotor:
-    """Fly the twin over the last minute from many starts, and keep what strays least: lag, speed, acceleration."""
-    rotor = _blown(track, board, rotor)
-    starts = _starts(track, seq, board)
-    if len(starts) < 3:
-        return rotor
-    laid = {}
-    for k in starts:
-        if seq[k] not in laid:
-            laid[seq[k]] = lay(board.items, int(seq[k]) + board.shift, board.origin, track.p[k], board.params)[0]
-
-    def miss(one: Rotor) -> float:
-        found = [_strays(track, k, laid[seq[k]], int(seq[k]) + board.shift, _Way(board, one)) for k in starts]
-        return float(np.mean(found)) + _DOUBT / len(starts) * (abs(np.log(one.share)) + 0.3 * abs(np.log(one.push)))
-
-    name, tried = _TRIED[rotor.turn % len(_TRIED)]
-    options = [replace(rotor, **{name: value}) for value in dict.fromkeys((getattr(rotor, name), *tried))]
-    found = [miss(one) for one in options]
-    best = int(np.argmin(found))
-    return replace(options[best], miss=found[best], starts=len(starts), turn=rotor.turn + 1)
-
-
-def _starts(track: Track, seq: np.ndarray, board: Onboard) -> list[int]:
-    """Choose rows to start from: on this route, moving, with ten seconds of flight after them."""
-    over, every = int(_OVER_S / STEP), int(_EVERY_S / STEP)
-    first = max(int(np.searchsorted(track.t, board.since + _LEAST_S)), len(track) - int(_BACK_S / STEP), 20)
-    rows = range(len(track) - 1 - over, first, -every)
-    return [k for k in rows if isfinite(seq[k]) and track.ok[k - 20 : k + over].all() and _moves(track, k, over)]
-
-
-def _moves(track: Track, k: int, over: int) -> bool:
-    return bool(np.linalg.norm(track.p[k + over] - track.p[k]) > 3.0)
-
-
-def _strays(track: Track, k: int, laid: np.ndarray, seq: int, way: _Way) -> float:
-    if not len(laid):
-        return 0.0
-    ahead = np.arange(0.0, _OVER_S + 0.5)
-    path = _follow(track.part(max(k - 100, 0), k + 1), laid, seq, way, ahead)
-    flown = track.p[k + np.rint(ahead / STEP).astype(int)]
-    return float(np.linalg.norm(path - flown, axis=1).mean())
-
-
-def _blown(track: Track, board: Onboard, rotor: Rotor) -> Rotor:
-    """See drag and wind in the tilt: thrust's pull minus acceleration is k (v - w), linear in k and k w."""
-    rows = np.arange(len(track) - 1, max(len(track) - int(_BACK_S / STEP), 10), -5)
-    rows = rows[track.ok[rows] & np.isfinite(track.euler[rows]).all(axis=1)]
-    if len(rows) < 40:
-        return rotor
-    euler = track.euler[rows]
-    cf, sf, ct, st, cp, sp = (g(euler[:, i]) for i in range(3) for g in (np.cos, np.sin))
-    down = np.column_stack([cf * st * cp + sf * sp, cf * st * sp - sf * cp, cf * ct])  # z of the body in NED
-    slope = (track.v[rows] - track.v[rows - 10]) / (10 * STEP)
-    thrust = (G - slope[:, 2]) / np.maximum(down[:, 2], 0.5)
-    v = track.v[rows, :2] - 0.5 * STEP * 10 * slope[:, :2]
-    pull = -down[:, :2] * thrust[:, None] - slope[:, :2]
-    one = np.ones(len(rows))
-    nil = 0.0 * one
-    A = np.vstack([np.column_stack([v[:, 0], -one, nil]), np.column_stack([v[:, 1], nil, -one])])
-    found = np.linalg.solve(A.T @ A + np.diag([20.0, 2.0, 2.0]), A.T @ pull.T.ravel() + [20.0 * 0.2, 0.0, 0.0])
-    k = float(found[0])
-    if not 0.03 < k < 2.0 or np.ptp(v, axis=0).max() < 3.0:
-        return rotor
-    wind = found[1:] / k
-    if not np.hypot(*wind) < 25.0:
-        return rotor
-    return replace(rotor, v_air=G * tan(board.limit.tilt) / k, wind=(float(wind[0]), float(wind[1])))
 
 
 def said(board: Onboard, rotor: Rotor) -> str:

@@ -38,6 +38,7 @@ N_PAR = 6
 
 _THERE = 0.15  # as near the end of a segment as this it is reached [m]
 _STILL = 0.3  # and as slow as this [m/s]
+_MOST_LEVEL, _MOST_UPRIGHT = 6.0, 4.0  # acceleration that tilt and thrust leave to the airframe [m/s2]
 
 
 class Limits(NamedTuple):
@@ -153,7 +154,7 @@ def follow(
         dt: step [s]
         out: positions, filled in, NED, (k, 3) [m]; out[0] is the start
     """
-    t, r = np.empty(3), np.empty(3)
+    t, r, a = np.empty(3), np.empty(3), np.empty(3)
     wn, zeta = par[WN], par[ZETA]
     for k in range(len(out)):
         out[k] = x
@@ -171,7 +172,10 @@ def follow(
             ref[S] = max(ref[S] - length, 0.0) if row[END] > 0.0 else 0.0
             ref[WAITED] = 0.0
         for i in range(3):
-            v[i] += dt * (wn * wn * (r[i] - x[i]) + 2.0 * zeta * wn * (t[i] * ref[S_DOT] - v[i]))
+            a[i] = wn * wn * (r[i] - x[i]) + 2.0 * zeta * wn * (t[i] * ref[S_DOT] - v[i])
+        over = max(sqrt(a[0] ** 2 + a[1] ** 2) / _MOST_LEVEL, abs(a[2]) / _MOST_UPRIGHT, 1.0)
+        for i in range(3):
+            v[i] += dt * a[i] / over
             x[i] += dt * v[i]
 
 
