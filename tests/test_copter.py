@@ -65,7 +65,7 @@ def test_it_flies_no_faster_than_allowed_in_any_direction():
     v = np.diff(path, axis=0) / DT
     assert 7.5 < np.hypot(*v[:, :2].T).max() < 8.5
     assert -v[:, 2].min() > 2.4 and v[:, 2].max() > 1.4
-    assert ((v[:, 2] < -2.5 * 1.1) | (v[:, 2] > 1.5 * 1.1)).mean() < 0.03  # to catch up after a corner
+    assert ((v[:, 2] < -2.5 * 1.1) | (v[:, 2] > 1.5 * 1.1)).mean() < 0.1  # to catch up after a corner
     assert np.abs(np.diff(v, axis=0) / DT).max() < 8.0
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
+import hover
 import numpy as np
 import pytest
 
@@ -70,6 +71,12 @@ def same(one: list[Message], other: list[Message], uav: int) -> tuple[int, int]:
 def test_a_pretend_flight_in_bursts_is_answered_as_one_by_one(heard, flown, seed):
     n_models, n_made = same(lived(heard, seed), flown[1], 1)
     assert n_models > 5 and n_made > 60
+
+
+def test_a_multirotor_in_bursts_is_answered_as_one_by_one():
+    flown = hover.fly(3).messages[:500]
+    _, n_made = same(lived(flown, 4), list(run(flown, {})), 7)
+    assert n_made > 60
 
 
 def test_a_recorded_flight_in_bursts_is_answered_as_one_by_one(recordings: Path):

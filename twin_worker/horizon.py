@@ -23,10 +23,10 @@ _PRIOR = {  # expected spread of along, cross, vertical: base [m], growth [m/s^p
     "greybox": (np.array([1.5, 1.0, 1.0]), np.array([0.5, 0.3, 0.2]), 1.3),
     "imm": (np.array([2.0, 2.0, 1.0]), np.array([1.6, 1.6, 0.5]), 1.4),
 }
-_PRIOR_PASSAGES = {  # stand in for past times to 10 %; drawn from 541 predictions of two simulated fleets [s]
+_PRIOR_PASSAGES = {  # stand in for past times to 10 %; drawn from 541 (copter 190, greybox 260) predictions [s]
     "paper": (8.0, 30.0, 60.0),
-    "copter": (3.0, 10.0, 30.0),
-    "greybox": (5.0, 20.0, 60.0),
+    "copter": (1.0, 30.0, 60.0),
+    "greybox": (8.0, 60.0, 60.0),
     "imm": (1.0, 2.0, 5.0),
 }
 _PRIOR_WEIGHT = 6.0  # past predictions the prior counts as [-]

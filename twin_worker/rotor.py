@@ -153,7 +153,7 @@ class Way:
 
 
 def fly_segments(track: Track, laid: np.ndarray, seq: int, way: Way, ahead: np.ndarray) -> np.ndarray:
-    """Fly laid segments ahead from the end of the track, item `seq` in force; times `ahead` (k,) [s], path (k, 3) [m]."""
+    """Fly laid segments ahead from the end of the track with item `seq` in force; give the path, (k, 3) [m]."""
     segments = paced(laid, way.limit)
     stops = (segments[:, copter.HOLD] > 0) & np.isfinite(segments[:, copter.HOLD])
     segments[stops, copter.HOLD] += way.rotor.pause
