@@ -224,6 +224,8 @@ def _messages(rng: np.random.Generator, flown: tuple, onboard: tuple, attitude: 
             kinds["attitude"] = rows([t[k]], turned[None])
         if j % 5 == 0:
             kinds["leg"] = rows([t[k]], [[float(seq[k])]])
-            out.append(Status(uav=7, t=t[k], mode="AUTO", armed=True, autopilot="ardupilot", vehicle="multirotor"))
+            out.append(
+                Status(uav=7, t=float(t[k]), mode="AUTO", armed=True, autopilot="ardupilot", vehicle="multirotor")
+            )
         out.append(Sample(uav=7, t=float(t[k]), **kinds))
     return out
