@@ -254,7 +254,14 @@ class Prediction(Message, frozen=True, kw_only=True):
     topic: ClassVar[str] = "prediction"
 
     state: State
-    method: Annotated[str, Meta(description="paper (closed loop on the mission) or imm (no route: turn rate only)")]
+    method: Annotated[
+        str,
+        Meta(
+            description="paper (identified model and controller twin in closed loop on the mission), "
+            "copter (on rotors: the route at limited speed, acceleration and jerk behind a lag, or holding its place), "
+            "greybox (fixed wing without a model: L1 guidance and lags on the route) or imm (no route: turn rate only)"
+        ),
+    ]
     law: Annotated[str, Meta(description="controller twin in force, e.g. arduplane: L1 + TECS")] = ""
     origin: Annotated[tuple[int, int, int], Meta(description="NED origin: lat, lon [1e-7 deg], alt [mm AMSL]")]
     ahead: Annotated[Array, Meta(description="look-ahead from `t`, (n,) <f4 [s]")]

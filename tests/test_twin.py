@@ -37,9 +37,12 @@ def test_everything_it_publishes_is_encodable_and_finite(flown):
     assert len(published(flown[1])) == len(flown[1]) > 80
 
 
-def test_before_a_model_it_guesses_by_turn_rate_and_says_why(flown):
+def test_before_a_model_it_flies_the_route_by_lags_and_says_why(flown):
     early = [p for p in predictions(flown[1]) if p.t < f.T0 + 25.0]
-    assert early and all(p.method == "imm" and p.state is State.IDENTIFYING for p in early)
+    guessed, greyed = ([p for p in early if p.method == method] for method in ("imm", "greybox"))
+    assert len(guessed) + len(greyed) == len(early) and len(greyed) > 10
+    assert all(p.t < f.T0 + 8.0 and "5 s are needed" in p.sentence for p in guessed)
+    assert all(p.state is State.PREDICTING and "L1" in p.law and p.seq >= 1 for p in greyed)
     assert all("30 s are needed" in p.sentence for p in early)
 
 
@@ -158,8 +161,9 @@ def test_what_has_no_wings_is_not_given_any(heard):
         twin, [msgspec.structs.replace(m, vehicle="multirotor") if isinstance(m, Status) else m for m in heard]
     )
     assert not [r for r in results if isinstance(r, Model)] and twin.axes is None
-    assert {p.method for p in predictions(results)} == {"imm"}
-    assert "multirotor is not modelled" in predictions(results)[-1].sentence
+    assert {p.method for p in predictions(results)} == {"copter"}
+    assert "multirotor has no wings to identify" in twin.verdict.sentence
+    assert "kinematic twin" in predictions(results)[-1].sentence
 
 
 def test_an_autopilot_flown_by_a_law_that_is_not_its_own_is_said(twin):

@@ -192,10 +192,10 @@ def test_garbage_of_one_does_not_stop_the_others(bus, worker):
 def test_a_failure_of_one_is_counted_said_and_stays_its_own(bus, worker, monkeypatch):
     advance = live.advance
 
-    def fragile(twin, messages, now):
+    def fragile(twin, *told):
         if twin.uav == 2:
             raise RuntimeError("a defect")
-        return advance(twin, messages, now)
+        return advance(twin, *told)
 
     monkeypatch.setattr(live, "advance", fragile)
     made = told(bus, Prediction)

@@ -59,7 +59,7 @@ class History:
             return np.empty(0), np.empty((0, len(COLUMNS[name])))
         t = np.concatenate([chunk[0] for chunk in found])
         x = np.concatenate([chunk[1] for chunk in found]).astype(float)
-        most = _MOST_POSITION if name == "position" else _MOST
+        most = _MOST_POSITION if name in ("position", "target") else _MOST
         good = (t >= since) & (np.abs(x) < most).all(axis=1)  # nan is not
         t, x = t[good], x[good]
         if (np.diff(t) > 0).all():

@@ -19,10 +19,14 @@ QUANTILE = 0.9
 _FLOOR_S = 2.0  # least path length, as seconds of ground speed [s]
 _PRIOR = {  # expected spread of along, cross, vertical: base [m], growth [m/s^power], power
     "paper": (np.array([1.0, 0.8, 0.6]), np.array([0.5, 0.2, 0.2]), 1.3),
+    "copter": (np.array([1.0, 0.8, 0.6]), np.array([0.3, 0.1, 0.1]), 1.1),
+    "greybox": (np.array([1.5, 1.0, 1.0]), np.array([0.5, 0.3, 0.2]), 1.3),
     "imm": (np.array([2.0, 2.0, 1.0]), np.array([1.6, 1.6, 0.5]), 1.4),
 }
-_PRIOR_PASSAGES = {  # stand in for past times to 10 %; drawn from 541 predictions of two simulated fleets [s]
+_PRIOR_PASSAGES = {  # stand in for past times to 10 %; drawn from 541 (copter 190, greybox 260) predictions [s]
     "paper": (8.0, 30.0, 60.0),
+    "copter": (1.0, 30.0, 60.0),
+    "greybox": (8.0, 60.0, 60.0),
     "imm": (1.0, 2.0, 5.0),
 }
 _PRIOR_WEIGHT = 6.0  # past predictions the prior counts as [-]
@@ -39,7 +43,7 @@ class Made:
     method: str
     path: np.ndarray  # NED, (61, 3) [m]
     tube: np.ndarray  # half-axes, (61, 3) [m]
-    speed: float  # ground speed at t [m/s]
+    speed: float  # over ground at t, climb included [m/s]
 
 
 def track_frame(path: np.ndarray) -> np.ndarray:
@@ -83,6 +87,7 @@ class Record:
     waiting: list[Made] = field(default_factory=list)
     errors: dict[str, deque[np.ndarray]] = field(default_factory=dict)  # along, cross, vertical, (61, 3) [m]
     passages: dict[str, deque[tuple[float, bool]]] = field(default_factory=dict)  # time to 10 % [s], censored
+    scored: dict[str, int] = field(default_factory=dict)  # predictions answered so far, by method
     inside: deque[float] = field(default_factory=lambda: deque(maxlen=_KEEP))
 
     def keep(self, made: Made) -> None:
@@ -119,6 +124,7 @@ class Record:
         error = axes_error(made.path, flown)
         self.inside.append(float((error[1:, :3] <= made.tube[1:]).all(axis=1).mean()))
         passage = first_passage(error[:, 3] / path_length(flown, made.speed))
+        self.scored[made.method] = self.scored.get(made.method, 0) + 1
         self.passages.setdefault(made.method, deque(maxlen=_KEEP)).append(passage)
         self.errors.setdefault(made.method, deque(maxlen=_KEEP)).append(error[:, :3])
 

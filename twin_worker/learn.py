@@ -6,6 +6,9 @@ import numpy as np
 from fleet.contract import Message, Model, Outcome, State, Verdict
 from fleet.window import Window
 from twin_worker.identify import AXES, Axis, identify_axis
+from twin_worker.kinds import NO_WINGS, QUADPLANE, compare_with_flight
+from twin_worker.lacking import lacking
+from twin_worker.lift import SETTLE_S, lifted
 from twin_worker.memory import Believed, Twin
 from twin_worker.predict import fly_ahead
 from twin_worker.preprocess import DT
@@ -13,7 +16,6 @@ from twin_worker.verify import verify
 
 LEAST_S = 30.0  # shortest stretch worth identifying [s]
 WINDOW_S = 140.0  # longest stretch used [s]
-NO_WINGS = ("multirotor", "helicopter")
 SLOW = 6.0  # air-relative forward speed below which nothing flies on its wings [m/s]
 _FREE_RUN_S = (2.0, 4.0, 2.0, 8.0)  # free-run length of the n-th try [s]
 _KEEP = 4  # verified models kept to choose from
@@ -23,7 +25,8 @@ _SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the window the n-th try uses
 
 def learn(twin: Twin) -> list[Message]:
     """Identify and verify once; give the model with its verdict, or nothing while data are starved."""
-    window = _airborne(twin.window(WINDOW_S))
+    compare_with_flight(twin)
+    window = _on_wings(twin, twin.window(WINDOW_S))
     why_not = _why_not(twin, window)
     if window is None or why_not is not None:
         if twin.axes is None and why_not is not None:
@@ -48,12 +51,14 @@ def learn(twin: Twin) -> list[Message]:
 def _why_not(twin: Twin, window: Window | None) -> Verdict | None:
     """Say why there is nothing to identify yet; None where there is."""
     if twin.vehicle in NO_WINGS:
-        sentence = f"{twin.name}: a {twin.vehicle} is not modelled yet, turn rate only"
+        sentence = f"{twin.name}: a {twin.vehicle} has no wings to identify; {twin.rotor}"
         return Verdict(outcome=Outcome.NOT_IDENTIFIABLE, sentence=sentence)
     have = 0.0 if window is None else float(window.ok.sum() * DT)
     if window is not None and have >= LEAST_S:
         return None
-    sentence = f"{twin.name}: {have:.0f} s of whole data, {LEAST_S:.0f} s are needed; {_missing(twin)}"
+    where = " on its wings" if twin.vehicle == QUADPLANE else ""
+    missing = lacking(twin.history) or "wait"
+    sentence = f"{twin.name}: {have:.0f} s of whole data{where}, {LEAST_S:.0f} s are needed; {missing}"
     return Verdict(outcome=Outcome.STARVED, sentence=sentence)
 
 
@@ -104,20 +109,22 @@ def _hindcast(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Axis]) 
     return float(np.linalg.norm(flown.path - window.p[rows], axis=1).mean())
 
 
-def _airborne(window: Window | None) -> Window | None:
-    """Keep what was flown: from the last row that was too slow to fly."""
+def _on_wings(twin: Twin, window: Window | None) -> Window | None:
+    """Keep what was flown on wings: from the last row that was too slow for them or hung on rotors."""
     if window is None:
         return None
-    slow = np.flatnonzero(window.ok & (window.columns(("u",))[:, 0] < SLOW))
-    start = int(slow[-1]) + 1 if len(slow) else 0
+    slow = window.ok & (window.columns(("u",))[:, 0] < SLOW)
+    start = _after(slow, 0)
+    if twin.vehicle == QUADPLANE:
+        hung = lifted(window.t, twin.history, twin.params.values if twin.params else {}, twin.modes)
+        start = max(start, _after(slow | hung, int(SETTLE_S / DT)))
     return window.part(start, len(window)) if len(window) - start > 1 else None
 
 
-def _missing(twin: Twin) -> str:
-    """Say which kinds of row have not come at all."""
-    needed = ("attitude", "velocity", "position", "servo", "air")
-    none = [kind for kind in needed if not len(twin.history.rows(kind)[0])]
-    return f"no {', '.join(none)} rows yet" if none else "wait"
+def _after(those: np.ndarray, more: int) -> int:
+    """Give the row after the last of those, and so many more; the first where there are none."""
+    found = np.flatnonzero(those)
+    return int(found[-1]) + 1 + more if len(found) else 0
 
 
 def _model(twin: Twin, verdict: Verdict, window: Window) -> Model:

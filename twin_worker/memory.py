@@ -1,5 +1,6 @@
 """What one twin remembers: the telemetry, the model in force, how past predictions fared; and how it listens."""
 
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,11 +10,13 @@ from fleet.autopilots import arduplane
 from fleet.contract import Message, Mission, Model, Outcome, Params, Prediction, Sample, State, Status, Verdict
 from fleet.frames import Origin
 from fleet.window import Window
+from twin_worker.greybox import Grey
 from twin_worker.history import History
 from twin_worker.horizon import Record
 from twin_worker.identify import Axis
 from twin_worker.predict import Onboard, Situation
 from twin_worker.preprocess import preprocess
+from twin_worker.rotor import Rotor
 from twin_worker.verify import OMEGA
 from twin_worker.wind import WindFilter
 
@@ -24,6 +27,7 @@ def _unheard() -> Verdict:
     return Verdict(outcome=Outcome.STARVED, sentence="no samples yet")
 
 
+_MODES = 64  # changes of mode remembered
 _NEWS = 0.3  # weight of the newest flight in a model's miss [-]
 
 
@@ -62,6 +66,9 @@ class Twin:
     history: History = field(default_factory=History)
     wind: WindFilter = field(default_factory=WindFilter)
     record: Record = field(default_factory=Record)
+    rotor: Rotor = field(default_factory=Rotor)
+    grey: Grey = field(default_factory=Grey)
+    modes: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=_MODES))  # changes, (when, name)
     origin: Origin | None = None
     status: Status | None = None
     mission: Mission | None = None
@@ -76,6 +83,8 @@ class Twin:
     state: State = State.WAITING
     tries: int = 0
     since: float = -np.inf  # last change of mode, mission or parameters
+    data_t: float = -np.inf  # newest time in any message
+    turned_t: float = -np.inf  # data time of the last turn of the loop
     wind_t: float = -np.inf
     identify_t: float = -np.inf
     predict_t: float = -np.inf
@@ -117,9 +126,9 @@ class Twin:
         """Say why the aircraft follows no mission now; empty where it does."""
         mode = self.status.mode if self.status else ""
         if mode not in ROUTE_MODES:
-            return f"mode {mode or 'unknown'} follows no mission: turn rate only"
+            return f"mode {mode or 'unknown'} follows no mission"
         if self.mission is None or not self.mission.items:
-            return "no mission on board: turn rate only"
+            return "no mission on board"
         return ""
 
 
@@ -157,11 +166,14 @@ def _control_changed(before: Params, after: Params) -> bool:
 def _hear_status(twin: Twin, status: Status) -> None:
     before = twin.status
     twin.status = status
+    if before is None or status.mode != before.mode:
+        twin.modes.append((status.t, status.mode))
     if before is None:
         return
     if status.clock_jumps != before.clock_jumps:
         twin.history.clear()
         twin.wind.t = twin.wind_t = twin.identify_t = twin.score_t = -np.inf  # the new time may lie before
+        twin.data_t = twin.turned_t = -np.inf
         _event(twin, status.t)
     elif status.mode != before.mode:
         _event(twin, status.t)

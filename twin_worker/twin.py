@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from fleet.contract import Alert, AlertKind, FleetRow, Link, Message, State
+from fleet.contract import Alert, AlertKind, FleetRow, Link, Message, Sample, State
 from fleet.frames import to_ned
 from twin_worker.foresee import foresee
 from twin_worker.horizon import AHEAD
@@ -14,34 +14,68 @@ from twin_worker.memory import Twin, hear
 HOP_S = 4.0  # between identifications [s]
 PREDICT_S = 1.0  # between predictions [s]
 LOST_S = 3.0  # without a sample: link lost [s]
+_TICK_S = 1.0  # between turns while data are silent, and between scorings [s]
+_SILENT_TURNS = 150  # most of them [-]
+_LATEST = 4e9  # times beyond are noise [s since 1970]
 
 
-def advance(twin: Twin, messages: Iterable[Message], now: float) -> list[Message]:
-    """Take what was heard, and identify, verify, predict and score whatever is due at data time `now`.
+def advance(twin: Twin, messages: Iterable[Message], now: float = -np.inf) -> list[Message]:
+    """Take what was heard, and identify, verify, predict and score whatever fell due meanwhile.
+
+    Data time is the newest time in any message, and deadlines are met after every single one: the answer does not
+    depend on how a driver groups them. Where the data themselves are silent the loop turns once a second.
 
     Args:
         twin: the aircraft's twin, changed in place
         messages: Sample, Status, Mission, Params in the order they were heard
-        now: data time [s since 1970]
+        now: data time by the wall clock, where data have fallen silent [s since 1970]
     Returns:
         Model, Prediction and Alert messages to publish
     """
+    results: list[Message] = []
     for message in messages:
+        heard = message.t if 0 < message.t < _LATEST else -np.inf
+        results += _through_silence(twin, heard)
         hear(twin, message)
-    if twin.origin is None or not np.isfinite(twin.history.newest):
+        if isinstance(message, Sample) or np.isfinite(twin.data_t):  # after a jump of the clock telemetry leads
+            twin.data_t = max(twin.data_t, heard)
+        results += _turn(twin, twin.data_t)
+    return results + _turn(twin, now) if now > twin.data_t else results
+
+
+def _through_silence(twin: Twin, until: float) -> list[Message]:
+    """Turn once a second up to `until`; a longer silence than any prediction is worth is leapt over."""
+    results: list[Message] = []
+    at = max(twin.data_t, twin.turned_t)
+    for _ in range(_SILENT_TURNS):
+        if not until - at > 2 * _TICK_S or not np.isfinite(at):
+            break
+        at += _TICK_S
+        results += _turn(twin, at)
+    return results
+
+
+def _turn(twin: Twin, now: float) -> list[Message]:
+    """Do whatever is due at data time `now`; it may lie before the last turn, where that ran ahead of late data."""
+    if twin.origin is None or not np.isfinite([twin.history.newest, now]).all():
         return []
+    twin.turned_t = now
     results = _watch_link(twin, now)
     _blow(twin)
-    if now - twin.score_t >= 1.0:
+    if _due(now, twin.score_t, _TICK_S):
         twin.score_t = now
         _score(twin)
-    if not twin.lost and now - twin.identify_t >= HOP_S:
+    if not twin.lost and _due(now, twin.identify_t, HOP_S):
         twin.identify_t = now
         results += learn(twin)
-    if now - twin.predict_t >= PREDICT_S:
+    if _due(now, twin.predict_t, PREDICT_S):
         twin.predict_t = now
         results += foresee(twin, now)
     return results
+
+
+def _due(now: float, last: float, period: float) -> bool:
+    return not last <= now < last + period
 
 
 def _watch_link(twin: Twin, now: float) -> list[Message]:
@@ -85,8 +119,8 @@ def _score(twin: Twin) -> None:
 
 def fleet_row(twin: Twin, now: float, **claim: object) -> FleetRow:
     """Give the aircraft's line of the fleet table; `now` is data time, `claim` names worker and epoch."""
-    t10, censored, n = twin.record.t10("paper")
     made = twin.prediction
+    t10, censored, n = twin.record.t10(made.method if made and made.method != "imm" else "paper")
     return FleetRow(
         uav=twin.uav,
         state=twin.state,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleet.autopilots import arduplane
+from fleet.autopilots import arduplane, copter, greybox
 from fleet.contract import Item
 from fleet.frames import Origin
 from fleet.mission import route
@@ -25,13 +25,19 @@ def warm_up() -> None:
     legs = route(_ITEMS, seq=1, origin=origin, params={}).legs
     n = len(window)
     euler, rates = np.ascontiguousarray(window.x[:, 6:]), np.ascontiguousarray(window.x[:, 3:6])
-    told = [np.full(n, _SPEED), np.zeros(n), np.zeros(n), window.u, np.ones(n, np.int64)]
-    rows = [window.t - window.t[0], window.p, window.v, euler, rates, *told]
+    heard = [np.full(n, _SPEED), np.zeros(n), np.zeros(n), window.u, np.ones(n, np.int64)]
+    rows = [window.t - window.t[0], window.p, window.v, euler, rates, *heard]
     ctl, _ = arduplane.shadow(par, legs, window.p[0], *rows)  # type: ignore
     state = np.concatenate([window.p[-1], window.x[-1]])
     matrices = [part for axis in axes for part in (axis.physical(), axis.means)]
     air = np.array([0.0, 0.0, 1.0, 0.0])
+    grey_ctl = ctl.copy()
     simulate(ctl, par, legs, *matrices, state, np.zeros(2), air, window.dt, np.empty((50, N_STATE)))  # type: ignore
+
+    ahead, grey = np.empty((5, 3)), np.ones(greybox.N_PAR)
+    greybox.follow(grey_ctl, par, legs, grey, np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0]), np.zeros(2), 0.1, ahead)  # type: ignore
+    segments, told = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
+    copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), told, 0.1, ahead)  # type: ignore
 
 
 def _flight(seconds: float = 20.0, dt: float = 0.04) -> Window:

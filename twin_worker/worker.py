@@ -130,18 +130,12 @@ def data_time(held: Held) -> float:
 
 
 def _advance_all(held: Held, messages: list[Message]) -> Iterator[Message]:
-    """Turn the loop once per half second of data, so that a burst meets the same deadlines as a live stream."""
-    batch: list[Message] = []
-    start = held.twin.history.newest
+    """Turn the loop after every message, as offline; the wall clock turns it on where data have fallen silent."""
     for message in messages:
-        batch.append(message)
-        if isinstance(message, Sample) and message.t - start >= 0.5:
-            yield from advance(held.twin, batch, message.t)
-            batch, start = [], message.t
+        yield from advance(held.twin, (message,))
     now = data_time(held)
-    if batch or np.isfinite(now):
-        newest = max([m.t for m in batch if isinstance(m, Sample)], default=-np.inf)
-        yield from advance(held.twin, batch, max(now, newest))
+    if now > held.twin.history.newest:
+        yield from advance(held.twin, (), now)
 
 
 def wanted(asked: dict[str, str]) -> np.ndarray | None:

@@ -1,0 +1,75 @@
+"""Any fixed wing's autopilot in the large: L1 guidance on the route, and lags in place of surfaces and loops.
+
+    phi_c from L1 (`arduplane.legs`);  phi' = (phi_c - phi) / tau_phi;  psi' = g tan(phi) / V
+    V' = (V_c - V) / tau_V;  h_dot_c = clip((h_sp - h) / tau_h, climb, sink);  h_ddot = (h_dot_c - h_dot) / tau_climb
+
+No surface, no rate loop, no airspeed sensor is needed: position and velocity are enough.
+Source: Park, Deyst & How (2004) for L1; lags as in Beard & McLain 2012, section 9.1 (autopilot design models).
+"""
+
+from math import cos, sin, sqrt, tan
+
+import numpy as np
+
+from fleet.autopilots.arduplane import legs as leg_rules
+from fleet.autopilots.arduplane.l1 import clip, to_roll
+from fleet.autopilots.arduplane.state import kernel
+from fleet.frames import G
+from fleet.mission import KIND, LAND, VA_C
+
+LAW = "greybox: L1 on the route, lags for the rest"
+
+TAU_PHI, TAU_V, TAU_H, TAU_CLIMB, CRUISE, SHARE, CLIMB, SINK = range(8)
+N_PAR = 8
+"""Lags of bank, speed, height, climb [s]; true airspeed where none is commanded [m/s]; true over commanded airspeed
+[-]; greatest climb and sink [m/s]."""
+
+
+@kernel
+def follow(
+    ctl: np.ndarray,
+    par: np.ndarray,
+    legs: np.ndarray,
+    grey: np.ndarray,
+    start: np.ndarray,
+    wind: np.ndarray,
+    dt: float,
+    out: np.ndarray,
+) -> None:
+    """Fly the route ahead.
+
+    Args:
+        ctl, par: state (changed) and parameters of ArduPlane's guidance
+        legs: route, (n, 9), see `fleet.mission`
+        grey: (N_PAR,)
+        start: p NED [m], V true airspeed [m/s], phi, psi [rad], h_dot [m/s], (7,)
+        wind: NED, where it blows to, (2,) [m/s]
+        dt: step [s]
+        out: positions, filled in, NED, (k, 3) [m]; out[0] is the start
+    """
+    p, v, euler = start[:3].copy(), np.zeros(3), np.zeros(3)
+    V, phi, psi, h_dot = start[3], start[4], start[5], start[6]
+    landed = False
+    for k in range(len(out)):
+        out[k] = p
+        if landed:
+            continue
+        level = sqrt(max(V * V - h_dot * h_dot, 1.0))
+        v[0], v[1], v[2] = level * cos(psi) + wind[0], level * sin(psi) + wind[1], -h_dot
+        euler[0], euler[2] = phi, psi
+        a_lat, over = leg_rules.steer(ctl, par, legs, p, v, euler, dt)
+        h_sp = leg_rules.height_demand(ctl, par, legs, p)
+        i = leg_rules.current(ctl, legs)
+        wanted = legs[i, VA_C] * grey[SHARE] if legs[i, VA_C] > 0.0 else grey[CRUISE]
+        phi += (to_roll(par, a_lat, 0.0) - phi) * min(dt / grey[TAU_PHI], 1.0)
+        psi += G * tan(clip(phi, -1.2, 1.2)) / max(V, 3.0) * dt
+        V += (wanted - V) * min(dt / grey[TAU_V], 1.0)
+        climb = clip((h_sp + p[2]) / grey[TAU_H], -grey[SINK], grey[CLIMB])
+        h_dot += (climb - h_dot) * min(dt / grey[TAU_CLIMB], 1.0)
+        for j in range(3):
+            p[j] += v[j] * dt
+        if int(legs[i, KIND]) == LAND:
+            along, length = leg_rules.along_line(ctl, legs[i], p)
+            landed = along >= length
+        if over and i + 1 < legs.shape[0]:
+            leg_rules.begin(ctl, par, legs, i + 1, p)

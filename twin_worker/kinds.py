@@ -1,0 +1,149 @@
+"""Which kind of twin an aircraft has now, and the route flown by those that need no identified model."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet.autopilots import copter, greybox
+from twin_worker import greybox as wing
+from twin_worker import rotor, rotor_fit
+from twin_worker.lift import SETTLE_S, lifted
+from twin_worker.memory import ROUTE_MODES, Twin
+from twin_worker.track import Track, track
+
+NO_WINGS = ("multirotor", "helicopter")
+QUADPLANE = "quadplane"
+WINGS = ("fixed_wing", QUADPLANE)
+_BACK_S = 130.0  # flight the twin's numbers come from [s]
+_SLOW = 6.0  # slower than this nothing flies on wings, whatever it is called [m/s]
+_VTOL = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
+_STEERED_S = 6.0  # a multirotor told to hold that still moves after so long is steered by hand [s]
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A flight ahead on the route, or the reason why there is none.
+
+    Attributes:
+        path: NED, (k, 3) [m]; None where this twin cannot fly
+        method, law: as in `Prediction`
+        seq: mission item it starts on, -1 none
+        sentence: what it rests on, or why there is none
+    """
+
+    path: np.ndarray | None
+    method: str
+    law: str
+    seq: int
+    sentence: str
+
+
+def nothing(sentence: str, seq: int = -1) -> Flight:
+    """Give no flight, and why."""
+    return Flight(None, "", "", seq, sentence)
+
+
+def seen(twin: Twin, seconds: float = _BACK_S) -> Track | None:
+    """Give what was flown of late, from positions and velocities alone."""
+    assert twin.origin is not None
+    return track(twin.history, twin.origin, until=twin.history.newest, seconds=seconds)
+
+
+def hangs(twin: Twin) -> bool:
+    """Tell whether the aircraft hangs on rotors now, or is about to by its mission."""
+    if twin.vehicle in NO_WINGS:
+        return True
+    if twin.vehicle != QUADPLANE:
+        return False
+    now = twin.history.newest
+    at = np.linspace(now - SETTLE_S, now, 7)
+    if lifted(at, twin.history, _params(twin), twin.modes).any():
+        return True
+    item = _items_now(twin)
+    return twin.status is not None and twin.status.mode in ROUTE_MODES and item in _VTOL
+
+
+def _items_now(twin: Twin) -> int:
+    """Give the command of the mission item in force; 0 unknown."""
+    seq = rotor.items_in_force(np.array([twin.history.newest]), twin.history.rows("leg"), twin.mission)[0]
+    items = twin.mission.items if twin.mission else ()
+    return next((item.command for item in items if item.seq == seq), 0)
+
+
+def _params(twin: Twin) -> dict[str, float]:
+    return twin.params.values if twin.params else {}
+
+
+def _board(twin: Twin, flown: Track) -> rotor.Onboard:
+    params, autopilot = _params(twin), twin.status.autopilot if twin.status else ""
+    prefix = "Q_" if twin.vehicle == QUADPLANE else ""
+    board = rotor.onboard(twin.mission, params, autopilot, twin.since, origin=twin.origin, flown=flown, prefix=prefix)
+    return rotor.with_wings(board) if prefix else board
+
+
+def _wing_board(twin: Twin) -> wing.Board:
+    assert twin.origin is not None
+    items = twin.mission.items if twin.mission else ()
+    wind = twin.wind.wind if np.isfinite(twin.wind.t) else None
+    return wing.Board(items, _params(twin), twin.since, twin.origin, wind)
+
+
+def compare_with_flight(twin: Twin) -> None:
+    """Let the twins that need no identified model learn their few numbers from the last minute."""
+    if twin.why_no_route() or (twin.vehicle not in NO_WINGS and (twin.vehicle not in WINGS or twin.axes is not None)):
+        return
+    flown = seen(twin)
+    if flown is None or len(flown) < 100:
+        return
+    seq = rotor.items_in_force(flown.t, twin.history.rows("leg"), twin.mission)
+    if twin.vehicle in NO_WINGS:
+        twin.rotor = rotor_fit.compare(flown, seq, _board(twin, flown), twin.rotor)
+    elif not hangs(twin):
+        twin.grey = wing.compare(flown, seq, _wing_board(twin), twin.grey)
+
+
+def fly_kind(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
+    """Fly the route ahead as this kind of aircraft does, without an identified model."""
+    whole = flown.whole()
+    if len(whole) < 20:
+        return nothing("less than 2 s of unbroken positions")
+    if hangs(twin):
+        return _fly_rotor(twin, whole, ahead)
+    if twin.vehicle not in WINGS:
+        return nothing(f"vehicle {twin.vehicle}: no law known to fly it by")
+    if why := twin.why_no_route():
+        return nothing(why)
+    if twin.vehicle == QUADPLANE:
+        hung = np.flatnonzero(lifted(whole.t, twin.history, _params(twin), twin.modes))
+        whole = whole.part(int(hung[-1]) + 1 if len(hung) else 0, len(whole))
+    seq = rotor.items_in_force(whole.t, twin.history.rows("leg"), twin.mission)
+    made = wing.fly(whole, seq, _wing_board(twin), twin.grey, ahead)
+    if made.path is None:
+        return nothing(made.sentence, made.seq)
+    return Flight(made.path, "greybox", greybox.LAW, made.seq, f"{wing.said(twin.grey)}. {made.sentence}".strip(". "))
+
+
+def _fly_rotor(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
+    mode = twin.status.mode if twin.status else ""
+    board = _board(twin, flown)
+    if twin.status is None or not twin.status.armed:
+        return nothing("it is not armed")
+    if mode in rotor.HOLD_MODES:
+        if twin.history.newest - twin.since > _STEERED_S and np.linalg.norm(flown.v[-20:].mean(axis=0)) > 1.0:
+            return nothing(f"mode {mode}, but it is steered by hand")
+        still = rotor.hold_still(flown, board, twin.rotor, ahead)
+        return Flight(still, "copter", copter.LAW, -1, f"mode {mode} holds its place")
+    if mode in rotor.RETURN_MODES and twin.vehicle in NO_WINGS:
+        path = rotor.fly_home(flown, board, twin.rotor, ahead)
+        said = f"returns to launch; {rotor.said(board, twin.rotor)}"
+        return Flight(path, "copter", copter.LAW, -1, said) if path is not None else nothing("home is not known")
+    if why := twin.why_no_route():
+        return nothing(why)
+    seq = rotor.items_in_force(flown.t, twin.history.rows("leg"), twin.mission)
+    if not np.isfinite(seq[-1]):
+        return nothing("the mission item in force is not reported (MISSION_CURRENT)")
+    path = rotor.fly_route(flown, seq, board, twin.rotor, ahead)
+    if path is None:
+        return nothing("the mission has nothing to fly", int(seq[-1]))
+    hung = "it hangs on its rotors; " if twin.vehicle == QUADPLANE else ""
+    return Flight(path, "copter", copter.LAW, int(seq[-1]), hung + rotor.said(board, twin.rotor))
