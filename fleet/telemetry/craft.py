@@ -62,23 +62,29 @@ class Craft:
         self._told: tuple[Any, ...] = ()
         self._told_at = float("-inf")
 
-    def note(self, arrival: np.ndarray, names: Sequence[str], seq: np.ndarray) -> None:
+    def note(self, arrival: np.ndarray, names: Sequence[str], seq: np.ndarray | None = None) -> None:
         """Take note that messages came, to count them.
 
         Args:
             arrival: fleet times, never falling, (n,) [s since 1970]
             names: of the messages
-            seq: their sequence numbers, (n,)
+            seq: their sequence numbers, (n,); None where there are none, so that none can be missed
         """
-        before = seq[:1] - 1 if self._seq is None else np.array([self._seq])
-        gaps = (np.diff(seq, prepend=before) - 1) & 0xFF
-        gaps[gaps >= 128] = 0  # a late message, not a loss
-        missed = np.cumsum(gaps) + (self._missed_by[-1] if self._missed_by else self._missed)
         done = self._measured
         self._arrivals, self._names = self._arrivals[done:] + arrival.tolist(), self._names[done:] + list(names)
-        self._missed_by = self._missed_by[done:] + missed.tolist()
+        self._missed_by = self._missed_by[done:] + self._gaps(seq, len(arrival)).tolist()
         self._counted, self._measured = self._counted - done, 0
-        self._seq, self.heard = int(seq[-1]), float(arrival[-1])
+        self.heard = float(arrival[-1])
+
+    def _gaps(self, seq: np.ndarray | None, n: int) -> np.ndarray:
+        """Count the messages missed up to each one, (n,)."""
+        before = self._missed_by[-1] if self._missed_by else self._missed
+        if seq is None:
+            return np.full(n, before)
+        gaps = (np.diff(seq, prepend=seq[:1] - 1 if self._seq is None else self._seq) - 1) & 0xFF
+        gaps[gaps >= 128] = 0  # a late message, not a loss
+        self._seq = int(seq[-1])
+        return np.cumsum(gaps) + before
 
     def lay(self, laid: Laid) -> None:
         """Take rows: give them their time, put them in order."""

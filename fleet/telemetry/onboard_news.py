@@ -9,6 +9,7 @@ from fleet.telemetry.intake import News
 from fleet.telemetry.onboard_log import Chunk, OnboardLog
 from fleet.telemetry.steps import Steps
 
+LEG_S = 1.0  # between two reports of the mission item in force [s]
 UNDATED_S = 946_684_800.0  # 2000-01-01, where a log never heard of the date [s since 1970]
 
 
@@ -24,12 +25,39 @@ def log_steps(log: OnboardLog, craft: Craft) -> Iterator[tuple[float, list[News]
     epoch_s = UNDATED_S if log.epoch_s is None else log.epoch_s
     steps = Steps(craft.take)
     newest: dict[str, float] = {}
+    leg: np.ndarray | None = None  # the mission item in force, (1,)
     for chunk in log.chunks():
+        chunk, leg = _leg_said_again(chunk, leg)
         times = [said.t for said in chunk.said] + [edge for t, _ in chunk.rows.values() for edge in t]
         if times:
             _digest(chunk, craft, epoch_s, newest)
             yield from steps.upto(np.sort(np.array(times)) + epoch_s)
     yield from steps.last()
+
+
+def _leg_said_again(chunk: Chunk, leg: np.ndarray | None) -> tuple[Chunk, np.ndarray | None]:
+    """Say once a second which item is in force, as an aircraft does; a log tells it only when it changes.
+
+    Args:
+        chunk: a stretch of a log
+        leg: in force before it, (1,); None before any was told
+    Returns:
+        the stretch with `leg` rows filled in, what is in force at its end
+    """
+    t, x = chunk.rows.get("leg", (np.empty(0), np.empty((0, 1))))
+    edges = [edge for times, _ in chunk.rows.values() for edge in times[[0, -1]]]
+    if not edges or (leg is None and not len(t)):
+        return chunk, leg
+    often = np.arange(np.ceil(min(edges)), max(edges), LEG_S)
+    known = np.searchsorted(t, often, side="right")
+    held = x[np.clip(known - 1, 0, None)] if len(t) else np.tile(leg, (len(often), 1))  # type: ignore[arg-type]
+    if len(t) and leg is not None:
+        held = np.where(known[:, None] > 0, held, leg)
+    told = slice(None) if leg is not None else known > 0
+    all_t, all_x = np.concatenate([t, often[told]]), np.concatenate([x, held[told]])
+    all_t, first = np.unique(all_t, return_index=True)
+    rows = chunk.rows | {"leg": (all_t, all_x[first])}
+    return chunk._replace(rows=rows), all_x[first][-1] if len(all_t) else leg
 
 
 def _digest(chunk: Chunk, craft: Craft, epoch_s: float, newest: dict[str, float]) -> None:
@@ -53,4 +81,4 @@ def _note(chunk: Chunk, craft: Craft, epoch_s: float) -> None:
     if len(arrival):
         names = np.repeat(np.array(list(times)), [len(t) for t in times.values()])
         order = np.argsort(arrival, kind="stable")
-        craft.note(arrival[order] + epoch_s, names[order].tolist(), np.arange(len(arrival)) + 1 & 0xFF)
+        craft.note(arrival[order] + epoch_s, names[order].tolist())
