@@ -1,0 +1,28 @@
+"""Servos and engine: first-order lags between what is commanded and what acts.
+
+    delta' = (delta_c - delta) / tau
+"""
+
+import numba as nb
+import numpy as np
+
+TAU = np.array([0.05, 0.05, 0.05, 0.25])  # delta_a delta_e delta_r delta_t of a small aircraft [s]
+
+
+@nb.njit(cache=True)
+def lagged(commands: np.ndarray, dt: float, tau: np.ndarray) -> np.ndarray:
+    """Give what acts on average in each interval, (n, 4), from the commands at its start, (n, 4).
+
+    Args:
+        commands: delta_a delta_e delta_r delta_t, held over each interval [-]
+        dt: sample time [s]
+        tau: time constants, (4,) [s]
+    """
+    share = 1.0 - np.exp(-dt / tau)
+    out, now = np.empty_like(commands), commands[0].copy()
+    for k in range(len(commands)):
+        for i in range(4):
+            step = share[i] * (commands[k, i] - now[i])
+            out[k, i] = now[i] + 0.5 * step
+            now[i] += step
+    return out

@@ -1,0 +1,159 @@
+"""Rigid body over a flat earth: kinematics and gravity exact, aerodynamics from THE wrench, in a steady wind.
+
+    u' = r v - q w - g sin(theta) + X            phi'   = p + (q sin(phi) + r cos(phi)) tan(theta)
+    v' = p w - r u + g cos(theta) sin(phi) + Y   theta' = q cos(phi) - r sin(phi)
+    w' = q u - p v + g cos(theta) cos(phi) + Z   psi'   = (q sin(phi) + r cos(phi)) / cos(theta)
+    p' = L   q' = M   r' = N                     (u v w over the ground; the wrench sees them less the wind)
+
+State x = u v w p q r phi theta psi as in `fleet.window`; delta = delta_a delta_e delta_r delta_t.
+
+Source: Beard & McLain 2012, eq. 3.14-3.17; products of inertia and gyroscopic terms are left to the derivatives.
+"""
+
+from math import cos, sin
+
+import numba as nb
+import numpy as np
+
+from fleet.frames import G
+from fleet.physics.wrench import WIND, slopes, terms, wrench
+
+N_X = 9
+STEEP = 1.5  # pitch beyond is not integrated: cos(theta) is kept from zero [rad]
+LOST = 1e4  # a state beyond has left every envelope
+
+
+@nb.njit(cache=True, fastmath=True)
+def rates_of_change(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, out: np.ndarray) -> None:
+    """Fill in x', (9,)."""
+    u, v, w, p, q, r = x[0], x[1], x[2], x[3], x[4], x[5]
+    phi, theta, psi = x[6], min(max(x[7], -STEEP), STEEP), x[8]
+    cf, sf, ct, st, cp, sp = cos(phi), sin(phi), cos(theta), sin(theta), cos(psi), sin(psi)
+    ahead, right = cp * par[WIND] + sp * par[WIND + 1], cp * par[WIND + 1] - sp * par[WIND]
+    u_a, v_a, w_a = u - ct * ahead, v - sf * st * ahead - cf * right, w - cf * st * ahead + sf * right
+    X, Y, Z, L, M, N = wrench(par, u_a, v_a, w_a, p, q, r, delta, at)
+    out[0] = r * v - q * w - G * st + X
+    out[1] = p * w - r * u + G * ct * sf + Y
+    out[2] = q * u - p * v + G * ct * cf + Z
+    out[3], out[4], out[5] = L, M, N
+    turn = (q * sf + r * cf) / ct
+    out[6] = p + turn * st
+    out[7] = q * cf - r * sf
+    out[8] = turn
+
+
+@nb.njit(cache=True, fastmath=True)
+def step(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, dt: float, work: np.ndarray) -> None:
+    """Advance x by dt with delta held: Runge-Kutta of order four.
+
+    Args:
+        x: state, changed in place, (9,)
+        delta: inputs as they act, (4,)
+        par: parameters, (37,)
+        at: U0, W0, (2,) [m/s]
+        dt: step [s]
+        work: scratch, (3, 9)
+    """
+    k, total, trial = work[0], work[1], work[2]
+    rates_of_change(x, delta, par, at, k)
+    for i in range(N_X):
+        total[i] = k[i]
+        trial[i] = x[i] + 0.5 * dt * k[i]
+    for ahead in (0.5, 1.0):
+        rates_of_change(trial, delta, par, at, k)
+        for i in range(N_X):
+            total[i] += 2.0 * k[i]
+            trial[i] = x[i] + ahead * dt * k[i]
+    rates_of_change(trial, delta, par, at, k)
+    for i in range(N_X):
+        x[i] += dt / 6.0 * (total[i] + k[i])
+
+
+@nb.njit(cache=True)
+def free_run(x0: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, dt: float, out: np.ndarray) -> bool:
+    """Fly from x0 with recorded inputs; out[0] = x0. Rows after it left every envelope are nan.
+
+    Args:
+        x0: state, (9,)
+        delta: inputs as they act in each interval, (n, 4)
+        par, at: as in `step`
+        dt: sample time [s]
+        out: states, filled in, (n, 9)
+    Returns:
+        whether it stayed inside
+    """
+    x, work = x0.copy(), np.empty((3, N_X))
+    for k in range(len(out)):
+        if not np.abs(x).max() < LOST:
+            out[k:] = np.nan
+            return False
+        out[k] = x
+        step(x, delta[k], par, at, dt, work)
+    return True
+
+
+@nb.njit(cache=True, fastmath=True)
+def jacobian(
+    x: np.ndarray,
+    delta: np.ndarray,
+    par: np.ndarray,
+    at: np.ndarray,
+    F: np.ndarray,
+    by_wind: np.ndarray,
+    term: np.ndarray,
+) -> None:
+    """Fill in F = d x' / d x (9, 9), d x' / d (w_n, w_e) (9, 2), and the terms of the derivatives (35,)."""
+    u, v, w, p, q, r, phi, psi = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[8]
+    theta = min(max(x[7], -STEEP), STEEP)
+    cf, sf, ct, st, cp, sp = cos(phi), sin(phi), cos(theta), sin(theta), cos(psi), sin(psi)
+    w_n, w_e = par[WIND], par[WIND + 1]
+    R = np.array(  # NED to body, its first two columns
+        (
+            (ct * cp, ct * sp),
+            (sf * st * cp - cf * sp, sf * st * sp + cf * cp),
+            (cf * st * cp + sf * sp, cf * st * sp - sf * cp),
+        )
+    )
+    wu, wv, ww = R[0, 0] * w_n + R[0, 1] * w_e, R[1, 0] * w_n + R[1, 1] * w_e, R[2, 0] * w_n + R[2, 1] * w_e
+    along, across = cp * w_n + sp * w_e, -sp * w_n + cp * w_e
+    terms(u - wu, v - wv, w - ww, x[3:6], delta, at, term)
+    by_air, by_rate = np.empty((6, 3)), np.empty((6, 3))
+    slopes(par, np.array((u - wu, v - wv, w - ww)), x[3:6], delta, at, by_air, by_rate)
+    turn = np.array(  # d(u_a v_a w_a) / d(phi theta psi): minus the turned wind
+        (
+            (0.0, st * along, -ct * across),
+            (-ww, -sf * ct * along, -(sf * st * across - cf * along)),
+            (wv, -cf * ct * along, -(cf * st * across + sf * along)),
+        )
+    )
+    F[:] = 0.0
+    for i in range(6):
+        for j in range(3):
+            F[i, j] = by_air[i, j]
+            F[i, 3 + j] = by_rate[i, j]
+            F[i, 6 + j] = by_air[i, 0] * turn[0, j] + by_air[i, 1] * turn[1, j] + by_air[i, 2] * turn[2, j]
+        for j in range(2):
+            by_wind[i, j] = -(by_air[i, 0] * R[0, j] + by_air[i, 1] * R[1, j] + by_air[i, 2] * R[2, j])
+    by_wind[6:] = 0.0
+    F[0, 1] += r
+    F[0, 2] -= q
+    F[0, 4] -= w
+    F[0, 5] += v
+    F[1, 0] -= r
+    F[1, 2] += p
+    F[1, 3] += w
+    F[1, 5] -= u
+    F[2, 0] += q
+    F[2, 1] -= p
+    F[2, 3] -= v
+    F[2, 4] += u
+    F[0, 7] -= G * ct
+    F[1, 6] += G * ct * cf
+    F[1, 7] -= G * st * sf
+    F[2, 6] -= G * ct * sf
+    F[2, 7] -= G * st * cf
+    spin, pull = q * sf + r * cf, q * cf - r * sf
+    tan, sec = st / ct, 1.0 / ct
+    F[6, 3], F[6, 4], F[6, 5], F[6, 6], F[6, 7] = 1.0, sf * tan, cf * tan, pull * tan, spin * sec * sec
+    F[7, 4], F[7, 5], F[7, 6] = cf, -sf, -spin
+    F[8, 4], F[8, 5], F[8, 6], F[8, 7] = sf * sec, cf * sec, pull * sec, spin * tan * sec

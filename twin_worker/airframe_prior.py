@@ -1,0 +1,70 @@
+"""What is held of an aircraft's derivatives before it has flown: its airframe's, or a class's, and how firmly.
+
+Classes are scaled so that lift carries weight at the speed flown: with k = V / U0 and l = b / span of the aircraft,
+forces per velocity grow with k, moments per deflection with l, per rate with k, per velocity with k l.
+"""
+
+from math import cos
+
+import numpy as np
+
+from fleet.airframes import Airframe, derivatives
+from fleet.frames import G
+from fleet.physics.wrench import NAMES, OFFSETS
+
+_FLOOR = {  # doubt beyond a share of the derivative itself, times the airframe's own `doubt`
+    **{"X_0": 2.0, "X_u": 0.3, "X_w": 0.3, "X_de": 1.2, "X_dt": 1.0, "X_ww": 0.05},
+    **{"Z_0": 3.0, "Z_u": 0.3, "Z_w": 0.3, "Z_q": 0.3, "Z_de": 1.0},
+    **{"M_0": 3.0, "M_u": 0.05, "M_w": 0.01, "M_q": 0.1, "M_de": 0.1, "M_dt": 1.0},
+    **{"Y_v": 0.05, "Y_p": 0.3, "Y_r": 0.3, "Y_da": 0.4, "Y_dr": 0.4, "Y_0": 0.5},
+    **{"L_v": 0.01, "L_p": 0.1, "L_r": 0.1, "L_da": 0.1, "L_dr": 0.1, "L_0": 2.0},
+    **{"N_v": 0.01, "N_p": 0.1, "N_r": 0.1, "N_da": 0.1, "N_dr": 0.1, "N_0": 0.5},
+}
+_ACROSS = {"L_r": ("L_p", 0.3), "N_p": ("L_p", 0.3), "L_dr": ("L_da", 0.1), "N_da": ("L_da", 0.1)}
+_WIND = 2.0  # doubt of a wind that telemetry was asked for [m/s]
+_SPANS = 0.3, 20.0  # believable [m]
+
+
+def prior(
+    airframe: Airframe, at: np.ndarray, trim: np.ndarray, wind: np.ndarray, span: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give mean and standard deviation of the parameters of `fleet.physics.wrench`, each (37,).
+
+    Args:
+        airframe: what is known of the aircraft, or a class
+        at: U0, W0, mean air-relative velocity forward and down, (2,) [m/s]
+        trim: mean inputs delta_a delta_e delta_r delta_t, (4,)
+        wind: mean wind, NED, the direction it blows to, (2,) or (3,) [m/s]
+        span: of the aircraft at hand, for a class; None: as its speed suggests [m]
+    """
+    mean = dict.fromkeys(NAMES, 0.0)
+    floor = dict(_FLOOR)
+    if airframe.scale:
+        k = airframe.value["speed"] / at[0]
+        l = airframe.value["b"] / float(np.clip(span, *_SPANS)) if span else k
+        mean |= {n: v * _scale(n, k, l) for n, v in derivatives(airframe, airframe.value["speed"]).items()}
+        floor |= {n: _FLOOR[n] * l for n in ("M_0", "M_dt", "L_0", "N_0")}
+    else:
+        mean |= derivatives(airframe, float(at[0]))
+    mean["X_0"] = G * at[1] / at[0] - mean["X_dt"] * trim[3] - mean["X_de"] * trim[1]
+    mean["Z_0"] = -G * cos(at[1] / at[0]) - mean["Z_de"] * trim[1]
+    mean["M_0"] = -mean["M_de"] * trim[1] - mean["M_dt"] * trim[3]
+    for name, (of, share) in _ACROSS.items():
+        floor[name] += share * abs(mean[of])
+    par = np.array([mean[name] for name in NAMES])
+    known = np.abs(par)
+    known[list(OFFSETS)] = 0.0
+    sigma = airframe.value["doubt"] * (known + [floor.get(name, 0.0) for name in NAMES])
+    par[-2:], sigma[-2:] = wind[:2], _WIND
+    return par, sigma
+
+
+def _scale(name: str, k: float, l: float) -> float:
+    """Give the factor from the class's speed and span to the aircraft's."""
+    force, per = name[0] in "XYZ", name[2:]
+    if per in ("q", "p", "r"):
+        return k * k / l if force else k
+    if per == "ww":
+        return k * k
+    power = k if per in ("u", "v", "w") else 1.0
+    return power if force else power * l

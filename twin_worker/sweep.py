@@ -1,0 +1,131 @@
+"""One pass over a window: residuals of free runs and their sensitivities, segment by segment.
+
+    S' = F S + d x' / d par,  S = d x / d(par, x0):  over a group of samples F is held,
+    S <- Phi S + Gamma d x' / d par,  Phi = exp(F h),  Gamma = integral of it
+
+Residuals are taken once a group: gusts colour them, so that neighbours say the same.
+
+Source: Jategaonkar 2015, section 4.6 (output error, sensitivity equations); exact for F held.
+"""
+
+import numba as nb
+import numpy as np
+
+from fleet.physics.dynamics import LOST, N_X, jacobian, step
+from fleet.physics.wrench import N_AERO, N_PAR, ROW, WIND
+
+GROUP = 4  # samples a residual; 2 ** DOUBLINGS
+_DOUBLINGS = 2
+N_COLUMN = N_PAR + N_X
+
+
+@nb.njit(cache=True, fastmath=True)
+def _times(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+    for i in range(N_X):
+        for j in range(N_X):
+            out[i, j] = 0.0
+        for k in range(N_X):
+            for j in range(N_X):
+                out[i, j] += a[i, k] * b[k, j]
+
+
+@nb.njit(cache=True, fastmath=True)
+def _transition(F: np.ndarray, dt: float, Phi: np.ndarray, Gamma: np.ndarray, work: np.ndarray) -> None:
+    """Fill in Phi = exp(F GROUP dt) and its integral: a series over one sample, doubled."""
+    square, cube, keep = work[0], work[1], work[2]
+    _times(F, F, square)
+    _times(F, square, cube)
+    for i in range(N_X):
+        for j in range(N_X):
+            Phi[i, j] = dt * F[i, j] + dt**2 / 2 * square[i, j] + dt**3 / 6 * cube[i, j]
+            Gamma[i, j] = dt**2 / 2 * F[i, j] + dt**3 / 6 * square[i, j] + dt**4 / 24 * cube[i, j]
+        Phi[i, i] += 1.0
+        Gamma[i, i] += dt
+    for _ in range(_DOUBLINGS):
+        _times(Phi, Gamma, keep)
+        Gamma += keep
+        _times(Phi, Phi, keep)
+        Phi[:] = keep
+
+
+@nb.njit(cache=True, fastmath=True)
+def _carry(
+    S: np.ndarray, Phi: np.ndarray, Gamma: np.ndarray, term: np.ndarray, by_wind: np.ndarray, out: np.ndarray
+) -> None:
+    """Fill in the sensitivities a group later."""
+    for i in range(N_X):
+        for a in range(N_COLUMN):
+            out[i, a] = 0.0
+        for k in range(N_X):
+            for a in range(N_COLUMN):
+                out[i, a] += Phi[i, k] * S[k, a]
+        for a in range(N_AERO):
+            out[i, a] += Gamma[i, ROW[a]] * term[a]
+        for k in range(6):
+            out[i, WIND] += Gamma[i, k] * by_wind[k, 0]
+            out[i, WIND + 1] += Gamma[i, k] * by_wind[k, 1]
+
+
+@nb.njit(cache=True, fastmath=True)
+def sweep(
+    par: np.ndarray,
+    starts: np.ndarray,
+    segments: np.ndarray,
+    y: np.ndarray,
+    delta: np.ndarray,
+    at: np.ndarray,
+    dt: float,
+    weight: np.ndarray,
+    e: np.ndarray,
+    J: np.ndarray,
+) -> float:
+    """Fly every segment and collect residuals e = (y - y_hat) weight; with a J of any rows their sensitivities, too.
+
+    Args:
+        par: parameters, (37,)
+        starts: start state of each segment, (m, 9)
+        segments: first and last row of each, a whole number of groups apart, (m, 2)
+        y: measured states, (n, 9)
+        delta: inputs as they act, (n, 4)
+        at: U0, W0, (2,) [m/s]
+        dt: sample time [s]
+        weight: square roots of the weights, (9,)
+        e: residuals, filled in group after group, (groups, 9)
+        J: d y_hat / d(par, x0) weight, filled in, (groups, 9, 46), or with no rows
+    Returns:
+        the sum of squares; inf where a segment left every envelope
+    """
+    x, half = np.empty(N_X), np.empty(N_X)
+    work, matrices = np.empty((3, N_X)), np.empty((5, N_X, N_X))
+    F, Phi, Gamma, by_wind = np.empty((N_X, N_X)), matrices[3], matrices[4], np.empty((N_X, 2))
+    mean = np.empty(4)
+    S, S_next, term = np.empty((N_X, N_COLUMN)), np.empty((N_X, N_COLUMN)), np.empty(N_AERO)
+    cost, row = 0.0, 0
+    for m in range(len(segments)):
+        x[:] = starts[m]
+        S[:] = 0.0
+        for i in range(N_X):
+            S[i, N_PAR + i] = 1.0
+        for k in range(segments[m, 0], segments[m, 1], GROUP):
+            for i in range(N_X):
+                e[row, i] = (y[k, i] - x[i]) * weight[i]
+                cost += e[row, i] ** 2
+                if len(J):
+                    for a in range(N_COLUMN):
+                        J[row, i, a] = S[i, a] * weight[i]
+            row += 1
+            for j in range(GROUP):
+                if 2 * j == GROUP:
+                    half[:] = x
+                step(x, delta[k + j], par, at, dt, work)
+            for i in range(N_X):
+                if not abs(x[i]) < LOST:
+                    return np.inf
+            if len(J):
+                for i in range(4):
+                    mean[i] = delta[k : k + GROUP, i].mean()
+                jacobian(half, mean, par, at, F, by_wind, term)
+                _transition(F, dt, Phi, Gamma, matrices)
+                _carry(S, Phi, Gamma, term, by_wind, S_next)
+                S[:] = S_next
+    return cost
