@@ -188,6 +188,7 @@ class Outcome(StrEnum):
     NOT_IDENTIFIABLE = "not_identifiable"
     BELOW_THRESHOLD = "below_threshold"
     WORSE_THAN_LAST = "worse_than_last"
+    DRIFTING = "drifting"
     DIVERGED = "diverged"
 
 
@@ -198,6 +199,12 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     sentence: str
     fit: Annotated[dict[str, float], Meta(description="100 (1 - nrmse) per state at `horizon_s` [%]")] = {}
     fit_hold: Annotated[dict[str, float], Meta(description="the same for holding the last value [%]")] = {}
+    fit_at: Annotated[
+        dict[str, float], Meta(description="mean fit of both axes by free-run length in s, e.g. lon16, lat16 [%]")
+    ] = {}
+    whiteness: Annotated[
+        dict[str, float], Meta(description="share of one-step residual autocorrelations that are noise's, 0..1")
+    ] = {}
     horizon_s: Annotated[float, Meta(description="free-run length the fit is over [s]")] = 0.0
     threshold: Annotated[float, Meta(description="omega: least mean fit [%]")] = 0.0
     tries: Annotated[int, Meta(description="identifications tried for this verdict")] = 0
@@ -220,16 +227,36 @@ class Linear(msgspec.Struct, frozen=True, kw_only=True):
     dt_s: Annotated[float, Meta(description="sample time [s]")]
 
 
+class Derivatives(msgspec.Struct, frozen=True, kw_only=True):
+    """The coupled model: specific force [m/s2] and angular acceleration [rad/s2] per unit of each term, and the wind.
+
+    Terms and letters: `fleet.physics.wrench`.
+    """
+
+    names: Annotated[tuple[str, ...], Meta(description="X_0 X_u ... N_0 w_n w_e")]
+    value: Annotated[Array, Meta(description="(n,) <f8")]
+    covariance: Annotated[Array, Meta(description="(n, n) <f4")]
+    told: Annotated[Array, Meta(description="share of each prior variance that the data removed, (n,) 0..1")]
+    U0: Annotated[float, Meta(description="airspeed the derivatives belong to [m/s]")]
+    W0: Annotated[float, Meta(description="velocity down the body at trim [m/s]")]
+    tau_s: Annotated[Array, Meta(description="lags of delta_a delta_e delta_r delta_t, (4,) [s]")]
+    prior: Annotated[str, Meta(description="airframe that holds what the data do not tell")] = ""
+    window_t0: Annotated[float, Meta(description="first instant of the stretch it came from [s since 1970]")] = 0.0
+    window_s: Annotated[float, Meta(description="length of that stretch [s]")] = 0.0
+    sentence: Annotated[str, Meta(description="what the data identified and what the prior held")] = ""
+
+
 class Model(Message, frozen=True, kw_only=True):
     """The model in force (none before the first verified one), the newest window and its verdict."""
 
     topic: ClassVar[str] = "model"
 
-    method: Annotated[str, Meta(description="paper")]
+    method: Annotated[str, Meta(description="dynamics (coupled derivatives) or paper (two linear axes)")]
     verdict: Annotated[Verdict, Meta(description="of the newest identification")]
     in_force: Annotated[Verdict | None, Meta(description="of the model below; null before any was verified")] = None
     longitudinal: Linear | None = None
     lateral: Linear | None = None
+    derivatives: Annotated[Derivatives | None, Meta(description="of the coupled model; null for method paper")] = None
     window_t0: Annotated[float, Meta(description="first instant of the identification window [s since 1970]")] = 0.0
     window_s: Annotated[float, Meta(description="length of the identification window [s]")] = 0.0
     interpolated: Annotated[float, Meta(description="share of the window that was interpolated, 0..1")] = 0.0
@@ -257,7 +284,8 @@ class Prediction(Message, frozen=True, kw_only=True):
     method: Annotated[
         str,
         Meta(
-            description="paper (identified model and controller twin in closed loop on the mission), "
+            description="dynamics (identified coupled model and controller twin in closed loop on the mission), "
+            "paper (the same with two linear axes), "
             "copter (on rotors: the route at limited speed, acceleration and jerk behind a lag, or holding its place), "
             "greybox (fixed wing without a model: L1 guidance and lags on the route) or imm (no route: turn rate only)"
         ),

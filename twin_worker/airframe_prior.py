@@ -12,14 +12,15 @@ from fleet.airframes import Airframe, derivatives
 from fleet.frames import G
 from fleet.physics.wrench import NAMES, OFFSETS
 
-_FLOOR = {  # doubt beyond a share of the derivative itself, times the airframe's own `doubt`
-    **{"X_0": 2.0, "X_u": 0.3, "X_w": 0.3, "X_de": 1.2, "X_dt": 1.0, "X_ww": 0.05},
-    **{"Z_0": 3.0, "Z_u": 0.3, "Z_w": 0.3, "Z_q": 0.3, "Z_de": 1.0},
-    **{"M_0": 3.0, "M_u": 0.05, "M_w": 0.01, "M_q": 0.1, "M_de": 0.1, "M_dt": 1.0},
-    **{"Y_v": 0.05, "Y_p": 0.3, "Y_r": 0.3, "Y_da": 0.4, "Y_dr": 0.4, "Y_0": 0.5},
-    **{"L_v": 0.01, "L_p": 0.1, "L_r": 0.1, "L_da": 0.1, "L_dr": 0.1, "L_0": 2.0},
-    **{"N_v": 0.01, "N_p": 0.1, "N_r": 0.1, "N_da": 0.1, "N_dr": 0.1, "N_0": 0.5},
+_DOUBT = {  # beyond a share of the derivative itself, times the airframe's own `doubt`
+    "X": {"0": 2.0, "u": 0.3, "w": 0.3, "de": 1.2, "dt": 1.0, "ww": 0.05},
+    "Z": {"0": 3.0, "u": 0.3, "w": 0.3, "q": 0.3, "de": 1.0},
+    "M": {"0": 3.0, "u": 0.05, "w": 0.01, "q": 0.1, "de": 0.1, "dt": 1.0},
+    "Y": {"v": 0.05, "p": 0.3, "r": 0.3, "da": 0.4, "dr": 0.4, "0": 0.5},
+    "L": {"v": 0.01, "p": 0.1, "r": 0.1, "da": 0.1, "dr": 0.1, "0": 2.0},
+    "N": {"v": 0.01, "p": 0.1, "r": 0.1, "da": 0.1, "dr": 0.1, "0": 0.5},
 }
+_FLOOR = {f"{row}_{per}": doubt for row, doubts in _DOUBT.items() for per, doubt in doubts.items()}
 _ACROSS = {"L_r": ("L_p", 0.3), "N_p": ("L_p", 0.3), "L_dr": ("L_da", 0.1), "N_da": ("L_da", 0.1)}
 _WIND = 2.0  # doubt of a wind that telemetry was asked for [m/s]
 _SPANS = 0.3, 20.0  # believable [m]

@@ -11,7 +11,7 @@ import numpy as np
 from fleet.airframes import Airframe
 from fleet.frames import ned_to_body
 from fleet.physics.actuators import TAU, lagged
-from fleet.physics.dynamics import free_run
+from fleet.physics.dynamics import free_runs
 from fleet.physics.wrench import N_PAR, OFFSETS, WIND
 from fleet.window import Window
 from twin_worker.airframe_prior import prior
@@ -55,9 +55,13 @@ class Coupled:
         return np.linalg.inv(self.information + self.precision)
 
     def fly(self, x0: np.ndarray, delta: np.ndarray, dt: float) -> np.ndarray:
-        """Run free from x0 with inputs as they act, (n, 4); give the states, (n, 9), nan once it left every envelope."""
+        """Run free from x0 with inputs as they act, (n, 4); give the states, (n, 9), nan once it left its envelope."""
+        return self.fly_each(x0[None], np.zeros(1, np.int64), len(delta), delta, dt)
+
+    def fly_each(self, starts: np.ndarray, begins: np.ndarray, length: int, delta: np.ndarray, dt: float) -> np.ndarray:
+        """Run free from several rows, `length` rows each; arguments as for `fleet.physics.dynamics.free_runs`."""
         out = np.empty((len(delta), 9))
-        free_run(x0, delta, self.par, self.at, dt, out)
+        free_runs(starts, begins, length, delta, self.par, self.at, dt, out)
         return out
 
 

@@ -12,6 +12,7 @@ from twin_worker.horizon import AHEAD, QUANTILE, Made
 from twin_worker.imm import STEP, imm
 from twin_worker.kinds import Flight, fly_kind, hangs, nothing, seen
 from twin_worker.memory import Twin
+from twin_worker.plant import method
 from twin_worker.predict import fly_ahead
 from twin_worker.track import STEP as TRACK_STEP
 from twin_worker.track import Track
@@ -48,10 +49,10 @@ def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
     window = twin.window(_LOOK_BACK_S)
     whole = window is not None and bool(window.ok[-1])
     why = twin.verdict.sentence
-    if twin.axes is not None and not hangs(twin):
+    if twin.plant is not None and not hangs(twin):
         first = nothing(twin.why_no_route() or "telemetry is broken: the model has nothing to start from")
         if window is not None and whole and not twin.why_no_route():
-            first = _paper(twin, window, ahead)
+            first = _dynamics(twin, window, ahead)
         if _good(first):
             twin.state = _state(twin, State.PREDICTING)
             return first, float(window.t[-1])  # type: ignore[union-attr]
@@ -61,7 +62,7 @@ def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
         twin.state = _state(twin, State.PREDICTING)
         said = second.sentence if hangs(twin) else f"{second.sentence}; {why}"
         return replace(second, sentence=said), float(flown.t[-1])
-    twin.state = _state(twin, State.VERIFIED if twin.axes else State.IDENTIFYING if whole else State.WAITING)
+    twin.state = _state(twin, State.VERIFIED if twin.plant else State.IDENTIFYING if whole else State.WAITING)
     parts = dict.fromkeys(part for part in (why, second.sentence, flown.sentence, "turn rate only") if part)
     path = _imm_path(flown, ahead)
     return Flight(path, "imm", _IMM_LAW, second.seq if path is None else -1, "; ".join(parts)), float(flown.t[-1])
@@ -71,14 +72,14 @@ def _good(flight: Flight) -> bool:
     return flight.path is not None and bool(np.isfinite(flight.path).all())
 
 
-def _paper(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
+def _dynamics(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
     """Fly the identified model and the controller twin on the route, or say why not."""
-    assert twin.axes is not None
-    flown = fly_ahead(twin.situation(window), twin.axes, ahead)
+    assert twin.plant is not None
+    flown = fly_ahead(twin.situation(window), twin.plant, ahead)
     if flown.path is None:
         return nothing(flown.sentence, flown.seq)
     sentence = " ".join(filter(None, (_strange_law(twin), flown.sentence)))
-    return Flight(flown.path, "paper", arduplane.LAW, flown.seq, sentence)
+    return Flight(flown.path, method(twin.plant), arduplane.LAW, flown.seq, sentence)
 
 
 def _strange_law(twin: Twin) -> str:

@@ -90,7 +90,7 @@ def _wing_board(twin: Twin) -> wing.Board:
 
 def compare_with_flight(twin: Twin) -> None:
     """Let the twins that need no identified model learn their few numbers from the last minute."""
-    if twin.why_no_route() or (twin.vehicle not in NO_WINGS and (twin.vehicle not in WINGS or twin.axes is not None)):
+    if twin.why_no_route() or (twin.vehicle not in NO_WINGS and (twin.vehicle not in WINGS or twin.plant is not None)):
         return
     flown = seen(twin)
     if flown is None or len(flown) < 100:

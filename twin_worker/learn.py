@@ -1,51 +1,78 @@
-"""One hop of learning: window, two-step identification, verification on data held out, the published model."""
+"""One hop of learning: window, identification, verification on data held out, the model in force, what is published."""
 
 import msgspec
 import numpy as np
 
-from fleet.contract import Message, Model, Outcome, State, Verdict
+from fleet.contract import Message, Outcome, State, Verdict
+from fleet.frames import G
 from fleet.window import Window
-from twin_worker.identify import AXES, Axis, identify_axis
+from twin_worker import coupled
+from twin_worker.choose import choose
+from twin_worker.identify import AXES, identify_axis
 from twin_worker.kinds import NO_WINGS, QUADPLANE, compare_with_flight
 from twin_worker.lacking import lacking
 from twin_worker.lift import SETTLE_S, lifted
-from twin_worker.memory import Believed, Twin
-from twin_worker.predict import fly_ahead
+from twin_worker.memory import Twin
+from twin_worker.plant import DYNAMICS, Plant
 from twin_worker.preprocess import DT
+from twin_worker.publish import model_message
 from twin_worker.verify import verify
 
 LEAST_S = 30.0  # shortest stretch worth identifying [s]
-WINDOW_S = 140.0  # longest stretch used [s]
 SLOW = 6.0  # air-relative forward speed below which nothing flies on its wings [m/s]
-_FREE_RUN_S = (2.0, 4.0, 2.0, 8.0)  # free-run length of the n-th try [s]
-_KEEP = 4  # verified models kept to choose from
-_NEW = 1.2  # a new model's only flight so far counts as a miss this much larger [-]
-_SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the window the n-th try uses
+_LENGTH = 17.0  # of the stretch identified, in U0 / g: slower modes of faster aircraft [-]
+_STRETCH_S = 35.0, 95.0  # its limits [s]
+_PAPER_S = 120.0  # the stretch of `--method paper` [s]
+_HELD_S = 8.2, 20.0, 40.2  # held out: least; most of `--method paper`; most [s]
+_HELD_SHARE = 0.3, 0.5  # of what there is, held out [-]
+_FREE_RUN_S = (2.0, 4.0, 2.0, 8.0)  # free-run length of the n-th try of `--method paper` [s]
+_SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the stretch the n-th try uses [-]
+_TELL_S = 4.0  # between models that say nothing new [s]
 
 
 def learn(twin: Twin) -> list[Message]:
-    """Identify and verify once; give the model with its verdict, or nothing while data are starved."""
+    """Identify and verify once; give the model with its verdict where it is news, nothing while data are starved."""
     compare_with_flight(twin)
-    window = _on_wings(twin, twin.window(WINDOW_S))
+    window = _on_wings(twin, twin.window(_stretch_s(twin) + _held_most(twin)))
     why_not = _why_not(twin, window)
     if window is None or why_not is not None:
-        if twin.axes is None and why_not is not None:
+        if twin.plant is None and why_not is not None:
             twin.verdict, twin.state = why_not, State.WAITING
         return []
-    twin.state = State.IDENTIFYING if twin.axes is None else twin.state
-    held_n = int(np.clip(0.3 * len(window), 8.2 / DT, 20.0 / DT))
+    twin.state = State.IDENTIFYING if twin.plant is None else twin.state
+    known = len(window) - int(np.clip(_HELD_SHARE[twin.method == DYNAMICS] * len(window), *_held_limits(twin)))
     try:
-        axes = _identify(twin, window.part(0, len(window) - held_n))
+        plant = _identify(twin, window.part(0, known))
     except (ValueError, np.linalg.LinAlgError) as error:
         twin.verdict = Verdict(outcome=Outcome.STARVED, sentence=f"{twin.name}: {error}", tries=twin.tries)
         return []
-    verdict = verify(axes, window.part(len(window) - held_n, len(window)), twin.omega)
+    verdict = verify(plant, window, known, twin.omega, twin.plant if twin.method == DYNAMICS else None)
     verdict = msgspec.structs.replace(verdict, sentence=f"{twin.name}: {verdict.sentence}", tries=twin.tries)
-    twin.verdict = _choose(twin, window, held_n, axes, verdict)
-    if twin.verdict.outcome in (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST):
+    verdict = choose(twin, window, known, plant, verdict)
+    news = verdict.outcome is not twin.verdict.outcome or window.t[-1] - twin.told_t >= _TELL_S
+    twin.verdict = verdict
+    if verdict.outcome in (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST):
         twin.tries = 0
-    twin.model = _model(twin, twin.verdict, window)
+    if not news:
+        return []
+    twin.told_t = float(window.t[-1])
+    twin.model = model_message(twin, window)
     return [twin.model]
+
+
+def _stretch_s(twin: Twin) -> float:
+    if twin.method != DYNAMICS:
+        return _PAPER_S
+    speed = float(twin.near.at[0]) if twin.near else 0.0
+    return float(np.clip(_LENGTH * speed / G, *_STRETCH_S))
+
+
+def _held_most(twin: Twin) -> float:
+    return _HELD_S[1 + (twin.method == DYNAMICS)]
+
+
+def _held_limits(twin: Twin) -> tuple[float, float]:
+    return _HELD_S[0] / DT, _held_most(twin) / DT
 
 
 def _why_not(twin: Twin, window: Window | None) -> Verdict | None:
@@ -62,51 +89,21 @@ def _why_not(twin: Twin, window: Window | None) -> Verdict | None:
     return Verdict(outcome=Outcome.STARVED, sentence=sentence)
 
 
-def _identify(twin: Twin, known: Window) -> tuple[Axis, Axis]:
-    """Identify both axes; every further try uses another free-run length or share of the window."""
+def _identify(twin: Twin, known: Window) -> Plant:
+    """Identify the aircraft; every further try begins elsewhere, or on another share of the window."""
     attempt = twin.tries % len(_SHARE)
     twin.tries += 1
     known = known.part(int(len(known) * (1 - _SHARE[attempt])), len(known))
-    before = twin.axes or (None, None)
+    if twin.method == DYNAMICS:
+        last = next((one for one in reversed(twin.anchors) if one.t1 <= known.t[0]), None)
+        near = twin.near if attempt == 0 and twin.near and twin.near.t1 > known.t[0] else None
+        twin.near = coupled.identify(known, twin.wind.wind, twin.airframe, last, near)
+        return twin.near
+    before = twin.plant if isinstance(twin.plant, tuple) else (None, None)
     lon, lat = (
         identify_axis(axis, known, _FREE_RUN_S[attempt], last)[1] for axis, last in zip(AXES, before, strict=True)
     )
     return lon, lat
-
-
-def _choose(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Axis], verdict: Verdict) -> Verdict:
-    """Fly every verified model in closed loop over the held-out data; the one that strays least is in force."""
-    for known in twin.pool:
-        known.flown(_hindcast(twin, window, held_n, known.axes))
-    if verdict.outcome is Outcome.VERIFIED:
-        miss = _hindcast(twin, window, held_n, axes)
-        if np.isinf(miss):
-            sentence = f"{verdict.sentence}; but on the route the twin leaves its envelope; trying again"
-            verdict = msgspec.structs.replace(verdict, outcome=Outcome.DIVERGED, sentence=sentence)
-        else:
-            twin.pool.append(Believed(axes, verdict, float(window.t[-1]), _NEW * miss))
-    twin.pool = sorted((known for known in twin.pool if not np.isinf(known.miss)), key=Believed.rank)[:_KEEP]
-    if not twin.pool:
-        return verdict
-    best = twin.pool[0]
-    twin.axes, twin.in_force = best.axes, best.verdict
-    if verdict.outcome is Outcome.VERIFIED and best.axes is not axes:
-        sentence = f"{verdict.sentence}; but an earlier model strays less on the route and stays in force"
-        return msgspec.structs.replace(verdict, outcome=Outcome.WORSE_THAN_LAST, sentence=sentence)
-    return verdict
-
-
-def _hindcast(twin: Twin, window: Window, held_n: int, axes: tuple[Axis, Axis]) -> float:
-    """Give the mean miss of a flight from the start of the held-out data [m]; inf: it diverges, nan: no route."""
-    if twin.why_no_route():
-        return np.nan
-    start = len(window) - held_n
-    ahead = np.arange(0.0, int(held_n * DT))
-    flown = fly_ahead(twin.situation(window.part(0, start + 1)), axes, ahead)
-    if flown.path is None:
-        return np.inf if flown.diverged else np.nan
-    rows = start + np.rint(ahead / DT).astype(int)
-    return float(np.linalg.norm(flown.path - window.p[rows], axis=1).mean())
 
 
 def _on_wings(twin: Twin, window: Window | None) -> Window | None:
@@ -125,22 +122,3 @@ def _after(those: np.ndarray, more: int) -> int:
     """Give the row after the last of those, and so many more; the first where there are none."""
     found = np.flatnonzero(those)
     return int(found[-1]) + 1 + more if len(found) else 0
-
-
-def _model(twin: Twin, verdict: Verdict, window: Window) -> Model:
-    """Publish the newest verdict with the model in force: a failed identification never shows its matrices."""
-    lon, lat = twin.axes or (None, None)
-    return Model(
-        uav=twin.uav,
-        t=float(window.t[-1]),
-        method="paper",
-        verdict=verdict,
-        in_force=twin.in_force,
-        longitudinal=lon.linear() if lon else None,
-        lateral=lat.linear() if lat else None,
-        window_t0=float(window.t[0]),
-        window_s=window.seconds,
-        interpolated=float(window.filled.mean()),
-        wind_n=float(twin.wind.wind[0]),
-        wind_e=float(twin.wind.wind[1]),
-    )

@@ -6,16 +6,18 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleet.airframe import ServoMap, servo_map
+from fleet.airframes import GENERIC, Airframe, load
 from fleet.autopilots import arduplane
 from fleet.contract import Message, Mission, Model, Outcome, Params, Prediction, Sample, State, Status, Verdict
 from fleet.frames import Origin
 from fleet.window import Window
+from twin_worker.coupled import Coupled
 from twin_worker.greybox import Grey
 from twin_worker.history import History
 from twin_worker.horizon import Record
-from twin_worker.identify import Axis
+from twin_worker.plant import DYNAMICS, Plant
 from twin_worker.predict import Onboard, Situation
-from twin_worker.preprocess import preprocess
+from twin_worker.preprocess import Grid
 from twin_worker.rotor import Rotor
 from twin_worker.verify import OMEGA
 from twin_worker.wind import WindFilter
@@ -27,6 +29,7 @@ def _unheard() -> Verdict:
     return Verdict(outcome=Outcome.STARVED, sentence="no samples yet")
 
 
+_ANCHORS = 8  # believed models kept to hold the parameters of later stretches
 _MODES = 64  # changes of mode remembered
 _NEWS = 0.3  # weight of the newest flight in a model's miss [-]
 
@@ -36,13 +39,13 @@ class Believed:
     """A verified model, and how far it strays when it flies the newest held-out data in closed loop.
 
     Attributes:
-        axes: longitudinal and lateral model
+        plant: the model
         verdict: what it was believed on
         t: end of the data it was believed on [s since 1970]
         miss: mean miss on the route, smoothed over the hops [m]; nan before any route, inf once it left its envelope
     """
 
-    axes: tuple[Axis, Axis]
+    plant: Plant
     verdict: Verdict
     t: float
     miss: float
@@ -63,7 +66,10 @@ class Twin:
 
     uav: int
     omega: float = OMEGA
+    method: str = DYNAMICS
+    airframe: Airframe = field(default_factory=lambda: load(GENERIC))
     history: History = field(default_factory=History)
+    grid: Grid = field(default_factory=Grid)
     wind: WindFilter = field(default_factory=WindFilter)
     record: Record = field(default_factory=Record)
     rotor: Rotor = field(default_factory=Rotor)
@@ -74,10 +80,12 @@ class Twin:
     mission: Mission | None = None
     params: Params | None = None
     servos: ServoMap = field(default_factory=lambda: servo_map({}))
-    axes: tuple[Axis, Axis] | None = None
+    plant: Plant | None = None  # the model in force
+    near: Coupled | None = None  # newest coupled model, believed or not: the next search begins there
+    anchors: deque[Coupled] = field(default_factory=lambda: deque(maxlen=_ANCHORS))  # believed, one a stretch
     verdict: Verdict = field(default_factory=_unheard)
     pool: list[Believed] = field(default_factory=list)
-    in_force: Verdict | None = None  # the verdict `axes` were believed on
+    in_force: Verdict | None = None  # the verdict `plant` was believed on
     model: Model | None = None
     prediction: Prediction | None = None
     state: State = State.WAITING
@@ -89,6 +97,8 @@ class Twin:
     identify_t: float = -np.inf
     predict_t: float = -np.inf
     score_t: float = -np.inf
+    flown_t: float = -np.inf  # models last flown in closed loop
+    told_t: float = -np.inf  # model last published
     lost: bool = False
     bad: int = 0
 
@@ -113,7 +123,7 @@ class Twin:
         """Give the newest `seconds` on the grid; None while a needed kind of row is missing."""
         assert self.origin is not None
         newest = self.history.newest
-        return preprocess(self.history, self.origin, self.servos, self.wind.wind, until=newest, seconds=seconds)
+        return self.grid.window(self.history, self.origin, self.servos, self.wind.wind, until=newest, seconds=seconds)
 
     def situation(self, window: Window) -> Situation:
         """Give what a prediction from the end of `window` starts from."""
@@ -172,7 +182,11 @@ def _hear_status(twin: Twin, status: Status) -> None:
         return
     if status.clock_jumps != before.clock_jumps:
         twin.history.clear()
+        twin.grid.clear()
         twin.wind.t = twin.wind_t = twin.identify_t = twin.score_t = -np.inf  # the new time may lie before
+        twin.flown_t = twin.told_t = -np.inf
+        twin.near = None
+        twin.anchors.clear()
         twin.data_t = twin.turned_t = -np.inf
         _event(twin, status.t)
     elif status.mode != before.mode:

@@ -15,11 +15,10 @@ from fleet.mission import KIND, LAND, TAKEOFF, route
 from fleet.simulate import N_STATE, simulate
 from fleet.window import Window
 from twin_worker.history import History
-from twin_worker.identify import Axis
+from twin_worker.plant import Plant, acting, settled
 from twin_worker.wind import WindFilter
 
 SHADOW_S = 60.0  # telemetry the controller twin is synchronised on [s]
-SETTLE_S = 40.0  # telemetry whose mean the model must meet [s]
 _SHADOW_STEP = 2  # window rows per shadow step
 _REFUSED = {TAKEOFF: "take-off", LAND: "landing"}
 
@@ -79,12 +78,12 @@ def held(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float) -> np.nda
     return out
 
 
-def fly_ahead(now: Situation, axes: tuple[Axis, Axis], ahead: np.ndarray) -> Flown:
-    """Predict with the identified linear model and the controller twin in closed loop (`--method paper`).
+def fly_ahead(now: Situation, plant: Plant, ahead: np.ndarray) -> Flown:
+    """Predict with the identified model and the controller twin in closed loop.
 
     Args:
         now: where the prediction starts, the end of its window
-        axes: longitudinal and lateral model
+        plant: coupled model, or longitudinal and lateral one
         ahead: wanted look-ahead times from there, rising, (k,) [s]
     """
     good = _on_this_route(now.window, now.onboard.since)
@@ -105,8 +104,7 @@ def fly_ahead(now: Situation, axes: tuple[Axis, Axis], ahead: np.ndarray) -> Flo
     if kind in _REFUSED:
         return Flown(None, int(seq[-1]), f"{_REFUSED[kind]} is not modelled: no route-aware prediction")
     out = np.empty((int(ahead[-1] / good.dt) + 2, N_STATE))
-    model = [part for axis in axes for part in (_settled(axis, good), axis.means)]
-    done = simulate(ctl, par, way.legs, *model, *_start(now, good), good.dt, out)  # type: ignore
+    done = simulate(ctl, par, way.legs, settled(plant, good), *_start(now, good), good.dt, out)
     if done <= ahead[-1] / good.dt:
         return Flown(None, int(seq[-1]), f"the twin leaves its envelope {done * good.dt:.0f} s ahead", True)
     path = np.column_stack([np.interp(ahead, good.dt * np.arange(done), column) for column in out[:done, :3].T])
@@ -135,21 +133,12 @@ def _telemetry(good: Window, at: np.ndarray, history: History) -> tuple[np.ndarr
 
 
 def _start(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give state (12,), commands in force (2,) and air (4,) at the end of the window."""
+    """Give state (12,), commands and inputs in force (6,) and air (4,) at the end of the window."""
     state = np.concatenate([good.p[-1], good.x[-3:, :6].mean(axis=0), good.x[-1, 6:]])
     command = held(*now.history.rows("command"), good.t[-1:], 1.0)[0, :2]
     command = np.where(np.isfinite(command), command, good.x[-1, 6:8])
+    command = np.concatenate([command, acting(good)])
     return state, command, np.array([*now.wind.wind[:2], now.wind.scale, _gust(now, good)])
-
-
-def _settled(axis: Axis, good: Window) -> np.ndarray:
-    """Give the model's [A B c] with c moved by its mean one-step miss of late, so that it starts without drift."""
-    recent = good.part(max(len(good) - int(SETTLE_S / good.dt), 0), len(good))
-    D = axis.physical()
-    y = recent.columns(axis.states) - axis.y_mean
-    z = np.column_stack([y, recent.columns(axis.inputs) - axis.u_mean, np.ones(len(y))])
-    D[:, -1] += (y[1:] - z[:-1] @ D.T).mean(axis=0)
-    return D
 
 
 def _gust(now: Situation, good: Window) -> float:

@@ -8,10 +8,10 @@ Residuals are taken once a group: gusts colour them, so that neighbours say the 
 Source: Jategaonkar 2015, section 4.6 (output error, sensitivity equations); exact for F held.
 """
 
-import numba as nb
 import numpy as np
 
 from fleet.physics.dynamics import LOST, N_X, jacobian, step
+from fleet.physics.kernel import kernel
 from fleet.physics.wrench import N_AERO, N_PAR, ROW, WIND
 
 GROUP = 4  # samples a residual; 2 ** DOUBLINGS
@@ -19,7 +19,7 @@ _DOUBLINGS = 2
 N_COLUMN = N_PAR + N_X
 
 
-@nb.njit(cache=True, fastmath=True)
+@kernel
 def _times(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
     for i in range(N_X):
         for j in range(N_X):
@@ -29,7 +29,7 @@ def _times(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
                 out[i, j] += a[i, k] * b[k, j]
 
 
-@nb.njit(cache=True, fastmath=True)
+@kernel
 def _transition(F: np.ndarray, dt: float, Phi: np.ndarray, Gamma: np.ndarray, work: np.ndarray) -> None:
     """Fill in Phi = exp(F GROUP dt) and its integral: a series over one sample, doubled."""
     square, cube, keep = work[0], work[1], work[2]
@@ -48,7 +48,7 @@ def _transition(F: np.ndarray, dt: float, Phi: np.ndarray, Gamma: np.ndarray, wo
         Phi[:] = keep
 
 
-@nb.njit(cache=True, fastmath=True)
+@kernel
 def _carry(
     S: np.ndarray, Phi: np.ndarray, Gamma: np.ndarray, term: np.ndarray, by_wind: np.ndarray, out: np.ndarray
 ) -> None:
@@ -66,7 +66,7 @@ def _carry(
             out[i, WIND + 1] += Gamma[i, k] * by_wind[k, 1]
 
 
-@nb.njit(cache=True, fastmath=True)
+@kernel
 def sweep(
     par: np.ndarray,
     starts: np.ndarray,

@@ -11,7 +11,7 @@ from twin_worker.horizon import AHEAD
 from twin_worker.learn import learn
 from twin_worker.memory import Twin, hear
 
-HOP_S = 4.0  # between identifications [s]
+HOP_S = 1.0  # between identifications [s]
 PREDICT_S = 1.0  # between predictions [s]
 LOST_S = 3.0  # without a sample: link lost [s]
 _TICK_S = 1.0  # between turns while data are silent, and between scorings [s]
@@ -84,7 +84,7 @@ def _watch_link(twin: Twin, now: float) -> list[Message]:
     if lost == twin.lost:
         return []
     twin.lost, twin.predict_t = lost, -np.inf
-    twin.state = State.LINK_LOST if lost else State.WAITING if twin.axes is None else State.VERIFIED
+    twin.state = State.LINK_LOST if lost else State.WAITING if twin.plant is None else State.VERIFIED
     said = f"no sample for {silent:.1f} s; the twin flies on alone" if lost else "link back"
     sentence = f"{twin.name}: {said}"
     return [Alert(uav=twin.uav, t=now, kind=AlertKind.LINK_LOST, active=lost, sentence=sentence)]
@@ -120,7 +120,7 @@ def _score(twin: Twin) -> None:
 def fleet_row(twin: Twin, now: float, **claim: object) -> FleetRow:
     """Give the aircraft's line of the fleet table; `now` is data time, `claim` names worker and epoch."""
     made = twin.prediction
-    t10, censored, n = twin.record.t10(made.method if made and made.method != "imm" else "paper")
+    t10, censored, n = twin.record.t10(made.method if made and made.method != "imm" else twin.method)
     return FleetRow(
         uav=twin.uav,
         state=twin.state,

@@ -1,4 +1,4 @@
-"""Does a model deserve belief? Free runs over data it has not seen, against a threshold and against holding still.
+"""Does a model deserve belief? Free runs over data it has not seen, against a threshold, holding still and the last.
 
 fit = 100 (1 - ||y - y_hat|| / ||y - mean(y)||).  Source: Huang 2021, eq. 22.
 """
@@ -6,32 +6,17 @@ fit = 100 (1 - ||y - y_hat|| / ||y - mean(y)||).  Source: Huang 2021, eq. 22.
 import numpy as np
 
 from fleet.contract import Outcome, Verdict
-from fleet.window import Window
-from twin_worker.identify import Axis
-from twin_worker.refine import free_run
+from fleet.window import STATES, Window
+from twin_worker.plant import Plant, finite, measured, runs
+from twin_worker.white import whiteness
 
-HORIZONS_S = (16.0, 8.0, 4.0)  # longest first: a model is verified at the longest its data allow
+HORIZONS_S = (40.0, 16.0, 4.0)  # longest first: a model is verified at the longest its data allow
+SHORTEST_S = 1.0  # told too, and no ground for belief: recorded inputs hold the noise of what they answered
 OMEGA = 0.0  # least mean fit over the nine states [%]; the paper: "greater than 0 is acceptable"
+AXES = {"lon": ("u", "w", "q", "theta"), "lat": ("phi", "psi", "p", "r", "v")}
 _LOST = -99.0  # mean fit that only a diverging run has [%]
 _QUIET_PHI, _QUIET_Q = 0.04, 0.02  # less than this is steady flight [rad, rad/s]
-
-
-def free_runs(D: np.ndarray, y: np.ndarray, u: np.ndarray, ok: np.ndarray, length: int) -> np.ndarray:
-    """Predict y from a fresh start every `length` samples; nan where a run crosses unmeasured rows.
-
-    Args:
-        D: [A B c], scaled units, (n, n + m + 1)
-        y, u, ok: held-out outputs (N, n), inputs (N, m), measured rows (N,)
-        length: free-run length [samples]
-    Returns:
-        predictions, (N, n)
-    """
-    out = np.full_like(y, np.nan)
-    for start in range(0, len(y), length):
-        stop = min(start + length, len(y))
-        if ok[start:stop].all() and stop - start > 1:
-            free_run(D, y[start], np.ascontiguousarray(u[start:stop]), out[start:stop])
-    return out
+_NO_WORSE = 1.0  # points a new model may lie below the last: chance [%]
 
 
 def hold(y: np.ndarray, ok: np.ndarray, length: int) -> np.ndarray:
@@ -50,71 +35,88 @@ def fit_percent(y: np.ndarray, y_hat: np.ndarray) -> np.ndarray:
     return np.clip(100.0 * (1.0 - nrmse), -100.0, 100.0)
 
 
-def fits_at(axes: tuple[Axis, Axis], held: Window, horizon_s: float) -> tuple[dict[str, float], dict[str, float]]:
-    """Give the fit of both axes' free runs, and of holding the last value, per state [%].
+def fits_at(plant: Plant, window: Window, start: int, horizon_s: float) -> tuple[dict[str, float], dict[str, float]]:
+    """Give the fit of the model's free runs, and of holding the last value, per state [%].
 
     Args:
-        axes: longitudinal and lateral model
-        held: data neither has seen
+        plant: the model
+        window: flight; rows from `start` on it has not seen
+        start: first row to predict
         horizon_s: free-run length [s]
     """
-    length = int(horizon_s / held.dt)
-    whole = held.part(0, max(len(held) // length, 1) * length)
-    fit: dict[str, float] = {}
-    still: dict[str, float] = {}
-    for axis in axes:
-        y, u = axis.scaled(whole)
-        fit |= dict(zip(axis.states, fit_percent(y, free_runs(axis.D, y, u, whole.ok, length)).tolist(), strict=True))
-        still |= dict(zip(axis.states, fit_percent(y, hold(y, whole.ok, length)).tolist(), strict=True))
-    return fit, still
+    length = max(int(horizon_s / window.dt), 2)
+    whole = window.part(0, start + max((len(window) - start) // length, 1) * length)
+    y, ok = measured(plant, whole)[start:], whole.ok[start:]
+    made, still = runs(plant, whole, start, length), hold(y, ok, length)
+    return _named(fit_percent(y, np.where(ok[:, None], made, np.nan))), _named(fit_percent(y, still))
 
 
-def mean(fit: dict[str, float]) -> float:
-    """Give the mean fit over the states, the paper's Fit_value [%]."""
-    return float(np.mean(list(fit.values())))
+def _named(fit: np.ndarray) -> dict[str, float]:
+    return dict(zip(STATES, fit.tolist(), strict=True))
 
 
-def verify(axes: tuple[Axis, Axis], held: Window, omega: float = OMEGA) -> Verdict:
-    """Judge a model on held-out data: above the threshold and, on either axis, better than holding still.
+def mean(fit: dict[str, float], states: tuple[str, ...] = STATES) -> float:
+    """Give the mean fit over states, the paper's Fit_value [%]."""
+    return float(np.mean([fit[name] for name in states]))
+
+
+def by_axis(fit: dict[str, float], horizon_s: float) -> dict[str, float]:
+    """Give the mean fit of both axes at a horizon, e.g. `lon16` and `lat16` [%]."""
+    return {f"{axis}{horizon_s:.0f}": mean(fit, states) for axis, states in AXES.items()}
+
+
+def verify(plant: Plant, window: Window, start: int, omega: float = OMEGA, last: Plant | None = None) -> Verdict:
+    """Judge a model on data it has not seen: above the threshold, better than holding still, no worse than the last.
 
     Args:
-        axes: longitudinal and lateral model
-        held: data neither has seen
+        plant: the model
+        window: flight; rows from `start` on it has not seen
+        start: first row to predict
         omega: threshold on the mean fit [%]
+        last: the model in force
     Returns:
         a verdict whose sentence does not yet say whose it is
     Raises:
         ValueError: when the data are shorter than the shortest horizon; wait for more.
     """
+    held = window.part(start, len(window))
     allowed = [h for h in HORIZONS_S if h <= held.seconds + held.dt]
     if not allowed:
         raise ValueError(f"verify: found {held.seconds:.1f} s held out, needs {HORIZONS_S[-1]:.0f} s; wait for more")
-    for horizon in allowed:
-        fit, still = fits_at(axes, held, horizon)
-        missing = _missing(axes, fit, still, omega)
-        if not missing:
-            break
-    outcome, sentence = _judge(fit, missing, held)
-    if not all(np.isfinite(axis.D).all() for axis in axes):
-        outcome, sentence = Outcome.DIVERGED, "the model is not finite; trying again"
+    found = {h: fits_at(plant, window, start, h) for h in (*allowed, SHORTEST_S)}
+    verified = [h for h in allowed if not _missing(*found[h], omega)]
+    horizon = verified[0] if verified else allowed[-1]
+    fit, still = found[horizon]
+    outcome, said = _judge(fit, _missing(fit, still, omega), held)
+    if last is not None:
+        before = mean(fits_at(last, window, start, horizon)[0])
+        if outcome is Outcome.VERIFIED and mean(fit) < before - _NO_WORSE:
+            outcome, said = Outcome.WORSE_THAN_LAST, f"the model in force has {before:.0f} % and stays"
+        elif outcome in (Outcome.BELOW_THRESHOLD, Outcome.DIVERGED) and before <= omega:
+            outcome, said = Outcome.DRIFTING, f"and {before:.0f} % by the model in force: aircraft or air have changed"
+    if not finite(plant):
+        outcome, said = Outcome.DIVERGED, "the model is not finite; trying again"
+    at = {name: value for h, (each, _) in found.items() for name, value in by_axis(each, h).items()}
     return Verdict(
         outcome=outcome,
-        sentence=f"mean fit {mean(fit):.0f} % over {horizon:.0f} s of unseen data, {sentence}",
+        sentence=f"mean fit {mean(fit):.0f} % over {horizon:.0f} s of unseen data, {said}",
         fit=fit,
         fit_hold=still,
+        fit_at=at,
+        whiteness=_named(whiteness(measured(plant, held), runs(plant, window, start, 2))),
         horizon_s=horizon,
         threshold=omega,
     )
 
 
-def _missing(axes: tuple[Axis, Axis], fit: dict[str, float], still: dict[str, float], omega: float) -> str:
+def _missing(fit: dict[str, float], still: dict[str, float], omega: float) -> str:
     """Say what the fit lacks: the threshold over all states, and on either axis more than holding still; or nothing."""
     if mean(fit) <= omega:
         return f"more than {omega:.0f} % is needed"
-    for axis in axes:
-        model, held = (mean({name: each[name] for name in axis.states}) for each in (fit, still))
+    for states in AXES.values():
+        model, held = mean(fit, states), mean(still, states)
         if model <= held:
-            return f"{axis.states[0]} {axis.states[1]} … {model:.0f} % is no better than holding still, {held:.0f} %"
+            return f"{states[0]} {states[1]} … {model:.0f} % is no better than holding still, {held:.0f} %"
     return ""
 
 

@@ -2,12 +2,14 @@
 
 import numpy as np
 
+from fleet.airframes import GENERIC, load
 from fleet.autopilots import arduplane, copter, greybox
 from fleet.contract import Item
 from fleet.frames import Origin
 from fleet.mission import route
-from fleet.simulate import N_STATE, simulate
+from fleet.simulate import N_STATE, coupled_plant, linear_plant, simulate
 from fleet.window import Window
+from twin_worker.coupled import identify
 from twin_worker.identify import AXES, identify_axis
 
 _SPEED = 22.0  # [m/s]
@@ -29,10 +31,12 @@ def warm_up() -> None:
     rows = [window.t - window.t[0], window.p, window.v, euler, rates, *heard]
     ctl, _ = arduplane.shadow(par, legs, window.p[0], *rows)  # type: ignore
     state = np.concatenate([window.p[-1], window.x[-1]])
-    matrices = [part for axis in axes for part in (axis.physical(), axis.means)]
+    paper = linear_plant(*(part for axis in axes for part in (axis.physical(), axis.means)))
+    coupled = coupled_plant(identify(window, np.zeros(2), load(GENERIC)).par, np.array([_SPEED, 0.0]))
     air = np.array([0.0, 0.0, 1.0, 0.0])
     grey_ctl = ctl.copy()
-    simulate(ctl, par, legs, *matrices, state, np.zeros(2), air, window.dt, np.empty((50, N_STATE)))  # type: ignore
+    for plant in (paper, coupled):
+        simulate(ctl.copy(), par, legs, plant, state, np.zeros(6), air, window.dt, np.empty((50, N_STATE)))
 
     ahead, grey = np.empty((5, 3)), np.ones(greybox.N_PAR)
     greybox.follow(grey_ctl, par, legs, grey, np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0]), np.zeros(2), 0.1, ahead)  # type: ignore

@@ -1,15 +1,16 @@
 """Servos and engine: first-order lags between what is commanded and what acts.
 
-    delta' = (delta_c - delta) / tau
+delta' = (delta_c - delta) / tau
 """
 
-import numba as nb
 import numpy as np
+
+from fleet.physics.kernel import kernel
 
 TAU = np.array([0.05, 0.05, 0.05, 0.25])  # delta_a delta_e delta_r delta_t of a small aircraft [s]
 
 
-@nb.njit(cache=True)
+@kernel
 def lagged(commands: np.ndarray, dt: float, tau: np.ndarray) -> np.ndarray:
     """Give what acts on average in each interval, (n, 4), from the commands at its start, (n, 4).
 

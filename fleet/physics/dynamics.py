@@ -12,10 +12,10 @@ Source: Beard & McLain 2012, eq. 3.14-3.17; products of inertia and gyroscopic t
 
 from math import cos, sin
 
-import numba as nb
 import numpy as np
 
 from fleet.frames import G
+from fleet.physics.kernel import kernel
 from fleet.physics.wrench import WIND, slopes, terms, wrench
 
 N_X = 9
@@ -23,7 +23,7 @@ STEEP = 1.5  # pitch beyond is not integrated: cos(theta) is kept from zero [rad
 LOST = 1e4  # a state beyond has left every envelope
 
 
-@nb.njit(cache=True, fastmath=True)
+@kernel
 def rates_of_change(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, out: np.ndarray) -> None:
     """Fill in x', (9,)."""
     u, v, w, p, q, r = x[0], x[1], x[2], x[3], x[4], x[5]
@@ -42,7 +42,7 @@ def rates_of_change(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.nd
     out[8] = turn
 
 
-@nb.njit(cache=True, fastmath=True)
+@kernel
 def step(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, dt: float, work: np.ndarray) -> None:
     """Advance x by dt with delta held: Runge-Kutta of order four.
 
@@ -69,30 +69,40 @@ def step(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, dt: 
         x[i] += dt / 6.0 * (total[i] + k[i])
 
 
-@nb.njit(cache=True)
-def free_run(x0: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, dt: float, out: np.ndarray) -> bool:
-    """Fly from x0 with recorded inputs; out[0] = x0. Rows after it left every envelope are nan.
+@kernel
+def free_runs(
+    starts: np.ndarray,
+    begins: np.ndarray,
+    length: int,
+    delta: np.ndarray,
+    par: np.ndarray,
+    at: np.ndarray,
+    dt: float,
+    out: np.ndarray,
+) -> None:
+    """Fly from each start with recorded inputs; rows no run reaches, or after it left every envelope, become nan.
 
     Args:
-        x0: state, (9,)
+        starts: state of each run at its first row, (m, 9)
+        begins: first row of each, (m,)
+        length: most rows of a run; it ends with `out`
         delta: inputs as they act in each interval, (n, 4)
         par, at: as in `step`
         dt: sample time [s]
         out: states, filled in, (n, 9)
-    Returns:
-        whether it stayed inside
     """
-    x, work = x0.copy(), np.empty((3, N_X))
-    for k in range(len(out)):
-        if not np.abs(x).max() < LOST:
-            out[k:] = np.nan
-            return False
-        out[k] = x
-        step(x, delta[k], par, at, dt, work)
-    return True
+    x, work = np.empty(N_X), np.empty((3, N_X))
+    out[:] = np.nan
+    for m in range(len(begins)):
+        x[:] = starts[m]
+        for k in range(begins[m], min(begins[m] + length, len(out))):
+            if not np.abs(x).max() < LOST:
+                break
+            out[k] = x
+            step(x, delta[k], par, at, dt, work)
 
 
-@nb.njit(cache=True, fastmath=True)
+@kernel
 def jacobian(
     x: np.ndarray,
     delta: np.ndarray,

@@ -12,8 +12,9 @@ the ground belongs to the same vector, for it is identified with them.
 Source: Beard & McLain 2012, section 5.5 (dimensional derivatives); Klein & Morelli 2006, chapter 3.
 """
 
-import numba as nb
 import numpy as np
+
+from fleet.physics.kernel import inlined, kernel
 
 NAMES = (
     *("X_0", "X_u", "X_w", "X_de", "X_dt", "X_ww"),
@@ -34,7 +35,7 @@ ROW = np.array([0] * 6 + [2] * 5 + [4] * 6 + [1] * 6 + [3] * 6 + [5] * 6)  # sta
 SLOW, FAST = 0.4, 2.0  # limits of u_a / U0: beyond, the derivatives grow no further [-]
 
 
-@nb.njit(cache=True, fastmath=True, inline="always")
+@inlined
 def wrench(par, u_a, v_a, w_a, p, q, r, delta, at):  # type: ignore[no-untyped-def]
     """Give X Y Z [m/s2], L M N [rad/s2].
 
@@ -60,7 +61,7 @@ def wrench(par, u_a, v_a, w_a, p, q, r, delta, at):  # type: ignore[no-untyped-d
     )
 
 
-@nb.njit(cache=True, fastmath=True)
+@kernel
 def terms(u_a: float, v_a: float, w_a: float, rates: np.ndarray, delta: np.ndarray, at: np.ndarray, out: np.ndarray):  # type: ignore[no-untyped-def]
     """Fill in what each derivative is multiplied by, (35,) in the order of `NAMES`; arguments as for `wrench`."""
     s = min(max(u_a / at[0], SLOW), FAST)
@@ -75,7 +76,7 @@ def terms(u_a: float, v_a: float, w_a: float, rates: np.ndarray, delta: np.ndarr
         out[k + 3], out[k + 4], out[k + 5] = delta[0] * s2, delta[2] * s2, 1.0
 
 
-@nb.njit(cache=True, fastmath=True)
+@kernel
 def slopes(
     par: np.ndarray,
     air: np.ndarray,

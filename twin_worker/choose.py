@@ -1,0 +1,71 @@
+"""Which verified model is in force: the one that strays least when it flies what was held out in closed loop."""
+
+import msgspec
+import numpy as np
+
+from fleet.contract import Outcome, Verdict
+from fleet.window import Window
+from twin_worker.coupled import Coupled
+from twin_worker.memory import Believed, Twin
+from twin_worker.plant import Plant
+from twin_worker.predict import fly_ahead
+
+FLY_S = 4.0  # between flights of the same models [s]
+_FLIGHT_S = 20.0  # of the newest data flown [s]
+_KEEP = 4  # verified models kept to choose from
+_NEW = 1.2  # a new model's only flight so far counts as a miss this much larger [-]
+
+
+def choose(twin: Twin, window: Window, known: int, plant: Plant, verdict: Verdict) -> Verdict:
+    """Fly every verified model in closed loop over the newest data; the one that strays least is in force.
+
+    Args:
+        twin: whose pool of models is renewed
+        window: flight; rows from `known` on `plant` has not seen
+        known: first of them
+        plant: the newest model
+        verdict: on it, open loop
+    Returns:
+        the verdict, changed where the closed loop says otherwise
+    """
+    if twin.pool and window.t[-1] - twin.flown_t < FLY_S:
+        return verdict
+    twin.flown_t = float(window.t[-1])
+    start = max(known, len(window) - 1 - int(_FLIGHT_S / window.dt))
+    for one in twin.pool:
+        one.flown(hindcast(twin, window, start, one.plant))
+    if verdict.outcome is Outcome.VERIFIED:
+        verdict = _join(twin, window, start, plant, verdict)
+    twin.pool = sorted((one for one in twin.pool if not np.isinf(one.miss)), key=Believed.rank)[:_KEEP]
+    if not twin.pool:
+        return verdict
+    best = twin.pool[0]
+    twin.plant, twin.in_force = best.plant, best.verdict
+    if verdict.outcome is Outcome.VERIFIED and best.plant is not plant:
+        sentence = f"{verdict.sentence}; but an earlier model strays less on the route and stays in force"
+        return msgspec.structs.replace(verdict, outcome=Outcome.WORSE_THAN_LAST, sentence=sentence)
+    return verdict
+
+
+def _join(twin: Twin, window: Window, start: int, plant: Plant, verdict: Verdict) -> Verdict:
+    """Take a verified model into the pool, unless it cannot fly the route."""
+    miss = hindcast(twin, window, start, plant)
+    if np.isinf(miss):
+        sentence = f"{verdict.sentence}; but on the route the twin leaves its envelope; trying again"
+        return msgspec.structs.replace(verdict, outcome=Outcome.DIVERGED, sentence=sentence)
+    twin.pool.append(Believed(plant, verdict, float(window.t[-1]), _NEW * miss))
+    if isinstance(plant, Coupled) and (not twin.anchors or plant.t1 - twin.anchors[-1].t1 > _FLIGHT_S):
+        twin.anchors.append(plant)
+    return verdict
+
+
+def hindcast(twin: Twin, window: Window, start: int, plant: Plant) -> float:
+    """Give the mean miss of a flight from row `start` to the end [m]; inf: it diverges, nan: no route."""
+    if twin.why_no_route():
+        return np.nan
+    ahead = np.arange(0.0, int((len(window) - 1 - start) * window.dt) + 1.0)
+    flown = fly_ahead(twin.situation(window.part(0, start + 1)), plant, ahead)
+    if flown.path is None:
+        return np.inf if flown.diverged else np.nan
+    rows = start + np.rint(ahead / window.dt).astype(int)
+    return float(np.linalg.norm(flown.path - window.p[rows], axis=1).mean())
