@@ -6,11 +6,10 @@ from fleet.physics.actuators import TAU, lagged
 from fleet.physics.dynamics import rates_of_change
 from fleet.physics.wrench import OFFSETS, WIND
 from fleet.simulate import coupled_plant, linear_plant
-from fleet.window import INPUTS, STATES, Window
-from twin_worker.coupled import Coupled, states
+from fleet.window import INPUTS, Window
+from twin_worker.coupled import Coupled
 from twin_worker.identify import Axis
 from twin_worker.output_error import LINE
-from twin_worker.refine import free_run
 
 DYNAMICS, PAPER = "dynamics", "paper"  # coupled, two linear axes
 Plant = Coupled | tuple[Axis, Axis]
@@ -29,53 +28,6 @@ def finite(plant: Plant) -> bool:
     """Tell whether every number of it is finite."""
     parts = (plant.par,) if isinstance(plant, Coupled) else [axis.D for axis in plant]
     return all(bool(np.isfinite(part).all()) for part in parts)
-
-
-def measured(plant: Plant, window: Window) -> np.ndarray:
-    """Give the states as this kind of model has them, (n, 9): u v w over the ground, or through the air."""
-    return states(window) if isinstance(plant, Coupled) else window.x
-
-
-def runs(plant: Plant, window: Window, start: int, length: int) -> np.ndarray:
-    """Run free from a fresh start every `length` rows of window[start:]; nan where a run crosses unmeasured rows.
-
-    Args:
-        plant: the model
-        window: flight; what lies before `start` settles lags and start states
-        start: first row to predict
-        length: rows of a run
-    Returns:
-        states, as `measured` has them, (len(window) - start, 9)
-    """
-    begins = np.arange(start, len(window), length)
-    stops = np.minimum(begins + length, len(window))
-    broken = np.concatenate([[0], np.cumsum(~window.ok)])
-    begins = begins[broken[stops] == broken[begins]]
-    if isinstance(plant, Coupled):
-        y, delta = states(window), lagged(window.u, window.dt, TAU)
-        return plant.fly_each(_fresh(y, window.ok, begins), begins, length, delta, window.dt)[start:]
-    out = np.full((len(window) - start, len(STATES)), np.nan)
-    for axis in plant:
-        columns = [STATES.index(name) for name in axis.states]
-        y, u = axis.scaled(window)
-        for k in begins:
-            stop = min(k + length, len(window))
-            if stop - k > 1:
-                run = np.empty((stop - k, len(columns)))
-                free_run(axis.D, y[k], np.ascontiguousarray(u[k:stop]), run)
-                out[k - start : stop - start, columns] = run * axis.y_scale + axis.y_mean
-    return out
-
-
-def _fresh(y: np.ndarray, ok: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Read the states at rows off a line through the rows up to each; off that row alone where they are broken."""
-    rows = begins[:, None] + np.arange(1 - LINE, 1)
-    smooth = np.einsum("l,mlk->mk", _TO_END, y[np.maximum(rows, 0)])
-    straight = (rows[:, 0] >= 0) & ok[np.maximum(rows, 0)].all(axis=1)
-    return np.where(straight[:, None], smooth, y[begins])
-
-
-_TO_END = np.linalg.pinv(np.column_stack([np.ones(LINE), np.arange(1 - LINE, 1)]))[0]
 
 
 def settled(plant: Plant, good: Window) -> tuple:
