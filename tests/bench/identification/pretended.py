@@ -1,0 +1,159 @@
+"""Fresh flights of the project's own pretend aircraft in gusty wind, and its true airframe without the gusts.
+
+JSBSim flies, the pretend autopilot steers by the errors of its sensors; no byte is sent. Flights take a while, so they
+are kept in the folder that PARAUAV_BENCH_CACHE names, else in the system's folder for temporary files.
+"""
+
+import hashlib
+import os
+import tempfile
+from math import atan2, degrees, hypot
+from pathlib import Path
+
+import numpy as np
+
+from fleet.frames import ned_to_body
+from fleet.pretend.jsbsim import Aircraft, Truth
+from fleet.pretend.missions import HOME
+from fleet.pretend.sensors import Servos
+from fleet.pretend.uav import DT as TICK_S
+from fleet.pretend.uav import PretendUav
+from fleet.pretend.weather import FT
+from fleet.window import STATES
+
+from .flight import Case, Flight, true_airspeed, unwrapped
+
+UAVS = 10
+SECONDS, SETTLE_S = 300.0, 15.0
+WIND, TURBULENCE = 4.0, 3  # mean [m/s], severity (light)
+_SPAN = 2.9  # [m]
+_ROW = 4  # ticks per row
+_EVERY = 10  # rows between two starts of the short horizons
+
+
+def cases(seed: int) -> list[Case]:
+    """Fly every aircraft, or read what was flown before with the same sources."""
+    return [_case(seed, k) for k in range(UAVS)]
+
+
+def _case(seed: int, k: int) -> Case:
+    path = _folder() / f"pretend-{_sources()}-{seed}-{k}.npz"
+    if path.is_file():
+        with np.load(path) as file:
+            kept = dict(file)
+    else:
+        kept = _fly(seed, k)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(path, **kept)
+    x, n = kept["measured"], len(kept["measured"])
+    flight = Flight(
+        name=f"pretend-{k}",
+        uav=k,
+        dt=_ROW * TICK_S,
+        t=_ROW * TICK_S * np.arange(n),
+        x=np.hstack([ned_to_body(*x[:, 3:6].T, x[:, :3]), x[:, 6:9], unwrapped(x[:, 3:6])]),
+        u=np.array([Servos.commands(tuple(pulses)) for pulses in kept["pulses"]]),
+        Va=true_airspeed(x[:, 9], HOME.alt_mm * 1e-3 - kept["p"][:, 2]),
+        ok=np.ones(n, bool),
+        b=_SPAN,
+    )
+    return Case(flight, Replay(_own(seed, k), kept, flight))
+
+
+def _own(seed: int, k: int) -> int:
+    """Give the seed that the pretend aircraft draws its airframe from."""
+    return int(np.random.SeedSequence((seed, k)).generate_state(1)[0])
+
+
+def _fly(seed: int, k: int) -> dict[str, np.ndarray]:
+    """Fly one aircraft; keep a row every 0.04 s: measured, pulses, truth, wind."""
+    uav = PretendUav(k, seed, wind=WIND, turbulence=TURBULENCE)
+    kept: dict[str, list] = {name: [] for name in ("measured", "pulses", "p", "v", "euler", "rates", "wind")}
+    first = int(SETTLE_S / TICK_S)
+    for tick in range(first, first + int(SECONDS / TICK_S), _ROW):
+        uav.step(tick * TICK_S)
+        truth = uav.aircraft.truth()
+        uav.step((tick + 1) * TICK_S)  # in this tick it measures that, and answers
+        if uav.down:
+            raise ValueError(f"pretend-{k}: came down after {tick * TICK_S:.0f} s, expected it to fly; choose a seed")
+        now = uav.now
+        kept["measured"].append(np.concatenate([now.v, now.euler, now.rates, [now.Va]]))
+        kept["pulses"].append(uav.pulses)
+        for name in ("p", "v", "euler", "rates"):
+            kept[name].append(getattr(truth, name))
+        kept["wind"].append([uav.aircraft[f"atmosphere/wind-{way}-fps"] * FT for way in ("north", "east")])
+    return {name: np.array(rows) for name, rows in kept.items()}
+
+
+def _folder() -> Path:
+    return Path(os.environ.get("PARAUAV_BENCH_CACHE") or Path(tempfile.gettempdir()) / f"parauav-bench-{os.getuid()}")
+
+
+def _sources() -> str:
+    """Hash what makes a flight, so that an edit flies anew."""
+    import fleet
+
+    root = Path(fleet.__file__).parent
+    digest = hashlib.sha256(Path(__file__).read_bytes())
+    for folder in ("pretend", "autopilots"):
+        for path in sorted((root / folder).rglob("*.*")):
+            if path.suffix in (".py", ".xml"):
+                digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+class Replay(Aircraft):
+    """The true airframe of one flight, put into its true state and flown by the recorded pulses without gusts."""
+
+    def __init__(self, own: int, kept: dict[str, np.ndarray], flight: Flight) -> None:
+        super().__init__(HOME, own)
+        self._kept, self._flight = kept, flight
+
+    def forecast(self, at: int, n: int) -> np.ndarray:
+        wind = self._kept["wind"][at : at + n].mean(axis=0)
+        self._place(at, wind)
+        told = []
+        for k in range(at, at + n):
+            told.append(self.truth())
+            self.drive(*self._flight.u[k])
+            for _ in range(_ROW):
+                self.blow(*wind)
+                self.step()
+        return self._rows(told, self._flight.x[at, 8])
+
+    def kstep(self, start: int, stop: int, k: int) -> np.ndarray:
+        """Predict row i + k from the truth of row i, for every 10th i; the rest is nan."""
+        out = np.full((stop - start - k, len(STATES)), np.nan)
+        for i in range(0, len(out), _EVERY):
+            out[i] = self.forecast(start + i, k + 1)[k]
+        return out
+
+    def _place(self, at: int, wind: np.ndarray) -> None:
+        """Put it into the true state of row `at`, its servos and motor where the commands before have left them."""
+        kept, fdm = self._kept, self._fdm
+        p, v, euler, rates = (kept[name][at] for name in ("p", "v", "euler", "rates"))
+        fdm["simulation/randomseed"] = 0
+        fdm["ic/terrain-elevation-ft"] = HOME.alt_mm * 1e-3 / FT
+        fdm["ic/lat-geod-deg"] = HOME.lat_e7 * 1e-7 + degrees(p[0] / self._per_rad[0])
+        fdm["ic/long-gc-deg"] = HOME.lon_e7 * 1e-7 + degrees(p[1] / self._per_rad[1])
+        fdm["ic/h-sl-ft"] = (HOME.alt_mm * 1e-3 - p[2]) / FT
+        fdm["ic/vw-mag-fps"] = hypot(*wind) / FT
+        fdm["ic/vw-dir-deg"] = degrees(atan2(wind[1], wind[0])) % 360
+        for name, value in zip(("phi", "theta", "psi-true"), (*euler[:2], euler[2] % (2 * np.pi)), strict=True):
+            fdm[f"ic/{name}-rad"] = value
+        for name, value in zip("ned", v, strict=True):
+            fdm[f"ic/v{name}-fps"] = value / FT
+        for name, value in zip("pqr", rates, strict=True):
+            fdm[f"ic/{name}-rad_sec"] = value
+        self.drive(*self._flight.u[max(at - 2, 0)])  # about one lag of the servos ago
+        fdm.set_trim_status(True)  # lags pass through
+        fdm.run_ic()
+        fdm.set_trim_status(False)
+        self.blow(*wind)
+
+    def _rows(self, told: list[Truth], psi: float) -> np.ndarray:
+        """Lay the truth as a flight's states, the heading unwrapped next to `psi` [rad]."""
+        euler = unwrapped(np.array([truth.euler for truth in told]))
+        euler[:, 2] += 2 * np.pi * np.round((psi - euler[0, 2]) / (2 * np.pi))
+        body = ned_to_body(*euler.T, np.array([truth.v for truth in told]))
+        return np.hstack([body, np.array([truth.rates for truth in told]), euler])
