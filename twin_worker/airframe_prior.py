@@ -26,23 +26,20 @@ _WIND = 2.0  # doubt of a wind that telemetry was asked for [m/s]
 _SPANS = 0.3, 20.0  # believable [m]
 
 
-def prior(
-    airframe: Airframe, at: np.ndarray, trim: np.ndarray, wind: np.ndarray, span: float | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def prior(airframe: Airframe, at: np.ndarray, trim: np.ndarray, wind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Give mean and standard deviation of the parameters of `fleet.physics.wrench`, each (37,).
 
     Args:
-        airframe: what is known of the aircraft, or a class
+        airframe: what is known of the aircraft, or a class; one without a span is scaled as its speed suggests
         at: U0, W0, mean air-relative velocity forward and down, (2,) [m/s]
         trim: mean inputs delta_a delta_e delta_r delta_t, (4,)
         wind: mean wind, NED, the direction it blows to, (2,) or (3,) [m/s]
-        span: of the aircraft at hand, for a class; None: as its speed suggests [m]
     """
     mean = dict.fromkeys(NAMES, 0.0)
     floor = dict(_FLOOR)
     if airframe.scale:
         k = airframe.value["speed"] / at[0]
-        l = airframe.value["b"] / float(np.clip(span, *_SPANS)) if span else k
+        l = airframe.value["b"] / float(np.clip(airframe.span, *_SPANS)) if airframe.span else k
         mean |= {n: v * _scale(n, k, l) for n, v in derivatives(airframe, airframe.value["speed"]).items()}
         floor |= {n: _FLOOR[n] * l for n in ("M_0", "M_dt", "L_0", "N_0")}
     else:

@@ -34,6 +34,7 @@ class Airframe:
         throw: deflection at full command, with the book's sign [rad]
         coefficient: per rad or per normalised rate [-]
         scale: the numbers are of a class, to be scaled to the aircraft at hand
+        span: of that aircraft, where it is known [m]
     """
 
     name: str
@@ -42,6 +43,7 @@ class Airframe:
     throw: dict[str, float]
     coefficient: dict[str, float]
     scale: bool
+    span: float | None = None
 
 
 def load(which: str) -> Airframe:
@@ -69,7 +71,9 @@ def load(which: str) -> Airframe:
     throw = _numbers(path.name, read.get("throw", {}), _THROWS)
     coefficient = _numbers(path.name, read.get("coefficients", {}), _COEFFICIENTS)
     named = str(read.get("name", path.stem))
-    return Airframe(named, str(read.get("source", "")), value, throw, coefficient, bool(read.get("scale", False)))
+    span = _numbers(path.name, read, ("span",))["span"] if "span" in read else None
+    source, scale = str(read.get("source", "")), bool(read.get("scale", False))
+    return Airframe(named, source, value, throw, coefficient, scale, span)
 
 
 def _numbers(file: str, table: object, names: tuple[str, ...]) -> dict[str, float]:

@@ -1,77 +1,77 @@
-"""Ours: the product's own identification, as the bench calls it. For now the two linear axes of the twin.
+"""Ours: the product's own identification, as the bench calls it.
 
 The bench makes one `Ours` per flight and calls `identify` for its windows in the order of time, so that it may start
 warm from the window before. Nobody hands over rows that have not been flown yet: `known` ends where the window ends.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fleet.frames import body_to_ned
-from fleet.window import STATES, Window
-from twin_worker.identify import AXES, Axis, identify_axis
-from twin_worker.refine import free_run
+from fleet.airframes import Airframe, load
+from fleet.frames import body_to_ned, ned_to_body
+from fleet.physics.actuators import TAU, lagged
+from fleet.window import Window
+from twin_worker.coupled import Coupled, identify
+from twin_worker.observer import Observer, observer
+from twin_worker.wind import WindFilter
 
 from .flight import Flight
+from .gusty import WEATHER
 
-_FREE_RUN_S = 8.0  # of the prediction-error step [s]
+_LEAD = 250  # rows that settle lags and filter
+_WIND_S = 0.2  # between rows the wind filter takes [s]
 
 
 @dataclass(frozen=True)
-class Linear:
-    """Both linear axes, as one model."""
+class Seen:
+    """One identified aircraft, as the bench asks for it."""
 
-    axes: tuple[Axis, ...]
+    eye: Observer
 
     def forecast(self, known: Flight, u: np.ndarray) -> np.ndarray:
-        """Run free from the last known row under the inputs u (n, 4): rows (n, 9), the first right after `known`."""
-        x = np.vstack([known.x[-1], np.tile(known.x[-1], (len(u), 1))])
-        window = _window(x, np.vstack([known.u[-1], u]), known.dt)
-        for axis in reversed(self.axes):  # the longitudinal axis asks for the bank angle that the lateral one foretells
-            y, inputs = axis.scaled(window)
-            out = np.empty_like(y)
-            free_run(axis.D, y[0], np.ascontiguousarray(inputs), out)
-            window.x[:, _columns(axis)] = out * axis.y_scale + axis.y_mean
-        return window.x[1:]
+        """Run free from the end of `known` under the inputs u (n, 4): rows (n, 9), the first right after `known`."""
+        past = known.part(max(len(known) - _LEAD, 0), len(known))
+        delta = lagged(np.vstack([past.u, u]), known.dt, TAU)
+        now = self.eye.track(past.x, delta[: len(past)])[-1:]
+        return self.eye.fly(now, np.array([len(past) - 1]), len(u) + 1, delta)[0, 1:]
 
     def kstep(self, flight: Flight, k: int) -> np.ndarray:
-        """Predict row i + k from row i, for every i: (n - k, 9)."""
-        window = _window(flight.x, flight.u, flight.dt)
-        out = np.empty((len(flight) - k, len(STATES)))
-        for axis in self.axes:
-            y, inputs = axis.scaled(window)
-            n, x = y.shape[1], y[:-k]
-            for j in range(k):
-                rows = inputs[j : len(y) - k + j]
-                x = np.clip(x @ axis.D[:, :n].T + rows @ axis.D[:, n:-1].T + axis.D[:, -1], -1e6, 1e6)
-            out[:, _columns(axis)] = x * axis.y_scale + axis.y_mean
-        return out
+        """Predict row i + k from the rows up to i, for every i: (n - k, 9)."""
+        delta = lagged(flight.u, flight.dt, TAU)
+        begins = np.arange(len(flight) - k)
+        return self.eye.fly(self.eye.track(flight.x, delta)[begins], begins, k + 1, delta)[:, k]
 
 
 class Ours:
     """The identification of one flight."""
 
     def __init__(self) -> None:
-        self._last: tuple[Axis | None, ...] = (None, None)
+        self._wind = WindFilter()
+        self._heard = 0
+        self._found: list[Coupled] = []
 
-    def identify(self, known: Flight, start: int) -> Linear:
+    def identify(self, known: Flight, start: int) -> Seen:
         """Identify on the rows from `start` to the end of `known`."""
-        now = known.part(start, len(known))
-        window = _window(now.x, now.u, now.dt, now.ok)
-        self._last = tuple(
-            identify_axis(axis, window, _FREE_RUN_S, last)[1] for axis, last in zip(AXES, self._last, strict=True)
-        )
-        return Linear(self._last)
+        v = body_to_ned(known.x[:, 6], known.x[:, 7], known.x[:, 8], known.x[:, :3])
+        for k in range(self._heard, len(known), max(round(_WIND_S / known.dt), 1)):
+            if np.isfinite(known.Va[k]):
+                self._wind.update(float(known.t[k]), v[k], float(known.Va[k]), float(known.x[k, 8]))
+        self._heard = len(known)
+        wind = self._wind.wind
+        air = known.x.copy()
+        air[:, :3] = ned_to_body(known.x[:, 6], known.x[:, 7], known.x[:, 8], v - wind)
+        s = slice(start, None)
+        n = len(known) - start
+        window = Window(known.t[s], air[s], known.u[s], np.zeros((n, 3)), v[s], known.ok[s], np.zeros(n, bool))
+        last = next((one for one in reversed(self._found) if one.t1 <= window.t[0]), None)
+        model = identify(window, wind, airframe(known), last)
+        self._found.append(model)
+        stretch = known.part(start, len(known))
+        return Seen(observer(model, stretch.x, lagged(stretch.u, known.dt, TAU), known.dt))
 
 
-def _columns(axis: Axis) -> list[int]:
-    return [STATES.index(name) for name in axis.states]
-
-
-def _window(x: np.ndarray, u: np.ndarray, dt: float, ok: np.ndarray | None = None) -> Window:
-    """Lay a flight in the twin's own form; the wind is taken for none."""
-    n = len(x)
-    v = body_to_ned(x[:, 6], x[:, 7], x[:, 8], x[:, :3])
-    good = np.ones(n, bool) if ok is None else ok
-    return Window(dt * np.arange(n), x.copy(), u, np.cumsum(v * dt, axis=0), v, good, np.zeros(n, bool))
+def airframe(flight: Flight) -> Airframe:
+    """Give what is known of the aircraft: the yardstick's type, else a class at this span."""
+    yardstick = flight.name.split("-")[0] in WEATHER
+    return load("aerosonde") if yardstick else replace(load("small_fixed_wing"), span=flight.b)
