@@ -10,11 +10,12 @@ from typing import Any, Protocol, TypeVar
 
 import zenoh
 
-from fleet.codec import Stamp, decode, encode, encoding, pack_stamp, unpack_stamp
+from fleet.codec import Stamp, Wire, decode, encode, encoding, pack_stamp, unpack_stamp
 from fleet.contract import PER_UAV
 
 M = TypeVar("M")
 Heard = Callable[[Any, Stamp | None], None]
+Overheard = Callable[[bytes, str, Stamp | None], None]
 Answers = Iterable[tuple[Any, Stamp | None]]
 Answer = Callable[[int | None, dict[str, str], bytes], Answers]
 
@@ -42,8 +43,14 @@ class Bus(AbstractContextManager, Protocol):
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
         """Send one message to whoever listens."""
 
+    def put(self, wire: Wire, stamp: Stamp | None = None) -> None:
+        """Send one message that is packed already."""
+
     def subscribe(self, kind: type, heard: Heard) -> None:
         """Call `heard(message, stamp)` for every message of a class; undecodable ones are counted, not raised."""
+
+    def overhear(self, kind: type, heard: Overheard) -> None:
+        """Call `heard(payload, encoding, stamp)` for every message of a class, as it came and whatever is in it."""
 
     def answer(self, kind: type, reply: Answer) -> None:
         """Declare one wildcard queryable for a class: `reply(uav or None, parameters, payload)`."""
@@ -90,6 +97,7 @@ class MemoryBus(AbstractContextManager):
     def __init__(self) -> None:
         self.writer = secrets.randbits(63)
         self._heard: dict[type, list[Heard]] = {}
+        self._overheard: dict[type, list[Overheard]] = {}
         self._reply: dict[type, list[Answer]] = {}
         self.bad = 0
 
@@ -97,8 +105,14 @@ class MemoryBus(AbstractContextManager):
         """Send one message to whoever listens."""
         self.deliver(type(message), encode(message), encoding(type(message)), stamp)
 
+    def put(self, wire: Wire, stamp: Stamp | None = None) -> None:
+        """Send one message that is packed already."""
+        self.deliver(wire.kind, wire.payload, encoding(wire.kind), stamp)
+
     def deliver(self, kind: type, payload: bytes, named: str, stamp: Stamp | None = None) -> None:
         """Hand bytes to the listeners as if they had come over a wire; count what does not decode."""
+        for overheard in self._overheard.get(kind, []):
+            overheard(payload, named, stamp)
         for heard in self._heard.get(kind, []):
             try:
                 message: Any = decode(kind, payload, named)
@@ -110,6 +124,10 @@ class MemoryBus(AbstractContextManager):
     def subscribe(self, kind: type, heard: Heard) -> None:
         """Call `heard(message, stamp)` for every message of a class."""
         self._heard.setdefault(kind, []).append(heard)
+
+    def overhear(self, kind: type, heard: Overheard) -> None:
+        """Call `heard(payload, encoding, stamp)` for every message of a class, as it came."""
+        self._overheard.setdefault(kind, []).append(heard)
 
     def answer(self, kind: type, reply: Answer) -> None:
         """Declare one wildcard queryable for a class."""
@@ -133,6 +151,7 @@ class MemoryBus(AbstractContextManager):
     def close(self) -> None:
         """Forget everyone."""
         self._heard.clear()
+        self._overheard.clear()
         self._reply.clear()
 
     def __exit__(self, *_: object) -> None:
@@ -153,14 +172,18 @@ class ZenohBus(AbstractContextManager):
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
         """Send one message to whoever listens."""
         kind = type(message)
-        name = key(kind, message.uav if kind in PER_UAV else f"{self.writer:016x}")
+        self.put(Wire(kind, message.uav if kind in PER_UAV else -1, encode(message)), stamp)
+
+    def put(self, wire: Wire, stamp: Stamp | None = None) -> None:
+        """Send one message that is packed already."""
+        name = key(wire.kind, wire.uav if wire.kind in PER_UAV else f"{self.writer:016x}")
         publisher = self._publishers.get(name)
         if publisher is None:
             with self._lock:
                 if (publisher := self._publishers.get(name)) is None:
-                    publisher = self._session.declare_publisher(name, encoding=encoding(kind))
+                    publisher = self._session.declare_publisher(name, encoding=encoding(wire.kind))
                     self._publishers[name] = publisher
-        publisher.put(encode(message), attachment=pack_stamp(stamp) if stamp else None)
+        publisher.put(wire.payload, attachment=pack_stamp(stamp) if stamp else None)
 
     def subscribe(self, kind: type, heard: Heard) -> None:
         """Call `heard(message, stamp)` for every message of a class, on a thread of the session."""
@@ -169,6 +192,14 @@ class ZenohBus(AbstractContextManager):
             pair = self._read(kind, sample)
             if pair is not None:
                 heard(*pair)
+
+        self._declared.append(self._session.declare_subscriber(key(kind, "*"), on_sample))
+
+    def overhear(self, kind: type, heard: Overheard) -> None:
+        """Call `heard(payload, encoding, stamp)` for every message of a class, as it came, on a session's thread."""
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            heard(sample.payload.to_bytes(), str(sample.encoding), _stamp(sample))
 
         self._declared.append(self._session.declare_subscriber(key(kind, "*"), on_sample))
 
@@ -218,8 +249,7 @@ class ZenohBus(AbstractContextManager):
         except ValueError:
             self.bad += 1
             return None
-        attachment = sample.attachment
-        return message, unpack_stamp(attachment.to_bytes() if attachment is not None else None)
+        return message, _stamp(sample)
 
     def present(self, name: str) -> None:
         """Declare the liveliness token `parauav/@live/{name}`; it goes with the session."""
@@ -231,6 +261,10 @@ class ZenohBus(AbstractContextManager):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _stamp(sample: zenoh.Sample) -> Stamp | None:
+    return unpack_stamp(sample.attachment.to_bytes() if sample.attachment is not None else None)
 
 
 def _parameters(query: zenoh.Query) -> dict[str, str]:

@@ -20,6 +20,18 @@ class Stamp(NamedTuple):
     writer: int
 
 
+class Wire(NamedTuple):
+    """A message that is packed already."""
+
+    kind: type  # from `fleet.contract`
+    uav: int
+    payload: bytes
+
+    def message(self) -> Any:
+        """Unpack it."""
+        return decode(self.kind, self.payload)
+
+
 def encode(message: Any) -> bytes:
     """Pack one message as a msgpack map."""
     return _PACK.encode(message)

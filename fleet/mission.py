@@ -39,6 +39,7 @@ _KINDS = {16: WAYPOINT, 17: LOITER_UNLIMITED, 18: LOITER_TURNS, 19: LOITER_TIME,
 _KINDS |= {21: LAND, 22: TAKEOFF, 31: LOITER_TO_ALT, 82: WAYPOINT, 84: TAKEOFF, 85: LAND}
 _RETURN, _LAST_NAV, _JUMP, _SPEED = 20, 95, 177, 178  # MAV_CMD: RETURN_TO_LAUNCH, NAV_LAST, DO_JUMP, DO_CHANGE_SPEED
 _ABSOLUTE, _RELATIVE, _TERRAIN = (0, 5), (3, 6), (10, 11)  # MAV_FRAME
+GLOBAL_FRAMES = _ABSOLUTE + _RELATIVE + _TERRAIN
 _SHORTEST = 1.0  # a line shorter than this has no direction worth flying [m]
 _HIGHEST = 1e5  # altitudes beyond are noise [m]
 _RTL_ALTITUDE = 100.0  # ArduPlane's default RTL_ALTITUDE [m]
@@ -140,8 +141,8 @@ def _fault(item: Item) -> str:
         return f"longitude {item.lon_e7} (1e-7 deg), expected within 180 deg"
     if not abs(item.alt_m) <= _HIGHEST:
         return f"altitude {item.alt_m}, expected within {_HIGHEST:.0f} m"
-    if item.frame not in _ABSOLUTE + _RELATIVE + _TERRAIN:
-        return f"frame {item.frame}, expected one of {_ABSOLUTE + _RELATIVE + _TERRAIN}"
+    if item.frame not in GLOBAL_FRAMES:
+        return f"frame {item.frame}, expected one of {GLOBAL_FRAMES}"
     return ""
 
 

@@ -5,12 +5,13 @@ import contextlib
 import logging
 import sys
 
+from fleet.bars import shown
 from fleet.bus import ROUTER, connect
 from fleet.cli import guarded, parser_for, stop_on_signal
+from fleet.telemetry.ids import Ids
 from gateway.link import Link, Udp
 from gateway.pump import Pump
 from gateway.recorded import Replay
-from gateway.show import shown
 from gateway.spec import read_spec
 
 DEFAULT_LINK = "udpin:127.0.0.1:14550"
@@ -19,6 +20,7 @@ EXAMPLES = """
   gateway --link udpin:0.0.0.0:14550                   listen on every network
   gateway --link "udpin:127.0.0.1:14550#offset=-1"     UAV id = system id - 1
   gateway --link "replay:flight.tlog.xz?speed=4"       play a recording four times as fast
+  gateway --link "replay:flight.tlog?speed=max&copies=50"
   gateway --listen-only                                send nothing to any aircraft
 """
 
@@ -29,11 +31,16 @@ def run(args: argparse.Namespace) -> int:
     stop = stop_on_signal()
     with connect(args.router) as bus, contextlib.ExitStack() as held:
         links: list[Link] = []
+        ids = Ids()
         for spec in specs:
-            link: Link = Udp(spec) if spec.kind == "udpin" else Replay(spec)
+            link: Link = Udp(spec) if spec.kind == "udpin" else Replay(spec, ids)
             held.callback(link.close)
             links.append(link)
-        with shown(links):
+            print(f"gateway: {spec.text}", flush=True)
+        replays = [link for link in links if isinstance(link, Replay)]
+        with shown(replays, lambda line: print(f"gateway: {line}", flush=True)):
+            for replay in replays:
+                replay.look(stop)
             Pump(links, bus, args.listen_only).run(stop)
     return 0
 

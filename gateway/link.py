@@ -6,9 +6,9 @@ import socket
 import threading
 import time
 from collections.abc import Hashable, Sequence
-from typing import NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast
 
-from fleet.contract import Message
+from fleet.codec import Wire
 from fleet.telemetry.decode import Piece
 from gateway.spec import Spec
 
@@ -24,11 +24,12 @@ def wall() -> float:
 
 
 class Batch(NamedTuple):
-    """What one link heard: bytes as they came, or the news of a recording."""
+    """What one link heard: bytes as they came, or the news of a recording and of its copies."""
 
     link: int
     heard: Sequence[Piece] = ()
-    news: Sequence[Message] = ()
+    news: Sequence[Any] = ()
+    copies: Sequence[Wire] = ()
     ended: bool = False
 
 

@@ -1,37 +1,59 @@
 """Contract messages to the bus; the latest of each aircraft answers whoever asks."""
 
 import threading
-from collections.abc import Iterable
+import time
+from collections.abc import Hashable, Iterable
 from functools import partial
+from typing import Any
+
+import msgspec
 
 from fleet.bus import Answers, Bus
-from fleet.contract import Account, Message, Mission, Params, Status
+from fleet.codec import Stamp, Wire
+from fleet.contract import Account, FleetState, Mission, Params, Status
+from fleet.telemetry.fleet_news import RESULTS
 
 KEPT = (Status, Mission, Params)
 REPEAT_S = 10.0  # mission and parameters are said again, for those who missed them [s]
 
 
 class Publisher:
-    """Publish, remember the latest, answer queries."""
+    """Publish, remember the latest, answer queries.
 
-    def __init__(self, bus: Bus) -> None:
+    Args:
+        bus: where messages go
+        results: answer also for recorded results, as a worker would
+    """
+
+    def __init__(self, bus: Bus, results: bool = False) -> None:
         self.published = 0
         self._bus = bus
         self._lock = threading.Lock()  # answers come from a thread of the bus
-        self._latest: dict[type, dict[int, Message]] = {kind: {} for kind in KEPT}
+        kept = KEPT + RESULTS if results else KEPT
+        self._latest: dict[type, dict[Hashable, tuple[Any, Stamp | None]]] = {kind: {} for kind in kept}
         self._account: Account | None = None
         self._repeated = 0.0
-        for kind in KEPT:
+        for kind in kept:
             bus.answer(kind, partial(self._answers, kind))
         bus.answer(Account, self._account_answer)
 
-    def publish(self, messages: Iterable[Message]) -> None:
+    def publish(self, messages: Iterable[Any]) -> None:
         """Put messages on the bus."""
         for message in messages:
-            if type(message) in self._latest:
-                with self._lock:
-                    self._latest[type(message)][message.uav] = message
-            self._put(message)
+            kind = type(message)
+            stamp = None
+            if kind in RESULTS:
+                message, stamp = self._claimed(message)
+            self._keep(kind, (getattr(message, "uav", 0), str(getattr(message, "kind", ""))), message, stamp)
+            self._bus.publish(message, stamp)
+            self.published += 1
+
+    def put(self, wires: Iterable[Wire]) -> None:
+        """Put messages on the bus that are packed already; results of workers are never among them."""
+        for wire in wires:
+            self._keep(wire.kind, (wire.uav, ""), wire, None)
+            self._bus.put(wire)
+            self.published += 1
 
     def account(self, account: Account) -> None:
         """Put the counters on the bus."""
@@ -44,18 +66,28 @@ class Publisher:
             return
         self._repeated = mono
         for kind in (Mission, Params):
-            for message in list(self._latest[kind].values()):
-                self._put(message)
+            for message, _ in list(self._latest[kind].values()):
+                (self.put if isinstance(message, Wire) else self.publish)([message])
 
-    def _put(self, message: Message) -> None:
-        self._bus.publish(message)
-        self.published += 1
+    def _keep(self, kind: type, who: Hashable, message: Any, stamp: Stamp | None) -> None:
+        if kind in self._latest:
+            with self._lock:
+                self._latest[kind][who] = message, stamp
+
+    def _claimed(self, message: Any) -> tuple[Any, Stamp]:
+        """Claim the aircraft anew with every recorded result, so that no worker that computes its own is believed."""
+        epoch = time.time_ns() // 1_000_000
+        if isinstance(message, FleetState):
+            rows = tuple(msgspec.structs.replace(row, epoch=epoch) for row in message.rows)
+            message = msgspec.structs.replace(message, rows=rows)
+        return message, Stamp(epoch, self._bus.writer)
 
     def _answers(self, kind: type, uav: int | None, settings: dict[str, str], payload: bytes) -> Answers:
         del settings, payload
         with self._lock:
             found = list(self._latest[kind].values())
-        return [(message, None) for message in found if uav is None or message.uav == uav]
+        told = [(one.message() if isinstance(one, Wire) else one, stamp) for one, stamp in found]
+        return [(one, stamp) for one, stamp in told if uav is None or getattr(one, "uav", uav) == uav]
 
     def _account_answer(self, uav: int | None, settings: dict[str, str], payload: bytes) -> Answers:
         del uav, settings, payload

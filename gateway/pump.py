@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import msgspec
 
 from fleet.bus import Bus
+from fleet.contract import Message
 from fleet.telemetry.craft import Craft
 from fleet.telemetry.intake import Intake
 from gateway.account import Tally
@@ -32,7 +33,7 @@ class Pump:
     def __init__(self, links: Sequence[Link], bus: Bus, listen_only: bool = False) -> None:
         self.links = links
         self.tally = Tally()
-        self.publisher = Publisher(bus)
+        self.publisher = Publisher(bus, results=any(link.spec.results for link in links))
         claims: dict[int, Craft] = {}
         self.intakes = [Intake(link.spec.offset, claims) for link in links]
         self._onboards = [Onboard() for _ in links]
@@ -72,8 +73,11 @@ class Pump:
             intake.hear(t, data, source)
         if batch.news:
             self._recorded = max(self._recorded, *(news.t for news in batch.news))
-            self._players.update(news.uav for news in batch.news)
+            self._players.update(news.uav for news in batch.news if isinstance(news, Message))
             self.publisher.publish(batch.news)
+        if batch.copies:
+            self._players.update(wire.uav for wire in batch.copies)
+            self.publisher.put(batch.copies)
         if batch.ended:
             self._open.discard(batch.link)
 

@@ -2,9 +2,12 @@
 
 import contextlib
 from typing import NamedTuple
-from urllib.parse import parse_qsl
+from urllib.parse import parse_qsl, unquote
+
+from fleet.telemetry.pace import read_speed
 
 LOOPBACK = "127.0.0.1"
+MOST_COPIES = 10_000
 
 
 class Spec(NamedTuple):
@@ -16,10 +19,14 @@ class Spec(NamedTuple):
     port: int
     speed: float  # recorded seconds per second; inf: as fast as it can be read
     offset: int  # UAV id = MAVLink system id + offset
+    copies: int = 1  # aircraft in place of each recorded one, itself included
+    results: bool = False  # play also what workers said, where it was recorded
 
 
 def read_spec(text: str, offset: int = 0) -> Spec:
-    """Read `udpin:HOST:PORT` or `replay:PATH?speed=N`, each with an optional `#offset=-1`.
+    """Read `udpin:HOST:PORT` or `replay:PATH?speed=N&copies=N&results=1`, each with an optional `#offset=-1`.
+
+    In PATH, `%3F` stands for ?, `%23` for # and `%25` for %.
 
     Raises:
         ValueError: when it is neither, or a value does not fit.
@@ -37,24 +44,11 @@ def read_spec(text: str, offset: int = 0) -> Spec:
             path, _, query = rest.partition("?")
             asked = dict(parse_qsl(query))
             speed = read_speed(asked.pop("speed", "1"))
-            if path and not asked:
-                return Spec(text, kind, path, 0, speed, offset)
+            copies, results = int(asked.pop("copies", "1")), asked.pop("results", "0")
+            fits = 1 <= copies <= MOST_COPIES and (results == "0" or (results == "1" and copies == 1))
+            if path and not asked and fits:
+                return Spec(text, kind, unquote(path), 0, speed, offset, copies, results == "1")
     raise ValueError(
-        f"--link: found {text!r}, expected udpin:HOST:PORT or replay:FILE?speed=4, "
+        f"--link: found {text!r}, expected udpin:HOST:PORT or replay:FILE?speed=4&copies=10&results=1, "
         "both with #offset=-1 if wanted; write one of these"
     )
-
-
-def read_speed(text: str) -> float:
-    """Read a replay speed: a number of times real time, or `max`.
-
-    Raises:
-        ValueError: when it is neither.
-    """
-    try:
-        speed = float("inf") if text == "max" else float(text)
-    except ValueError:
-        speed = 0.0
-    if not speed > 0:
-        raise ValueError(f"speed: found {text!r}, expected a number above 0 or max; write e.g. 4")
-    return speed

@@ -51,9 +51,11 @@ class Ear:
 def test_a_link_is_read():
     spec = read_spec("udpin:0.0.0.0:14550#offset=-1")
     assert (spec.kind, spec.where, spec.port, spec.offset) == ("udpin", "0.0.0.0", 14550, -1)
-    assert read_spec("udpin::14550", 3)[2:] == ("127.0.0.1", 14550, 1.0, 3)
+    assert read_spec("udpin::14550", 3)[2:6] == ("127.0.0.1", 14550, 1.0, 3)
     assert read_spec("replay:/a b/c.tlog.xz?speed=max")[1:5] == ("replay", "/a b/c.tlog.xz", 0, float("inf"))
     assert read_spec("replay:c.tlog?speed=4").speed == 4
+    assert read_spec("replay:a%3F%23.bin?copies=50")[2:] == ("a?#.bin", 0, 1.0, 0, 50, False)
+    assert read_spec("replay:c.parauav?results=1").results
 
 
 @pytest.mark.parametrize(
@@ -69,6 +71,9 @@ def test_a_link_is_read():
         "udpin:h:1#offset=x",
         "udpin:h:1#a=1",
         "replay:x.tlog?sped=4",
+        "replay:x.tlog?copies=0",
+        "replay:x.tlog?copies=2&results=1",
+        "replay:x.tlog?results=yes",
     ],
 )
 def test_what_is_no_link_stops_at_start(text):

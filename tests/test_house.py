@@ -23,7 +23,7 @@ ROOMS = (  # inside fleet a room imports only from rooms above it, and from itse
     ("autopilots",),
     ("simulate",),
     ("telemetry",),
-    ("sheet", "page"),
+    ("sheet", "page", "bars"),
     ("pretend",),
     ("config",),
     ("children",),

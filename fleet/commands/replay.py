@@ -3,33 +3,48 @@
 import argparse
 import subprocess
 import sys
+import threading
+from pathlib import Path
+from urllib.parse import quote
 
+from fleet.bars import shown
 from fleet.bus import ROUTER
 from fleet.cli import stop_on_signal
+from fleet.telemetry.airing import MOST_ON_A_LINK, Airing, address
+from fleet.telemetry.ids import Ids
+from fleet.telemetry.pace import read_speed
 
 EXAMPLES = """
   fleet replay flight.tlog
-  fleet replay flight.tlog.xz --speed 4
-  fleet replay one.tlog two.tlog --speed max --router tcp/127.0.0.1:7447
+  fleet replay flight.tlog.xz log7.bin --speed 4
+  fleet replay one.tlog two.ulg --speed max --router tcp/127.0.0.1:7447
+  fleet replay monday.parauav --results                        what the twins said then, not what they say now
+  fleet replay flight.tlog --copies 50                         fifty aircraft, 500 m apart
+  fleet replay flight.tlog --copies 50 --to 127.0.0.1:14550    the same as MAVLink over UDP
 """
 _PATIENCE_S = 10.0
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `fleet replay`."""
-    parser.add_argument("file", nargs="+", metavar="FILE", help="telemetry log: .tlog or .tlog.xz")
+    parser.add_argument("file", nargs="+", metavar="FILE", help="recordings of any kind, also compressed")
     parser.add_argument("--speed", default="1", metavar="N|max", help="times real time, or max (1)")
+    parser.add_argument("--copies", type=int, default=1, metavar="N", help="aircraft for each recorded one (1)")
+    parser.add_argument("--results", action="store_true", help="play also the models, predictions and alerts recorded")
+    parser.add_argument("--to", metavar="HOST:PORT", help="send a .tlog as MAVLink over UDP there, on this machine")
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
     parser.add_argument("--router", default=ROUTER, help=f"where the bus is ({ROUTER})")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Start a gateway that plays the files; its exit code is ours."""
-    command = [sys.executable, "-m", "gateway", "--router", args.router, f"--offset={args.offset}", "--listen-only"]
-    for name in args.file:
-        command += ["--link", f"replay:{name}?speed={args.speed}"]
+    """Start a gateway that plays the files; its exit code is ours. Or send them as datagrams."""
+    check(args)
+    if args.to:
+        return _send(args)
+    options = [f"--link={link(name, args)}" for name in args.file]
+    options += ["--router", args.router, f"--offset={args.offset}", "--listen-only"]
     stop = stop_on_signal()
-    child = subprocess.Popen(command)
+    child = subprocess.Popen([sys.executable, "-m", "gateway", *options])
     try:
         while child.poll() is None and not stop.wait(0.2):
             pass
@@ -38,3 +53,39 @@ def run(args: argparse.Namespace) -> int:
             child.terminate()
     code = child.wait(_PATIENCE_S)
     return code if code >= 0 else 128 - code
+
+
+def _send(args: argparse.Namespace) -> int:
+    """Send every file in a thread of its own; exit code 1 where one could not be sent to its end."""
+    to = address(args.to)
+    ids = Ids(1, MOST_ON_A_LINK)
+    airings = [Airing(Path(name), read_speed(args.speed), args.copies, ids) for name in args.file]
+    stop = stop_on_signal()
+    threads = [threading.Thread(target=airing.send, args=(to, stop), name=airing.name) for airing in airings]
+    with shown(airings, lambda line: print(f"fleet replay: {line}", file=sys.stderr, flush=True)):
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    for airing in airings:
+        print(f"fleet replay: {airing.trouble or f'{airing.name}: {airing.words()}'}", file=sys.stderr)
+    return 1 if any(airing.trouble for airing in airings) else 0
+
+
+def check(args: argparse.Namespace) -> None:
+    """Refuse wrong use before anything is opened.
+
+    Raises:
+        ValueError: when an option makes no sense; the sentence says which.
+    """
+    read_speed(args.speed)
+    if not 1 <= args.copies <= 10_000:
+        raise ValueError(f"--copies: found {args.copies}, expected 1 to 10,000; change it")
+    if args.results and args.copies > 1:
+        raise ValueError("--results: found --copies too, expected one of them; results are of the aircraft recorded")
+
+
+def link(name: str, args: argparse.Namespace) -> str:
+    """Give the gateway's `--link` for one recording, by its name and --speed, --copies and --results."""
+    path = quote(str(Path(name).resolve()), safe="/ ")
+    return f"replay:{path}?speed={args.speed}&copies={args.copies}&results={int(args.results)}"

@@ -15,13 +15,16 @@ from rich.text import Text
 from fleet.bus import ROUTER, Bus, connect, open_router, reachable
 from fleet.children import Children
 from fleet.cli import stop_on_signal
+from fleet.commands.replay import check as check_playing
+from fleet.commands.replay import link
 from fleet.commands.status import as_objects, fleet_rows, table
 from fleet.contract import FleetRow, FleetState, State
 
 EXAMPLES = """
   fleet up --uavs 8
   fleet up --link udpin:0.0.0.0:14550
-  fleet up --replay flight.tlog.xz --speed 4
+  fleet up --replay flight.tlog.xz log7.bin --speed 4
+  fleet up --replay monday.parauav --results
   fleet up --uavs 8 --for 240 --no-viewer --summary summary.json
   fleet up --router tcp/127.0.0.1:7448 --mavlink 127.0.0.1:14551 --port 8081      a second fleet beside the first
 """
@@ -34,8 +37,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--uavs", type=int, default=8, metavar="N", help="simulated aircraft, ids 0 to N-1 (8)")
     parser.add_argument("--mavlink", default=_MAVLINK, metavar="HOST:PORT", help=f"where they send UDP ({_MAVLINK})")
     parser.add_argument("--link", action="append", default=[], help="real aircraft instead, e.g. udpin:0.0.0.0:14550")
-    parser.add_argument("--replay", action="append", default=[], metavar="FILE", help="recordings instead")
+    parser.add_argument(
+        "--replay", action="extend", nargs="+", default=[], metavar="FILE", help="recordings of any kind instead"
+    )
     parser.add_argument("--speed", default="1", help="replay speed, a number or max (1)")
+    parser.add_argument("--copies", type=int, default=1, metavar="N", help="aircraft for each recorded one (1)")
+    parser.add_argument("--results", action="store_true", help="show the results recorded, compute none")
     parser.add_argument("--for", dest="seconds", type=float, default=0.0, help="stop this long after the first sample")
     parser.add_argument("--no-viewer", action="store_true", help="without the web page")
     parser.add_argument("--port", type=int, default=8080, help="port of the web page (8080)")
@@ -68,6 +75,9 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"--uavs: found {args.uavs}, expected 1 to 250 aircraft; start several fleets for more")
     if not 0 <= args.seconds < float("inf"):
         raise ValueError(f"--for: found {args.seconds} s, expected 0 (until Ctrl-C) or more; change it")
+    check_playing(args)
+    if args.results and not args.replay:
+        raise ValueError("--results: found no --replay, expected a recording made by `fleet record`; name one")
     for name in args.replay:
         if not Path(name).is_file():
             raise ValueError(f"--replay: found no recording {name!r}, expected a file; check the path")
@@ -91,9 +101,11 @@ def _check_free(mavlink: str) -> None:
 
 def _start(children: Children, args: argparse.Namespace) -> None:
     router = ["--router", args.router]
-    children.start("twin worker", "twin_worker", "--uavs", "0-249", *router)
-    links = [f"--link={link}" for link in args.link]
-    links += [f"--link=replay:{Path(file).resolve()}?speed={args.speed}" for file in args.replay]
+    if not args.results:
+        ids = "0-999999" if args.replay else "0-249"
+        children.start("twin worker", "twin_worker", "--uavs", ids, *router)
+    links = [f"--link={text}" for text in args.link]
+    links += [f"--link={link(file, args)}" for file in args.replay]
     if links:
         children.start("gateway", "gateway", *links, *router)
     else:

@@ -43,7 +43,7 @@ class Frames(NamedTuple):
 
     def fields(self, which: np.ndarray, name: str) -> "Fields":
         """Give the fields of frames `which`, all of one message, as arrays."""
-        kind = _dtype(name)
+        kind = layout(name)
         laid = s.gather(self.buf, self.at[which, s.PAYLOAD], self.at[which, s.SIZE], kind.itemsize)
         return Fields(laid.view(kind)[:, 0])
 
@@ -66,8 +66,8 @@ class Fields:
 _DTYPES: dict[str, np.dtype] = {}
 
 
-def _dtype(name: str) -> np.dtype:
-    """Read the layout of a message on the wire off pymavlink's class."""
+def layout(name: str) -> np.dtype:
+    """Give the layout of a message on the wire, read off pymavlink's class."""
     if name not in _DTYPES:
         kind = dialect.mavlink_map[IDS[name]]
         tokens = re.findall(r"(\d*)([a-zA-Z])", kind.unpacker.format.lstrip("<"))

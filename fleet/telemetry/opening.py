@@ -4,6 +4,7 @@ import bz2
 import gzip
 import lzma
 import stat
+import threading
 from collections.abc import Callable
 from io import RawIOBase
 from pathlib import Path
@@ -25,6 +26,7 @@ class Source:
         self.path = Path(path)
         self.name = self.path.name
         self.trouble = ""
+        self.stop: threading.Event | None = None  # set it, and whoever reads comes to an end
         try:
             found = self.path.stat()
         except OSError as error:
@@ -69,6 +71,8 @@ class Bytes(RawIOBase):
     def readinto(self, buffer: Any) -> int:
         """Fill a buffer; 0 at the end."""
         filled = 0
+        if self._source.stop is not None and self._source.stop.is_set():
+            return 0
         while filled < len(buffer):
             try:
                 data = self._stream.read1(len(buffer) - filled)

@@ -3,12 +3,15 @@
 import logging
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fleet.telemetry.craft import Craft
 from fleet.telemetry.dataflash import DataflashLog
 from fleet.telemetry.decode import frames_of
+from fleet.telemetry.fleet_log import MAGIC, sound
+from fleet.telemetry.fleet_news import FleetNews
 from fleet.telemetry.intake import Intake, News
 from fleet.telemetry.onboard_log import OnboardLog
 from fleet.telemetry.onboard_news import UNDATED_S, craft_of, log_steps
@@ -18,7 +21,13 @@ from fleet.telemetry.steps import Steps
 from fleet.telemetry.tlog import Tlog
 from fleet.telemetry.ulog import UlogLog
 
-KINDS = {".tlog": "telemetry log", ".bin": "DataFlash log", ".log": "DataFlash text log", ".ulg": "ULog"}
+KINDS = {
+    ".tlog": "telemetry log",
+    ".bin": "DataFlash log",
+    ".log": "DataFlash text log",
+    ".ulg": "ULog",
+    ".parauav": "fleet recording",
+}
 _HEAD = 1 << 16  # bytes looked at to tell the kind
 
 _log = logging.getLogger("parauav.recordings")
@@ -29,7 +38,7 @@ class Recording:
 
     Args:
         path: a recording of one of `KINDS`, possibly compressed
-        offset: UAV id = MAVLink system id + offset
+        offset: UAV id = MAVLink system id + offset; in a fleet recording, recorded id + offset
     Raises:
         ValueError: when it is no recording, or holds nothing.
         OSError: when it cannot be opened.
@@ -41,8 +50,7 @@ class Recording:
         self._told: list[str] = []
         self.suffix = self._recognise()
         self.crafts: dict[int, Craft] = {}  # by UAV id, filled while reading
-        self._log: OnboardLog | None = None
-        self._tlog: Tlog | None = None
+        self._opened: OnboardLog | Tlog | FleetNews | None = None
 
     @property
     def kind(self) -> str:
@@ -57,17 +65,23 @@ class Recording:
     @property
     def skipped(self) -> list[str]:
         """Say what was skipped, where, and what was assumed; whole once read to the end."""
-        opened = self._log or self._tlog
-        found = [*self._told, *(opened.skipped if opened else ()), self.source.trouble]
+        found = [*self._told, *(self._opened.skipped if self._opened else ()), self.source.trouble]
         return [f"{self.name}: {sentence.removeprefix(f'{self.name}: ')}" for sentence in found if sentence]
 
-    def steps(self) -> Iterator[tuple[float, list[News]]]:
+    def steps(self, results: bool = False) -> Iterator[tuple[float, list[Any]]]:
         """Give the recording in steps of 0.1 s: (end of the step [s since 1970], news).
 
+        Args:
+            results: give also what workers said then, where it was recorded
         Raises:
             ValueError: when there is nothing in it.
         """
-        steps = self._mavlink() if self.suffix == ".tlog" else self._onboard()
+        steps: Iterator[tuple[float, list[Any]]]
+        if self.suffix == ".parauav":
+            self._opened = FleetNews(self.source, self.offset)
+            steps = self._opened.steps(results)
+        else:
+            steps = self._mavlink() if self.suffix == ".tlog" else self._onboard()
         count = 0
         for now, news in steps:
             count += len(news)
@@ -77,22 +91,22 @@ class Recording:
             raise ValueError(f"{said}; expected the {self.kind} of a flight; check the file")
 
     def _mavlink(self) -> Iterator[tuple[float, list[News]]]:
-        self._tlog = Tlog(self.source)
+        self._opened = tlog = Tlog(self.source)
         intake = Intake(self.offset)
         steps = Steps(intake.take)
-        for frames in self._tlog.batches():
+        for frames in tlog.batches():
             intake.digest(frames)
             self.crafts.update((craft.uav, craft) for craft in intake.crafts.values())
             yield from steps.upto(frames.arrival)
         yield from steps.last()
 
     def _onboard(self) -> Iterator[tuple[float, list[News]]]:
-        self._log = _READERS[self.suffix](self.source.open, self.name)
-        craft = craft_of(self._log, self.offset)
+        self._opened = log = _READERS[self.suffix](self.source.open, self.name)
+        craft = craft_of(log, self.offset)
         self.crafts[craft.uav] = craft
-        if self._log.epoch_s is None:
+        if log.epoch_s is None:
             self._told.append(f"no date in it: times count from {UNDATED_S:.0f} s since 1970, the year 2000")
-        yield from log_steps(self._log, craft)
+        yield from log_steps(log, craft)
 
     def _recognise(self) -> str:
         """Tell the kind by the content, else by the name."""
@@ -115,11 +129,14 @@ def _by_content(head: bytes) -> str:
     """Tell the suffix whose content this is; empty where nothing is recognised."""
     if head.startswith(b"ULog\x01\x12"):
         return ".ulg"
+    if head.startswith(MAGIC):
+        return ".parauav"
     buf = np.frombuffer(head, np.uint8)
     at, _, _ = frames_of(buf, np.array([[0, len(head)]]), np.zeros(3, np.int64), STAMP)
     found = {
         ".tlog": int((at[:, STOP] - at[:, START]).sum()) + STAMP * len(at),
         ".bin": 89 * head.count(b"\xa3\x95\x80"),
+        ".parauav": sum(stop - start for start, stop in sound(head)),
         ".log": sum(map(len, [line for line in head.split(b"\n") if line.startswith((b"FMT,", b"PARM,"))])),
     }
     best = max(found, key=lambda suffix: found[suffix])

@@ -1,0 +1,71 @@
+"""Show how far recordings have come: a bar each on a terminal, a line now and then elsewhere."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+REFRESH_S = 0.5
+PLAIN_S = 10.0  # between lines where the output is no terminal [s]
+
+
+class Played(Protocol):
+    """Something that is worked through."""
+
+    @property
+    def name(self) -> str:
+        """Name it."""
+
+    @property
+    def share(self) -> float:
+        """Tell how far it has come, 0..1."""
+
+    def words(self) -> str:
+        """Say what else there is to say."""
+
+
+@contextmanager
+def shown(played: Sequence[Played], say: Callable[[str], None], console: Console | None = None) -> Iterator[None]:
+    """Show progress for as long as the block lasts.
+
+    Args:
+        played: what is worked through; read on a thread of this block
+        say: takes a line where there is no terminal
+        console: where the bars go (standard output)
+    """
+    console = console or Console()
+    if not played:
+        yield
+        return
+    done = threading.Event()
+    show = _bars if console.is_terminal else _lines
+    thread = threading.Thread(target=show, args=(played, done, say, console), name="bars")
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+def _bars(played: Sequence[Played], done: threading.Event, _: Callable[[str], None], console: Console) -> None:
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[words]}"))
+    with Progress(*columns, console=console) as progress:
+        bars = [progress.add_task(one.name, total=1.0, words="") for one in played]
+        ended = False
+        while not ended:
+            ended = done.wait(REFRESH_S)
+            for bar, one in zip(bars, played, strict=True):
+                progress.update(bar, completed=one.share, words=one.words())
+
+
+def _lines(played: Sequence[Played], done: threading.Event, say: Callable[[str], None], _: Console) -> None:
+    due = time.monotonic() + PLAIN_S
+    while not done.wait(max(due - time.monotonic(), 0.0)):
+        due += PLAIN_S
+        for one in played:
+            say(f"{one.name}: {one.share:.0%}, {one.words()}")

@@ -1,0 +1,157 @@
+"""A `.tlog` on the air again: its aircraft, and copies of them, as MAVLink datagrams on this machine."""
+
+import ipaddress
+import socket
+import threading
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from fleet.frames import Origin
+from fleet.telemetry.aside import Aside
+from fleet.telemetry.copies import GROUPS
+from fleet.telemetry.decode import IDS, Frames
+from fleet.telemetry.heartbeat import is_aircraft
+from fleet.telemetry.ids import Ids
+from fleet.telemetry.opening import Source
+from fleet.telemetry.pace import Pace
+from fleet.telemetry.recast import Cut, cut, recast
+from fleet.telemetry.recordings import Recording
+from fleet.telemetry.scan import ID, SYSTEM
+from fleet.telemetry.tlog import Tlog
+
+STEP_S = 0.05  # recorded time between two rounds of datagrams [s]
+MOST_ON_A_LINK = 250  # system ids 1 to 250; the rest belongs to ground stations
+
+
+def address(text: str) -> tuple[str, int]:
+    """Read HOST:PORT of this machine.
+
+    Raises:
+        ValueError: when it is none, or another machine: recorded aircraft must not reach real ground stations.
+    """
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
+        raise ValueError(f"--to: found {text!r}, expected HOST:PORT such as 127.0.0.1:14550; correct it")
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)[0][4]
+    except OSError as error:
+        raise ValueError(f"--to: found {host!r}, which nobody knows ({error}); name 127.0.0.1") from None
+    if not ipaddress.ip_address(str(found[0]).partition("%")[0]).is_loopback:
+        raise ValueError(
+            f"--to: found {text!r} on another machine, expected a loopback address such as 127.0.0.1:{port}; "
+            "copies of aircraft are for this machine alone"
+        )
+    return str(found[0]), int(port)
+
+
+class Airing:
+    """One telemetry log, sent.
+
+    Args:
+        path: the recording
+        speed: times real time
+        copies: aircraft in place of each recorded one, itself included
+        ids: MAVLink system ids given out, shared by all that are sent to one place
+    Raises:
+        ValueError: when it is no telemetry log.
+        OSError: when it cannot be read.
+    """
+
+    def __init__(self, path: Path, speed: float, copies: int, ids: Ids) -> None:
+        recording = Recording(path)
+        if recording.suffix != ".tlog":
+            raise ValueError(f"{path.name}: found a {recording.kind}, expected a telemetry log for --to; leave it out")
+        self.name = path.name
+        self.pace = Pace(speed)
+        self.sent = 0  # datagrams
+        self.trouble = ""
+        self._source = Source(path)
+        self._copies, self._ids = copies, ids
+        self._systems: dict[int, np.ndarray] = {}  # of the cast, by the recorded one, (copies,)
+        self._asides: list[Aside] | None = None
+
+    @property
+    def share(self) -> float:
+        """Tell how far reading has come, 0..1."""
+        return self._source.share
+
+    def words(self) -> str:
+        """Say how far it has been sent, and how fast."""
+        return f"{self.pace.words()}, {len(self._systems) * self._copies} aircraft, {self.sent:,} datagrams"
+
+    def send(self, to: tuple[str, int], stop: threading.Event) -> None:
+        """Send everything until it ends or `stop` is set; what goes wrong is left in `trouble`."""
+        self._source.stop = stop
+        family = socket.AF_INET6 if ":" in to[0] else socket.AF_INET
+        try:
+            with socket.socket(family, socket.SOCK_DGRAM) as out:
+                for now, datagrams in self._rounds():
+                    if self.pace.wait(now, stop):
+                        return
+                    for datagram in datagrams:
+                        self._put(out, datagram, to)
+        except (ValueError, OSError) as error:
+            self.trouble = str(error)
+        if not self._systems and not self.trouble and not stop.is_set():
+            self.trouble = f"{self.name}: found no aircraft in it, expected at least one heartbeat; check the file"
+
+    def _put(self, out: socket.socket, datagram: bytes, to: tuple[str, int]) -> None:
+        try:
+            out.sendto(datagram, to)
+            self.sent += 1
+        except OSError:  # nobody listens yet, no room: gone, as with a radio
+            return
+
+    def _rounds(self) -> Iterator[tuple[float, list[bytes]]]:
+        """Give round by round: (recorded time [s since 1970], datagrams)."""
+        past: deque[list[Cut]] = deque(maxlen=GROUPS)  # newest first
+        sources: deque[list[int]] = deque(maxlen=GROUPS)
+        first, now = np.nan, 0.0
+        for frames in Tlog(self._source).batches():
+            self._meet(frames)
+            first = float(frames.arrival[0]) if np.isnan(first) else first
+            number = np.floor((frames.arrival - first) / STEP_S)
+            for part in np.split(np.arange(len(number)), np.flatnonzero(np.diff(number)) + 1):
+                now = first + float(number[part[0]]) * STEP_S
+                systems = [int(n) for n in np.unique(frames.at[part, SYSTEM]) if int(n) in self._systems]
+                past.appendleft([cut(frames, part[frames.at[part, SYSTEM] == n]) for n in systems])
+                sources.appendleft(systems)
+                yield now, list(self._said(past, sources))
+
+    def _said(self, past: deque[list[Cut]], sources: deque[list[int]]) -> Iterator[bytes]:
+        """Give what originals say now, and copies a few steps later."""
+        for lag, (cuts, systems) in enumerate(zip(past, sources, strict=True)):
+            for one, system in zip(cuts, systems, strict=True):
+                cast = self._systems[system][lag::GROUPS]
+                if len(cast):
+                    aside = self._asides[lag] if self._asides is not None else None
+                    yield from (row.tobytes() for row in recast(one, cast, aside))
+
+    def _meet(self, frames: Frames) -> None:
+        """Learn which aircraft there are; give them and their copies system ids."""
+        new: set[int] = set()
+        for i in np.flatnonzero(frames.at[:, ID] == IDS["HEARTBEAT"]).tolist():
+            system = int(frames.at[i, SYSTEM])
+            if system not in self._systems and system not in new and system:
+                message = frames.message(i)
+                new.update([system] if message is not None and is_aircraft(message) else [])
+        cast = {system: [self._ids.give((self, system, 0), system)] for system in sorted(new)}
+        for copy in range(1, self._copies):
+            for system, mine in cast.items():
+                mine.append(self._ids.give((self, system, copy), mine[0]))
+        self._systems.update((system, np.array(mine, np.uint8)) for system, mine in cast.items())
+        if self._asides is None and self._copies > 1:
+            self._find_place(frames)
+
+    def _find_place(self, frames: Frames) -> None:
+        which = np.flatnonzero(frames.at[:, ID] == IDS["GLOBAL_POSITION_INT"])
+        fields = frames.fields(which, "GLOBAL_POSITION_INT")
+        known = np.flatnonzero((fields.lat != 0) | (fields.lon != 0)) if len(which) else which
+        if len(known):
+            at = known[0]
+            origin = Origin(int(fields.lat[at]), int(fields.lon[at]), int(fields.alt[at]))
+            numbers = np.arange(self._copies)
+            self._asides = [Aside(numbers[lag::GROUPS], self._copies, origin) for lag in range(GROUPS)]

@@ -1,0 +1,35 @@
+"""Who is who where several recordings, and copies of them, fly together: every aircraft has an id of its own."""
+
+from collections.abc import Hashable
+
+
+class Ids:
+    """Ids given out so far.
+
+    Args:
+        least, most: ids there are
+    """
+
+    def __init__(self, least: int = 0, most: int = 999_999) -> None:
+        self._least, self._most = least, most
+        self._of: dict[Hashable, int] = {}
+        self._held: set[int] = set()
+
+    def give(self, who: Hashable, wanted: int) -> int:
+        """Give `who` the id it has, else the wanted one, else the next free one above, else the first free one.
+
+        Raises:
+            ValueError: when none is left.
+        """
+        if who in self._of:
+            return self._of[who]
+        after = max(wanted, self._least)
+        free = next((i for i in range(after, self._most + 1) if i not in self._held), None)
+        if free is None:
+            free = next((i for i in range(self._least, after) if i not in self._held), None)
+        if free is None:
+            count = self._most - self._least + 1
+            raise ValueError(f"ids: found all {count} taken, expected a free one; play fewer aircraft or copies")
+        self._of[who] = free
+        self._held.add(free)
+        return free

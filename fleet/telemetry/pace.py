@@ -1,0 +1,56 @@
+"""Recorded time against the wall clock: when the next step is due, and how fast it really goes."""
+
+import math
+import threading
+import time
+
+
+class Pace:
+    """Play at a multiple of recorded time.
+
+    Args:
+        speed: recorded seconds per second; inf: as fast as possible
+    """
+
+    def __init__(self, speed: float) -> None:
+        self.speed = speed
+        self.passed_s = 0.0  # recorded time played
+        self._first: float | None = None
+        self._begun = self._newest = 0.0
+
+    def wait(self, now: float, stop: threading.Event) -> bool:
+        """Wait until recorded time `now` [s since 1970] is due; True when told to stop meanwhile."""
+        if self._first is None:
+            self._first, self._begun = now, time.monotonic()
+        due = self._begun + (now - self._first) / self.speed - time.monotonic()
+        stopped = stop.wait(due) if due > 0 else stop.is_set()
+        self.passed_s, self._newest = now - self._first, time.monotonic()
+        return stopped
+
+    @property
+    def reached(self) -> float:
+        """Tell the speed reached so far, recorded seconds per second; nan before the start."""
+        took = self._newest - self._begun
+        return self.passed_s / took if took > 0 else math.nan
+
+    def words(self) -> str:
+        """Say how far it has come, and how fast."""
+        minutes, seconds = divmod(int(self.passed_s), 60)
+        hours, minutes = divmod(minutes, 60)
+        fast = "" if math.isnan(self.reached) else f", {self.reached:.1f} times real time"
+        return (f"{hours}:" if hours else "") + f"{minutes:02}:{seconds:02} recorded{fast}"
+
+
+def read_speed(text: str) -> float:
+    """Read a replay speed: a number of times real time, or `max`.
+
+    Raises:
+        ValueError: when it is neither.
+    """
+    try:
+        speed = math.inf if text == "max" else float(text)
+    except ValueError:
+        speed = 0.0
+    if not speed > 0:
+        raise ValueError(f"speed: found {text!r}, expected a number above 0 or max; write e.g. 4")
+    return speed
