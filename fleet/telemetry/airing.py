@@ -120,6 +120,10 @@ class Airing:
                 past.appendleft([cut(frames, part[frames.at[part, SYSTEM] == n]) for n in systems])
                 sources.appendleft(systems)
                 yield now, list(self._said(past, sources))
+        for lag in range(1, GROUPS):  # the originals have ended
+            past.appendleft([])
+            sources.appendleft([])
+            yield now + lag * STEP_S, list(self._said(past, sources))
 
     def _said(self, past: deque[list[Cut]], sources: deque[list[int]]) -> Iterator[bytes]:
         """Give what originals say now, and copies a few steps later."""
