@@ -1,13 +1,19 @@
 """Whatever a file has suffered, whatever its kind: what is good is read, what was skipped is said, nothing raises."""
 
+import bz2
+import gzip
 import lzma
+import os
 import re
 import resource
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from fleet.codec import encode, encoding
 from fleet.contract import COLUMNS, Sample
+from fleet.telemetry.fleet_log import Record
 from fleet.telemetry.opening import Source
 from fleet.telemetry.recordings import Recording
 
@@ -16,6 +22,7 @@ FILES = {
     "bin": "real/dronekit_copter_log171_crash.bin",
     "log": "real/ardupilot_mechanical_fail_quad.log",
     "ulg": "real/px4_vtol_cubeorange_6s_reader_test.ulg",
+    "parauav": "sitl/s02_nominal_light_wind.tlog.xz",  # as the bus hears it
 }
 SEEDS = range(20)
 MOST = 1_000_000  # bytes of each file used
@@ -38,8 +45,22 @@ def read(path) -> tuple[int, list[str]]:
 
 @pytest.fixture(scope="module", params=list(FILES))
 def good(request, recordings) -> tuple[str, bytes]:
-    with Source(recordings / FILES[request.param]).open() as stream:
+    path = recordings / FILES[request.param]
+    if request.param == "parauav":
+        return request.param, said(path)
+    with Source(path).open() as stream:
         return request.param, stream.read(MOST)
+
+
+def said(path: Path) -> bytes:
+    """What the gateway says of a recording, as `fleet record` would write it."""
+    out = bytearray()
+    for now, news in Recording(path).steps():
+        for message in news:
+            out += Record(now, encoding(type(message)), encode(message)).pack()
+        if len(out) > MOST:
+            break
+    return bytes(out)
 
 
 def test_flipped_bits_cost_what_they_hit(good, tmp_path):
@@ -79,7 +100,7 @@ def test_a_file_cut_anywhere_keeps_what_came_before(good, tmp_path):
 
 def test_another_suffix_changes_nothing(good, tmp_path):
     kind, data = good
-    other = {"tlog": "bin", "bin": "log", "log": "ulg", "ulg": "tlog"}[kind]
+    other = {"tlog": "bin", "bin": "log", "log": "ulg", "ulg": "parauav", "parauav": "tlog"}[kind]
     for suffix in (kind, other, "dat"):
         (tmp_path / f"flight.{suffix}").write_bytes(data)
     (rows, _), (same, said), (again, _) = (read(tmp_path / f"flight.{suffix}") for suffix in (kind, other, "dat"))
@@ -100,3 +121,77 @@ def test_an_endless_file_is_given_up_in_bounded_memory(kind, content, tmp_path):
     assert rows == 0
     assert said and f"endless.{kind}.xz" in said[0] and "expected" in said[0]
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 * 1024  # kB
+
+
+PACKERS = {
+    "": bytes,
+    ".xz": lzma.compress,
+    ".gz": gzip.compress,
+    ".bz2": lambda data: bz2.compress(data, 1),
+}  # small blocks
+
+
+@pytest.mark.parametrize("packed", list(PACKERS))
+@pytest.mark.parametrize("kind", list(FILES))
+def test_an_empty_file_is_said_to_be_empty(kind, packed, tmp_path):
+    path = tmp_path / f"empty.{kind}{packed}"
+    for content in (PACKERS[packed](b""), b""):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=rf"^empty\.{kind}.*; expected a recording; check the file$"):
+            Recording(path)
+
+
+@pytest.mark.parametrize("packed", [".xz", ".gz", ".bz2"])
+def test_a_damaged_archive_of_any_kind_gives_what_came_before(good, packed, tmp_path):
+    kind, data = good
+    path = tmp_path / f"flight.{kind}"
+    path.write_bytes(data)
+    whole, _ = read(path)
+    archive = PACKERS[packed](data)
+    path = tmp_path / f"flight.{kind}{packed}"
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        damaged = bytearray(archive)
+        damaged[int(rng.integers(len(archive) // 2, len(archive) - 100))] ^= 0x55
+        path.write_bytes(damaged)
+        rows, skipped = read(path)
+        assert 0 < rows <= whole
+        assert rows == whole or any("damaged" in sentence or "expected" in sentence for sentence in skipped)
+
+
+@pytest.mark.parametrize("kind", list(FILES))
+def test_what_cannot_be_opened_is_said_in_one_sentence(kind, tmp_path, monkeypatch):
+    path = tmp_path / f"flight.{kind}"
+    path.mkdir()
+    (tmp_path / f"endless.{kind}").symlink_to("/dev/zero")
+    (tmp_path / f"gone.{kind}").symlink_to(tmp_path / "nowhere")
+    os.mkfifo(tmp_path / f"pipe.{kind}")
+    for name in ("flight", "endless", "gone", "pipe", "none"):
+        with pytest.raises(OSError, match=rf"{name}\.{kind}: found no .*, expected a recording; "):
+            Recording(tmp_path / f"{name}.{kind}")
+    locked = tmp_path / f"locked.{kind}"
+    locked.write_bytes(b"secret")
+
+    def refuse(*_: object) -> None:  # permissions do not stop root, who may be running this
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(OSError, match=rf"locked\.{kind}: cannot be read \(Permission denied\); check"):
+        Recording(locked)
+
+
+@pytest.mark.parametrize("packed", [".xz", ".gz", ".bz2"])
+def test_a_good_recording_that_never_ends_is_read_in_bounded_memory(good, packed, tmp_path):
+    """Copies of one stretch: what repeats itself may be refused, but neither raises nor piles up."""
+    kind, data = good
+    path = tmp_path / f"endless.{kind}{packed}"
+    stretch = PACKERS[packed](data[:400_000])
+    with path.open("wb") as file:
+        for _ in range(20):
+            file.write(stretch)  # archives joined are an archive
+    short = tmp_path / f"short.{kind}{packed}"
+    short.write_bytes(stretch * 4)
+    read(short)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    read(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50 * 1024  # kB

@@ -1,0 +1,91 @@
+"""A long telemetry log: read in bounded memory, with progress, and interrupted at once."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+
+import long_tlog
+import pytest
+from conftest import ROOT
+from talker import of
+
+from fleet.commands import inspect
+from fleet.contract import Sample
+from fleet.telemetry.recordings import Recording
+
+PATIENCE_S = 60.0
+PEAK = """
+import resource, sys
+from pathlib import Path
+from fleet.commands.inspect import read
+heard = read(Path(sys.argv[1]))
+(told,) = heard.file.aircraft
+print(round(told.seconds), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+"""
+
+
+def peak(path) -> tuple[int, int]:
+    """Inspect a recording in a process of its own; give the seconds in it and the most memory it took [MB]."""
+    command = [sys.executable, "-c", PEAK, str(path)]
+    done = subprocess.run(command, cwd=ROOT, env=env(), capture_output=True, text=True, timeout=600, check=True)
+    seconds, megabytes = done.stdout.split()
+    return int(seconds), int(megabytes)
+
+
+def env() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
+def test_what_is_made_up_is_a_sound_flight(tmp_path):
+    path = tmp_path / "flight.tlog"
+    seconds = long_tlog.write(path, 1)
+    recording = Recording(path)
+    news = [message for _, step in recording.steps() for message in step]
+    rows = sum(len(m.attitude.t.numpy()) for m in of(Sample, news) if m.attitude)
+    assert recording.skipped == [] and rows == pytest.approx(50 * seconds, abs=2)
+    assert news[-1].t - news[0].t == pytest.approx(seconds, abs=4)
+    assert max(m.clock_jumps + m.rejected for m in news if hasattr(m, "rejected")) == 0
+
+
+def test_ten_times_the_length_takes_no_more_memory(tmp_path):
+    short, long = tmp_path / "short.tlog", tmp_path / "long.tlog"
+    lasts = [long_tlog.write(short, 3), long_tlog.write(long, 30)]
+    found = [peak(path) for path in (short, long)]
+    assert [seconds for seconds, _ in found] == pytest.approx(lasts, abs=2)
+    assert found[1][1] - found[0][1] < 25  # of the 27 MB more in the file, and 160 MB more of rows
+
+
+def test_progress_rises_to_the_end(tmp_path, monkeypatch):
+    path, shares = tmp_path / "flight.tlog", []
+    long_tlog.write(path, 5)
+
+    class Watched(Recording):
+        def steps(self):
+            for step in super().steps():
+                shares.append(self.share)
+                yield step
+
+    monkeypatch.setattr(inspect, "Recording", Watched)
+    assert inspect.read(path).file.sentences == ()
+    assert shares == sorted(shares) and len(set(shares)) >= 4 and shares[-1] == 1.0
+
+
+def test_ctrl_c_ends_an_inspection_at_once(tmp_path):
+    path = tmp_path / "flight.tlog"
+    long_tlog.write(path, 60)
+    primary, secondary = os.openpty()
+    command = [sys.executable, "-m", "fleet.cli", "inspect", str(path)]
+    with subprocess.Popen(command, cwd=ROOT, env=env(), stdout=secondary, stderr=secondary) as child:
+        os.close(secondary)
+        shown, pause = b"", threading.Event()
+        while not re.search(rb"reading flight.tlog.* [1-9]\d?%", shown):
+            assert child.poll() is None, shown
+            shown += os.read(primary, 4096)
+        child.send_signal(signal.SIGINT)
+        pause.wait(0)
+        assert child.wait(timeout=5) == 0
+    os.close(primary)
+    assert b"Traceback" not in shown
