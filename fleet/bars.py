@@ -29,13 +29,16 @@ class Played(Protocol):
 
 
 @contextmanager
-def shown(played: Sequence[Played], say: Callable[[str], None], console: Console | None = None) -> Iterator[None]:
+def shown(
+    played: Sequence[Played], say: Callable[[str], None], console: Console | None = None, *, leave: bool = True
+) -> Iterator[None]:
     """Show progress for as long as the block lasts.
 
     Args:
         played: what is worked through; read on a thread of this block
         say: takes a line where there is no terminal
         console: where the bars go (standard output)
+        leave: let the bars stand at the end
     """
     console = console or Console()
     if not played:
@@ -43,7 +46,7 @@ def shown(played: Sequence[Played], say: Callable[[str], None], console: Console
         return
     done = threading.Event()
     show = _bars if console.is_terminal else _lines
-    thread = threading.Thread(target=show, args=(played, done, say, console), name="bars")
+    thread = threading.Thread(target=show, args=(played, done, say, console), kwargs={"leave": leave}, name="bars")
     thread.start()
     try:
         yield
@@ -52,9 +55,11 @@ def shown(played: Sequence[Played], say: Callable[[str], None], console: Console
         thread.join()
 
 
-def _bars(played: Sequence[Played], done: threading.Event, _: Callable[[str], None], console: Console) -> None:
+def _bars(
+    played: Sequence[Played], done: threading.Event, _: Callable[[str], None], console: Console, *, leave: bool
+) -> None:
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[words]}"))
-    with Progress(*columns, console=console) as progress:
+    with Progress(*columns, console=console, transient=not leave) as progress:
         bars = [progress.add_task(one.name, total=1.0, words="") for one in played]
         ended = False
         while not ended:
@@ -63,7 +68,10 @@ def _bars(played: Sequence[Played], done: threading.Event, _: Callable[[str], No
                 progress.update(bar, completed=one.share, words=one.words())
 
 
-def _lines(played: Sequence[Played], done: threading.Event, say: Callable[[str], None], _: Console) -> None:
+def _lines(
+    played: Sequence[Played], done: threading.Event, say: Callable[[str], None], _: Console, *, leave: bool
+) -> None:
+    del leave
     due = time.monotonic() + PLAIN_S
     while not done.wait(max(due - time.monotonic(), 0.0)):
         due += PLAIN_S

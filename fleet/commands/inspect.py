@@ -5,14 +5,13 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 from rich.console import Console
 
+from fleet.bars import shown
 from fleet.commands.schema import fields_of, parts_of, summary
 from fleet.sheet import table
 from fleet.telemetry.findings import Facts, File, Findings, findings
@@ -92,8 +91,8 @@ def read(path: Path, offset: int = 0) -> Heard:
     said: list[str] = []
     try:
         recording = Recording(path, offset)
-        with _progress(recording) as progress:
-            surveys = survey((news for _, step in recording.steps() for news in step), progress)
+        with shown([recording], _say, Console(stderr=True), leave=False):
+            surveys = survey(news for _, step in recording.steps() for news in step)
         facts = {uav: Facts(craft.firmware, tuple(craft.texts)) for uav, craft in recording.crafts.items()}
         said += recording.skipped
     except (ValueError, OSError) as error:
@@ -103,6 +102,10 @@ def read(path: Path, offset: int = 0) -> Heard:
     aircraft = tuple(findings(known, facts.get(uav, Facts())) for uav, known in surveys.items())
     said = [sentence.removeprefix(f"{path.name}: ") for sentence in dict.fromkeys(said)]
     return Heard(File(file=str(path), bytes=_size(path), sentences=tuple(said), aircraft=aircraft), surveys, facts)
+
+
+def _say(line: str) -> None:
+    print(f"fleet inspect: {line}", file=sys.stderr, flush=True)
 
 
 def _size(path: Path) -> int:
@@ -130,21 +133,6 @@ def _check(args: argparse.Namespace) -> None:
             raise ValueError(f"{option}: found no folder {str(Path(name).parent)!r}, expected one; make it first")
         if name and any(path.exists() and Path(name).exists() and path.samefile(name) for path in args.file):
             raise ValueError(f"{option}: found the recording {str(name)!r} itself, expected another file; rename it")
-
-
-@contextmanager
-def _progress(recording: Recording) -> Iterator[Any]:
-    """Show how much of the file has been read, where somebody watches."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda _: None
-        return
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(f"reading {recording.name}", total=1.0)
-        yield lambda _: bar.update(task, completed=recording.share)
 
 
 def _twin(path: Path) -> dict[str, Any]:

@@ -69,6 +69,7 @@ class Airing:
         self.sent = 0  # datagrams
         self.trouble = ""
         self._source = Source(path)
+        self._tlog = Tlog(self._source)
         self._copies, self._ids = copies, ids
         self._systems: dict[int, np.ndarray] = {}  # of the cast, by the recorded one, (copies,)
         self._asides: list[Aside] | None = None
@@ -76,7 +77,7 @@ class Airing:
     @property
     def share(self) -> float:
         """Tell how far reading has come, 0..1."""
-        return self._source.share
+        return self._tlog.share
 
     def words(self) -> str:
         """Say how far it has been sent, and how fast."""
@@ -110,7 +111,7 @@ class Airing:
         past: deque[list[Cut]] = deque(maxlen=GROUPS)  # newest first
         sources: deque[list[int]] = deque(maxlen=GROUPS)
         first, now = np.nan, 0.0
-        for frames in Tlog(self._source).batches():
+        for frames in self._tlog.batches():
             self._meet(frames)
             first = float(frames.arrival[0]) if np.isnan(first) else first
             number = np.floor((frames.arrival - first) / STEP_S)

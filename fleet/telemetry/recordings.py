@@ -60,7 +60,11 @@ class Recording:
     @property
     def share(self) -> float:
         """Tell how far reading has come, 0..1."""
-        return self.source.share
+        return self._opened.share if isinstance(self._opened, Tlog) else self.source.share
+
+    def words(self) -> str:
+        """Say what is being done with it."""
+        return "reading"
 
     @property
     def skipped(self) -> list[str]:

@@ -1,6 +1,6 @@
 """What one recording says of one aircraft: its messages laid up in bounded memory, and what happened when."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -97,17 +97,16 @@ class Survey:
             self.lost_events += 1
 
 
-def survey(messages: Iterable[Message], progress: Callable[[float], None] = lambda _: None) -> dict[int, Survey]:
+def survey(messages: Iterable[Message]) -> dict[int, Survey]:
     """Take a whole recording.
 
     Args:
         messages: Sample, Status, Mission, Params in the order they were heard
-        progress: called now and then with the recorded time that has passed [s]
     Returns:
         what it says of each aircraft, by UAV id
     """
     found: dict[int, Survey] = {}
-    begun, told = np.nan, 0.0
+    begun = np.nan
     for message in messages:
         if not np.isfinite(message.t):
             continue
@@ -116,9 +115,6 @@ def survey(messages: Iterable[Message], progress: Callable[[float], None] = lamb
             found[message.uav] = Survey(message.uav, begun)
             _share(found)
         hear(found[message.uav], message)
-        if message.t - begun >= told + 1.0:
-            told = message.t - begun
-            progress(told)
     for each in found.values():
         each.events.sort()
     return dict(sorted(found.items()))

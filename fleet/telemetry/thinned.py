@@ -137,7 +137,7 @@ class Thinned:
 
     def _keep(self, t: np.ndarray, x: np.ndarray) -> None:
         taken = slice(-self._count % self._stride, None, self._stride)
-        self._kept.append((t[taken], x[taken]))
+        self._kept.append((t[taken].copy(), x[taken].copy()))  # a view would keep what is let go
         self._count += len(t)
         while sum(len(kept) for kept, _ in self._kept) > self.most:
             whole_t, whole_x = (np.concatenate([pair[i] for pair in self._kept]) for i in (0, 1))

@@ -13,6 +13,7 @@ from fleet.telemetry.opening import Source
 
 CHUNK = 1 << 20
 HOPELESS = 1 << 26  # bytes without a single frame after which a file is no telemetry log
+LOOK = 0.1  # share of the work that is done before the first frame is given
 BACK_S = 1.0  # a clock that steps back further was set; time goes on all the same [s]
 BACKLOG_S = 5.0  # arriving later than boot time tells by more than this is a backlog, not a delay [s]
 _BOOT_FIRST = [IDS[name] for name in ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")]
@@ -29,12 +30,18 @@ class Tlog:
         self.decoder = Decoder()  # its counters tell what was skipped
         self.skipped: list[str] = []
         self._source = source
-        self._offset_s = backlog_offset(self._batches(Decoder()))
+        self._looking = True
+
+    @property
+    def share(self) -> float:
+        """Tell how far reading has come, 0..1; a look for a backlog comes first."""
+        return LOOK * self._source.share if self._looking else LOOK + (1 - LOOK) * self._source.share
 
     def batches(self) -> Iterator[Frames]:
         """Give the frames in the time the flight took, even where a backlog arrived in a rush."""
+        offset_s = backlog_offset(self._batches(Decoder()))
         batches = self._batches(self.decoder)
-        yield from batches if self._offset_s is None else restamped(batches, self._offset_s)
+        yield from batches if offset_s is None else restamped(batches, offset_s)
         if bad := int(self.decoder.counts[1]):
             read = int(self.decoder.counts[0])
             where = f", the first near byte {self._first_bad}" if self._first_bad is not None else ""
@@ -45,6 +52,7 @@ class Tlog:
         counts, self._first_bad = decoder.counts, None
         rest, last_t, place, line = b"", np.nan, 0, Line()
         with self._source.open() as stream:
+            self._looking = decoder is not self.decoder
             while True:
                 chunk = stream.read(CHUNK) or b""
                 told = rest + chunk
