@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import msgspec
 import numpy as np
@@ -21,9 +22,11 @@ from fleet.contract import TOPICS, Alert, FleetState, Message, Mission, Model, P
 from fleet.telemetry.fleet_log import HOPELESS, Record
 from fleet.telemetry.fleet_news import NEWS, RESULTS
 from fleet.telemetry.recordings import Recording, replay_messages
+from gateway.publish import Publisher
 from gateway.pump import Pump
 from gateway.recorded import Replay
 from gateway.spec import read_spec
+from viewer.feed import Feed
 
 PATIENCE_S = 60.0
 
@@ -185,6 +188,19 @@ def test_what_the_twins_said_then_is_played_and_answered_for(tmp_path):
     ((state, stamp),) = bus.ask(FleetState)
     assert {row.epoch for row in state.rows} == {stamp.epoch}
     assert bus.ask(Alert) == []
+
+
+def test_the_viewer_believes_the_results_of_then_while_a_worker_computes_its_own():
+    bus = MemoryBus()
+    feed, player = Feed(bus), Publisher(bus, results=True)
+    worker = Stamp(time.time_ns() // 1_000_000 - 5, 1)  # it heard of the aircraft when the recording began to play
+    then, now = (msgspec.structs.replace(EXAMPLES[Prediction], sentence=words) for words in ("then", "now"))
+    bus.publish(now, worker)
+    assert feed.one(then.uav).prediction.sentence == "now"
+    for _ in range(3):
+        player.publish([then])
+        bus.publish(now, worker)
+        assert feed.one(then.uav).prediction.sentence == "then"
 
 
 def test_without_asking_for_results_only_telemetry_is_played(tmp_path):
