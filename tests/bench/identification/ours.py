@@ -13,7 +13,7 @@ from fleet.frames import body_to_ned, ned_to_body
 from fleet.physics.actuators import TAU, lagged
 from fleet.window import Window
 from twin_worker.coupled import Coupled, identify
-from twin_worker.observer import Observer, observer
+from twin_worker.observer import Observer
 from twin_worker.wind import WindFilter
 
 from .flight import Flight
@@ -67,8 +67,7 @@ class Ours:
         last = next((one for one in reversed(self._found) if one.t1 <= window.t[0]), None)
         model = identify(window, wind, airframe(known), last)
         self._found.append(model)
-        stretch = known.part(start, len(known))
-        return Seen(observer(model, stretch.x, lagged(stretch.u, known.dt, TAU), known.dt))
+        return Seen(Observer(model, known.dt))
 
 
 def airframe(flight: Flight) -> Airframe:
