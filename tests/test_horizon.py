@@ -132,7 +132,7 @@ def test_the_tube_is_as_wide_as_the_errors_were():
     assert (wide > 8 * narrow).all()
 
 
-@pytest.mark.parametrize("method", ["paper", "copter", "greybox", "imm"])
+@pytest.mark.parametrize("method", ["dynamics", "paper", "copter", "greybox", "imm"])
 def test_the_tube_is_finite_and_grows_before_and_after_scoring(method):
     record = Record()
     for _ in range(3):

@@ -123,8 +123,8 @@ def arguments(path: str, tree: ast.AST, text: str) -> Iterator[str]:
     for node in ast.walk(tree):
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             continue
-        if any(re.search(r"\b(njit|kernel)\b", ast.unparse(decorator)) for decorator in node.decorator_list):
-            continue  # compiled (`kernel` is a file's own name for njit with options): takes flat numbers and arrays
+        if any(re.search(r"\b(njit|kernel|inlined)\b", ast.unparse(decorator)) for decorator in node.decorator_list):
+            continue  # compiled (`kernel` and `inlined` are njit with options): takes flat numbers and arrays
         if path.startswith("tests/") and node.name.startswith("test_"):
             continue  # pytest fills these in by name
         names = [a.arg for a in (*node.args.posonlyargs, *node.args.args) if a.arg not in ("self", "cls")]
@@ -207,6 +207,7 @@ ALLOWED = (
     (direction, "fleet/telemetry/a.py", "from fleet.contract import Sample\nfrom . import clock"),
     (alone, "gateway/link.py", "from pymavlink import mavutil"),
     (arguments, "fleet/a.py", "@nb.njit(cache=True)\ndef f(a, b, c, d, e, g): ..."),
+    (arguments, "fleet/a.py", "@inlined\ndef f(a, b, c, d, e, g): ..."),
     (arguments, "fleet/a.py", "class A:\n    def f(self, a, b, c, d, e, *, g): ..."),
     (docstrings, "viewer/a.py", '"""Fine: no verb needed."""\ndef f():\n    """Give a thing."""\ndef _g(): ...'),
 )

@@ -5,7 +5,7 @@ import pytest
 from flights import linear_flight
 
 from fleet.contract import Outcome, Verdict
-from twin_worker import learn
+from twin_worker import choose as choosing
 from twin_worker.memory import Believed, Twin
 
 VERDICT = Verdict(outcome=Outcome.VERIFIED, sentence="mean fit 30 %")
@@ -17,28 +17,28 @@ def choose(monkeypatch):
     """Let a twin with models `name: miss so far` choose, when each model's next flight misses by `misses[name]`."""
 
     def call(misses, *, pool=(), new=None, verdict=VERDICT):
-        monkeypatch.setattr(learn, "_hindcast", lambda twin, window, n, axes: misses[axes])
+        monkeypatch.setattr(choosing, "hindcast", lambda twin, window, start, plant: misses[plant])
         twin = Twin(1, pool=[Believed(name, VERDICT, float(t), miss) for t, (name, miss) in enumerate(pool)])
-        return twin, learn._choose(twin, WINDOW, 100, new, verdict)
+        return twin, choosing.choose(twin, WINDOW, 400, new, verdict)
 
     return call
 
 
 def test_the_first_model_is_in_force(choose):
     twin, verdict = choose({"new": 9.0}, new="new")
-    assert twin.axes == "new" and twin.in_force is VERDICT and verdict.outcome is Outcome.VERIFIED
+    assert twin.plant == "new" and twin.in_force is VERDICT and verdict.outcome is Outcome.VERIFIED
 
 
 def test_the_one_that_strays_least_is_in_force(choose):
     twin, verdict = choose({"old": 10.0, "new": 2.0}, pool=[("old", 10.0)], new="new")
-    assert twin.axes == "new" and verdict.outcome is Outcome.VERIFIED
+    assert twin.plant == "new" and verdict.outcome is Outcome.VERIFIED
     twin, verdict = choose({"old": 2.0, "new": 10.0}, pool=[("old", 2.0)], new="new")
-    assert twin.axes == "old" and verdict.outcome is Outcome.WORSE_THAN_LAST and "earlier model" in verdict.sentence
+    assert twin.plant == "old" and verdict.outcome is Outcome.WORSE_THAN_LAST and "earlier model" in verdict.sentence
 
 
 def test_one_lucky_flight_does_not_beat_a_good_record(choose):
     twin, _ = choose({"old": 5.0, "new": 4.9}, pool=[("old", 5.0)], new="new")
-    assert twin.axes == "old"
+    assert twin.plant == "old"
 
 
 def test_an_older_model_may_come_back(choose):
@@ -48,26 +48,26 @@ def test_an_older_model_may_come_back(choose):
         new=None,
         verdict=Verdict(outcome=Outcome.BELOW_THRESHOLD, sentence="no"),
     )
-    assert twin.axes == "good" and verdict.outcome is Outcome.BELOW_THRESHOLD
+    assert twin.plant == "good" and verdict.outcome is Outcome.BELOW_THRESHOLD
 
 
 def test_a_model_that_leaves_its_envelope_is_never_believed_again(choose):
     twin, verdict = choose({"new": np.inf}, new="new")
-    assert twin.axes is None and verdict.outcome is Outcome.DIVERGED and not twin.pool
+    assert twin.plant is None and verdict.outcome is Outcome.DIVERGED and not twin.pool
     twin, _ = choose({"old": np.inf, "new": 30.0}, pool=[("old", 1.0)], new="new")
-    assert twin.axes == "new" and [known.axes for known in twin.pool] == ["new"]
+    assert twin.plant == "new" and [known.plant for known in twin.pool] == ["new"]
 
 
 def test_off_the_route_the_newest_is_in_force(choose):
     twin, verdict = choose({"old": np.nan, "new": np.nan}, pool=[("old", np.nan)], new="new")
-    assert twin.axes == "new" and verdict.outcome is Outcome.VERIFIED
+    assert twin.plant == "new" and verdict.outcome is Outcome.VERIFIED
 
 
 def test_a_model_that_has_flown_a_route_goes_before_one_that_has_not(choose):
     twin, _ = choose({"old": np.nan, "new": np.nan}, pool=[("old", 12.0)], new="new")
-    assert twin.axes == "old"
+    assert twin.plant == "old"
 
 
 def test_the_pool_stays_small(choose):
     twin, _ = choose({str(k): float(k) for k in range(20)}, pool=[(str(k), float(k)) for k in range(20)], new="3")
-    assert len(twin.pool) == learn._KEEP and twin.axes == "0"
+    assert len(twin.pool) == choosing._KEEP and twin.plant == "0"

@@ -88,7 +88,7 @@ def test_hostile_missions_never_raise(twin, items):
     twin.since = -np.inf
     results = published(advance(twin, (), twin.history.newest + 1.5))
     assert predictions(results)
-    assert all(p.method == "paper" or p.sentence for p in predictions(results))
+    assert all(p.method == "dynamics" or p.sentence for p in predictions(results))
 
 
 @pytest.mark.parametrize("value", [NAN, INF, -INF, 1e300, -1e38, 1e9, 9e4, 0.0])

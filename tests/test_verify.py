@@ -7,7 +7,9 @@ import pytest
 from flights import linear_flight, standstill, truth
 
 from fleet.contract import Outcome
-from twin_worker.verify import fit_percent, fits_at, free_runs, hold, mean, verify
+from twin_worker.identify import Axis
+from twin_worker.unseen import Unseen
+from twin_worker.verify import fit_percent, fits_at, hold, mean, verify
 
 
 def blurred(share: float, seed: int = 0):
@@ -45,76 +47,84 @@ def test_hold_by_hand():
     assert np.isnan(hold(y, ok, 3)[3:6]).all()
 
 
+def halving() -> tuple[Axis, Axis]:
+    """Models by which every state halves every sample."""
+    lon, lat = truth()
+    D = (np.hstack([0.5 * np.eye(len(a.D)), np.zeros((len(a.D), a.D.shape[1] - len(a.D)))]) for a in (lon, lat))
+    lon, lat = (replace(a, D=each, y_mean=0 * a.y_mean) for a, each in zip((lon, lat), D, strict=True))
+    return lon, lat
+
+
 def test_free_runs_start_afresh_and_cross_no_hole():
-    D = np.array([[0.5, 0.0, 0.0]])
-    y, u, ok = np.full((9, 1), 8.0), np.zeros((9, 1)), np.ones(9, bool)
-    ok[4] = False
-    runs = free_runs(D, y, u, ok, 3)[:, 0]
-    assert np.array_equal(runs, [8, 4, 2, np.nan, np.nan, np.nan, 8, 4, 2], equal_nan=True)
+    held = linear_flight(9.0).part(0, 11)
+    held.x[:], held.ok[6] = 8.0, False
+    runs = Unseen(halving(), held, 2).runs(3)  # two rows it has seen, then three runs of three
+    want = [8, 4, 2, np.nan, np.nan, np.nan, 8, 4, 2]
+    assert np.array_equal(runs, np.tile(want, (9, 1)).T, equal_nan=True)
 
 
 def test_standstill_is_holding():
     held = linear_flight(9.0)
-    fit, still = fits_at(standstill(truth()), held, 4.0)
+    fit, still = fits_at(Unseen(standstill(truth()), held, 0), 4.0)
     assert fit == pytest.approx(still)
     assert set(fit) == {"u", "v", "w", "p", "q", "r", "phi", "theta", "psi"}
 
 
 def test_a_perfect_model_fits_perfectly():
-    verdict = verify(truth(), linear_flight(20.0))
+    verdict = verify(truth(), linear_flight(20.0), 0)
     assert verdict.outcome is Outcome.VERIFIED
     assert min(verdict.fit.values()) > 99.9
     assert mean(verdict.fit_hold) < 50.0
-    noisy = verify(truth(), linear_flight(20.0, noise=0.02))
+    noisy = verify(truth(), linear_flight(20.0, noise=0.02), 0)
     assert 80.0 < mean(noisy.fit) < mean(verdict.fit)
 
 
 @pytest.mark.parametrize(("seconds", "longest"), [(20.0, 16.0), (16.0, 16.0), (15.0, 8.0), (9.0, 8.0), (5.0, 4.0)])
 def test_verified_at_the_longest_horizon_the_data_allow(seconds, longest):
-    verdict = verify(truth(), linear_flight(seconds))
+    verdict = verify(truth(), linear_flight(seconds), 0)
     assert verdict.horizon_s == longest
     assert f"over {longest:.0f} s" in verdict.sentence
 
 
 def test_a_model_good_for_a_while_is_verified_for_that_while():
     held, drifting = linear_flight(20.0, seed=2), truth(grow=0.004)
-    fits = [mean(fits_at(drifting, held, h)[0]) for h in (16.0, 8.0, 4.0)]
+    fits = [mean(fits_at(Unseen(drifting, held, 0), h)[0]) for h in (16.0, 8.0, 4.0)]
     assert fits[0] < fits[1] < fits[2]
     for horizon, between in ((8.0, fits[:2]), (4.0, fits[1:])):
-        verdict = verify(drifting, held, omega=sum(between) / 2)
+        verdict = verify(drifting, held, 0, omega=sum(between) / 2)
         assert verdict.outcome is Outcome.VERIFIED and verdict.horizon_s == horizon
 
 
 def test_the_threshold_is_a_threshold():
     held = linear_flight(20.0)
-    fit = mean(verify(blurred(0.01), held).fit)
-    assert verify(blurred(0.01), held, omega=fit - 0.1).outcome is Outcome.VERIFIED
-    refused = verify(truth(), held, omega=100.0)
+    fit = mean(verify(blurred(0.01), held, 0).fit)
+    assert verify(blurred(0.01), held, 0, omega=fit - 0.1).outcome is Outcome.VERIFIED
+    refused = verify(truth(), held, 0, omega=100.0)
     assert refused.outcome is Outcome.BELOW_THRESHOLD
     assert refused.threshold == 100.0 and "100 % is needed" in refused.sentence
 
 
 def test_no_better_than_holding_still_is_refused_however_low_the_threshold():
-    verdict = verify(standstill(truth()), linear_flight(20.0), omega=-100.0)
+    verdict = verify(standstill(truth()), linear_flight(20.0), 0, omega=-100.0)
     assert verdict.outcome is Outcome.BELOW_THRESHOLD
 
 
 def test_steady_flight_identifies_nothing():
     held = linear_flight(20.0, lively=0.02, noise=0.1)
-    verdict = verify(standstill(truth()), held)
+    verdict = verify(standstill(truth()), held, 0)
     assert verdict.outcome is Outcome.NOT_IDENTIFIABLE
     assert "steady flight" in verdict.sentence
 
 
 def test_a_diverging_model_is_named_so():
-    verdict = verify(truth(grow=0.5), linear_flight(20.0))
+    verdict = verify(truth(grow=0.5), linear_flight(20.0), 0)
     assert verdict.outcome is Outcome.DIVERGED
     assert all(np.isfinite(fit) for fit in verdict.fit.values())
 
 
 def test_a_model_of_no_numbers_is_refused():
     lon, lat = truth()
-    verdict = verify((replace(lon, D=np.full_like(lon.D, np.nan)), lat), linear_flight(20.0))
+    verdict = verify((replace(lon, D=np.full_like(lon.D, np.nan)), lat), linear_flight(20.0), 0)
     assert verdict.outcome is Outcome.DIVERGED
     assert all(np.isfinite(fit) for fit in verdict.fit.values())
 
@@ -122,17 +132,17 @@ def test_a_model_of_no_numbers_is_refused():
 def test_data_full_of_holes_verify_nothing():
     held = linear_flight(20.0)
     held.ok[::50] = False
-    assert verify(truth(), held).outcome is not Outcome.VERIFIED
+    assert verify(truth(), held, 0).outcome is not Outcome.VERIFIED
 
 
 def test_data_too_short_for_any_horizon_say_so():
     with pytest.raises(ValueError, match="needs 4 s"):
-        verify(truth(), linear_flight(3.0))
+        verify(truth(), linear_flight(3.0), 0)
 
 
 def test_one_axis_cannot_carry_the_other():
     lon, lat = truth()
     frozen_lon = standstill((lon, lat))[0]
-    verdict = verify((frozen_lon, lat), linear_flight(20.0), omega=-100.0)
+    verdict = verify((frozen_lon, lat), linear_flight(20.0), 0, omega=-100.0)
     assert verdict.outcome is Outcome.BELOW_THRESHOLD
     assert "no better than holding still" in verdict.sentence

@@ -38,24 +38,17 @@ def linearise(plant: Coupled, window: Window) -> tuple[Linear, Linear]:
     for k in range(4):
         rates_of_change(x, u + _H * np.eye(4)[k], plant.par, plant.at, moved)
         G[:, k] = (moved - rate) / _H
-    lon, lat = (_axis(F, G, x, u, rows, columns, dt) for rows, columns in _AXES)
+    lon, lat = (_axis(np.hstack([F, G]), x, u, axis, dt) for axis in _AXES)
     return lon, lat
 
 
-def _axis(
-    F: np.ndarray,
-    G: np.ndarray,
-    x: np.ndarray,
-    u: np.ndarray,
-    names: tuple[str, ...],
-    inputs: tuple[str, ...],
-    dt: float,
-) -> Linear:
+def _axis(FG: np.ndarray, x: np.ndarray, u: np.ndarray, axis: tuple, dt: float) -> Linear:
     """Cut one axis out and make it discrete: exp([[A B] [0 0]] dt)."""
+    names, inputs = axis
     rows, columns = [STATES.index(name) for name in names], [INPUTS.index(name) for name in inputs]
     n, m = len(rows), len(columns)
     whole = np.zeros((n + m, n + m))
-    whole[:n, :n], whole[:n, n:] = F[np.ix_(rows, rows)], G[np.ix_(rows, columns)]
+    whole[:n] = FG[np.ix_(rows, [*rows, *(len(x) + k for k in columns)])]
     discrete = scipy.linalg.expm(whole * dt)[:n]
     return Linear(
         states=names,
