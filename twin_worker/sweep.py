@@ -31,16 +31,20 @@ def _times(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
 
 @kernel
 def _transition(F: np.ndarray, dt: float, Phi: np.ndarray, Gamma: np.ndarray, work: np.ndarray) -> None:
-    """Fill in Phi = exp(F GROUP dt) and its integral: a series over one sample, doubled."""
+    """Fill in Phi = exp(F GROUP dt) and its integral: over one sample as Runge-Kutta of order four has them, doubled.
+
+    Phi = I + F Gamma to the last digit, or what stands still would creep: S = -F^-1 G must stay.
+    """
     square, cube, keep = work[0], work[1], work[2]
     _times(F, F, square)
     _times(F, square, cube)
     for i in range(N_X):
         for j in range(N_X):
-            Phi[i, j] = dt * F[i, j] + dt**2 / 2 * square[i, j] + dt**3 / 6 * cube[i, j]
             Gamma[i, j] = dt**2 / 2 * F[i, j] + dt**3 / 6 * square[i, j] + dt**4 / 24 * cube[i, j]
-        Phi[i, i] += 1.0
         Gamma[i, i] += dt
+    _times(F, Gamma, Phi)
+    for i in range(N_X):
+        Phi[i, i] += 1.0
     for _ in range(_DOUBLINGS):
         _times(Phi, Gamma, keep)
         Gamma += keep
