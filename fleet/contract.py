@@ -228,7 +228,7 @@ class Linear(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Derivatives(msgspec.Struct, frozen=True, kw_only=True):
-    """Coupled model: specific force [m/s2], angular acceleration [rad/s2] per unit of each term, and the wind.
+    """Coupled model: specific force [m/s2], angular acceleration [rad/s2] per unit of each term, and wind.
 
     Terms and letters: `fleet.physics.wrench`.
     """

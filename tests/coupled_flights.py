@@ -45,7 +45,7 @@ def fly(
     """Fly random attitudes and speeds; without noise the coupled model's free run is the flight."""
     rng = np.random.default_rng(seed)
     n = round(seconds / dt) + 1
-    now, acting, share, work = level(par), TRIM.copy(), 1.0 - np.exp(-dt / TAU), np.empty((3, 9))
+    now, acting, share, work = level(par), None, 1.0 - np.exp(-dt / TAU), np.empty((3, 9))
     y, u, ask = np.empty((n, 9)), np.empty((n, 4)), np.zeros(4)
     for k in range(n):
         if k % round(1.6 / dt) == 0:
@@ -54,6 +54,7 @@ def fly(
         p, q, phi, theta = now[3], now[4], now[6], now[7]
         u[k] = [0.5 * (ask[0] - phi) - 0.05 * p, 0.8 * (ask[1] + W0 / V - theta) - 0.1 * q, ask[2], 0.5 + ask[3]]
         u[k] = np.clip(u[k], [-1, -1, -1, 0], 1)
+        acting = u[k].copy() if acting is None else acting
         change = share * (u[k] - acting)
         step(now, acting + 0.5 * change, par, AT, dt, work)
         acting += change
