@@ -234,5 +234,3 @@ def test_more_doubt_about_the_data_means_less_said():
     tight, loose = (search(problem(16.0, discount=d), HELD[0], (HELD[0], LAMBDA), 8, None) for d in (0.25, 0.01))
     shares = [np.trace(np.linalg.solve(found.information + LAMBDA, LAMBDA)) for found in (tight, loose)]
     assert shares[0] < shares[1] < N_PAR
-
-

@@ -13,6 +13,7 @@ from fleet.frames import body_to_ned, ned_to_body
 from fleet.physics.actuators import TAU, lagged
 from fleet.window import Window
 from twin_worker.coupled import Coupled, identify
+from twin_worker.earned import Earned
 from twin_worker.observer import Observer
 from twin_worker.wind import WindFilter
 
@@ -20,6 +21,9 @@ from .flight import Flight
 from .gusty import WEATHER
 
 _LEAD = 250  # rows that settle lags and filter
+_SETTLE = 50  # rows that settle the filter before runs are judged
+_AHEAD_S, _EVERY_S = 40.0, 2.0  # runs judged: how long, how often
+_IN_SAMPLE = 0.5  # worth of runs over data the model has seen, where there are no others
 _WIND_S = 0.2  # between rows the wind filter takes [s]
 
 
@@ -28,19 +32,35 @@ class Seen:
     """One identified aircraft, as the bench asks for it."""
 
     eye: Observer
+    earned: Earned
+    mean: np.ndarray  # of the states over the stretch, (9,)
+
+    def runs(self, x: np.ndarray, u: np.ndarray, begins: np.ndarray, length: int) -> np.ndarray:
+        """Run free from rows of a stretch, `length` rows each with the one begun at, (m, length, 9)."""
+        delta = lagged(u, self.eye.dt, TAU)
+        return self.eye.fly(self.eye.track(x, delta[: len(x)])[begins], begins, length, delta)
 
     def forecast(self, known: Flight, u: np.ndarray) -> np.ndarray:
         """Run free from the end of `known` under the inputs u (n, 4): rows (n, 9), the first right after `known`."""
         past = known.part(max(len(known) - _LEAD, 0), len(known))
-        delta = lagged(np.vstack([past.u, u]), known.dt, TAU)
-        now = self.eye.track(past.x, delta[: len(past)])[-1:]
-        return self.eye.fly(now, np.array([len(past) - 1]), len(u) + 1, delta)[0, 1:]
+        run = self.runs(past.x, np.vstack([past.u, u]), np.array([len(past) - 1]), len(u) + 1)[0, 1:]
+        return self.earned.forecast(run, past.x[-1], self.mean, self.eye.dt * np.arange(1, len(u) + 1))
 
     def kstep(self, flight: Flight, k: int) -> np.ndarray:
         """Predict row i + k from the rows up to i, for every i: (n - k, 9)."""
-        delta = lagged(flight.u, flight.dt, TAU)
         begins = np.arange(len(flight) - k)
-        return self.eye.fly(self.eye.track(flight.x, delta)[begins], begins, k + 1, delta)[:, k]
+        run = self.runs(flight.x, flight.u, begins, k + 1)[:, k:]
+        return self.earned.forecast(run, flight.x[begins], self.mean, self.eye.dt * np.array([k]))[:, 0]
+
+    def look_back(self, flight: Flight, weight: float) -> None:
+        """Learn from a stretch what the runs are worth."""
+        length = min(round(_AHEAD_S / flight.dt) + 1, len(flight))
+        begins = np.arange(_SETTLE, len(flight) - round(1 / flight.dt), round(_EVERY_S / flight.dt))
+        runs = self.runs(flight.x, flight.u, begins, length)
+        rows = begins[:, None] + np.arange(length)
+        y = np.where(flight.ok[:, None], flight.x, np.nan)[np.minimum(rows, len(flight) - 1)]
+        y[rows >= len(flight)] = np.nan
+        self.earned.learn(runs, y, self.mean, flight.dt, weight)
 
 
 class Ours:
@@ -50,6 +70,9 @@ class Ours:
         self._wind = WindFilter()
         self._heard = 0
         self._found: list[Coupled] = []
+        self._seen: Seen | None = None
+        self._earned = Earned()
+        self._taught = 0  # rows of the flight the lessons have reached
 
     def identify(self, known: Flight, start: int) -> Seen:
         """Identify on the rows from `start` to the end of `known`."""
@@ -67,7 +90,14 @@ class Ours:
         last = next((one for one in reversed(self._found) if one.t1 <= window.t[0]), None)
         model = identify(window, wind, airframe(known), last)
         self._found.append(model)
-        return Seen(Observer(model, known.dt))
+        stretch = known.part(start, len(known))
+        if self._seen:
+            self._seen.look_back(stretch.part(len(stretch) - (len(known) - self._taught), len(stretch)), 1.0)
+        seen = Seen(Observer(model, known.dt), self._earned, stretch.x[stretch.ok].mean(axis=0))
+        if not self._seen:
+            seen.look_back(stretch, _IN_SAMPLE)
+        self._seen, self._taught = seen, len(known)
+        return seen
 
 
 def airframe(flight: Flight) -> Airframe:
