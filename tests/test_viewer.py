@@ -24,12 +24,15 @@ from fleet.contract import (
 from fleet.frames import Origin, body_to_ned, to_geodetic
 from viewer.app import near
 from viewer.camera import FOV, frame
-from viewer.detail import about, band, scale, why
+from viewer.charts import band, scale
+from viewer.chronicle import listing
+from viewer.detail import about, facts, why
 from viewer.feed import Feed
 from viewer.palette import DARK, LIGHT, line_colour, rgb, shown_line
 from viewer.place import UNIT_M, Place, scene_quat
 from viewer.routes import route
-from viewer.scene import DASHES, aircraft, cut_at_horizon
+from viewer.scene import DASHES, cut_at_horizon
+from viewer.shapes import aircraft
 from viewer.tube import curtain, marks, rings, skin
 from viewer.words import empty, summary, table
 
@@ -214,9 +217,10 @@ def test_a_hostile_mission_is_survived(items: tuple[Item, ...]) -> None:
 def test_what_comes_over_the_bus_is_escaped_everywhere(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 2, hostile=0)
     bus.publish(Alert(uav=0, t=T, kind=AlertKind.GROUND, sentence=HOSTILE))
-    page = about(feed.vehicles[0], DARK, clock.now) + summary(feed.all(), feed, DARK, clock.now)
+    page = about(feed.vehicles[0], DARK, clock.now) + facts(feed.vehicles[0], clock.now)
+    page += listing(feed.vehicles[0].events, DARK) + summary(feed.all(), feed, DARK, clock.now)
     page += table(feed.all(), DARK, clock.now, total=2, pick="{}", selected=0)
-    assert "<img" not in page and page.count("&lt;img") >= 4
+    assert "<img" not in page and page.count("&lt;img") >= 6
 
 
 def test_who_has_no_prediction_is_told_why(clock: Clock) -> None:
@@ -231,7 +235,7 @@ def test_who_has_no_prediction_is_told_why(clock: Clock) -> None:
 
 def test_the_panel_says_measured_coverage(clock: Clock) -> None:
     feed, _, _ = feed_of(clock, 1)
-    assert "90 % tube held 91 %, n = 412" in about(feed.vehicles[0], DARK, clock.now)
+    assert "90 % tube held 91 %, n = 412" in facts(feed.vehicles[0], clock.now)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 1e300])
@@ -250,7 +254,8 @@ def test_wild_numbers_in_good_messages_do_not_stop_the_page(clock: Clock, value:
     vehicle = feed.vehicles[0]
     assert vehicle.model.verdict is not None and vehicle.row.epoch == 1 and vehicle.forecast.t == T + 2
     assert np.isfinite(vehicle.forecast.until) and np.isfinite(vehicle.forecast.tube).all()
-    assert "UAV-000" in about(vehicle, DARK, clock.now) and "2 UAVs" in summary(feed.all(), feed, DARK, clock.now)
+    assert "UAV-000" in about(vehicle, DARK, clock.now) and "fit per state" in facts(vehicle, clock.now)
+    assert "2 UAVs" in summary(feed.all(), feed, DARK, clock.now)
     assert "UAV-000" in table(feed.all(), DARK, clock.now, total=2, pick="{}", selected=0)
     assert all(np.isfinite(part).all() for part in band(vehicle)[:4])
 

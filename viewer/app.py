@@ -17,8 +17,9 @@ from viewer.palette import DARK, LIGHT
 from viewer.panels import Panels
 from viewer.place import UNIT_M, Place
 from viewer.routes import home_alt_m, route
-from viewer.scene import Scene
+from viewer.scene import MINUTE, Scene
 from viewer.selected import Selection
+from viewer.track import placed
 from viewer.vehicle import Vehicle
 
 TICK_S = 0.1
@@ -141,7 +142,7 @@ class App:
         options, scene, chosen = self.panels, self.scene, self._chosen(fleet)
         scene.set_ground(_ground(fleet, place, scene.ground))
         if tick % 10 == 0:
-            scene.beat(fleet)
+            scene.beat(fleet, self._played(fleet))
         scene.draw_predicted(fleet, now, self.selected if options.tube.value else None)
         scene.predicted.show(options.predicted.value)
         scene.stems.show(options.stems.value)
@@ -150,10 +151,17 @@ class App:
         others = [v for v in fleet if v is not chosen] if options.routes.value else []
         scene.draw_routes([route(v.mission, place, scene.ground) for v in others])
         self.selection.tube = options.tube.value
+        if chosen is not None:
+            self.selection.draw_flight(chosen, self.feed, now, scene.glyph)
         own = route(chosen.mission if chosen else None, place, scene.ground)
         self.selection.draw_route(own)
         self._frame(fleet, now, place, own.points)
         scene.glyph = options.glyph.value * self._life
+
+    def _played(self, fleet: list[Vehicle]) -> dict[int, np.ndarray]:
+        """Give where the UAVs of recordings were in the last minute of data time, one place a second: (n, 3) [10 m]."""
+        tracks = {v.uav: (self.feed.track(v), v.t) for v in fleet if v.recorded}
+        return {uav: placed(rows, t - MINUTE, np.inf) for uav, (rows, t) in tracks.items() if len(rows)}
 
     def _frame(self, fleet: list[Vehicle], now: float, place: Place, points: np.ndarray) -> None:
         """Frame fleet, route and prediction when something new of these appears or someone new looks."""

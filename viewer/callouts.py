@@ -25,7 +25,8 @@ class Callouts:
 
     def draw(self, fleet: list[Vehicle], now: float, *, selected: int | None, size: float) -> None:
         """Name alerts and lost links; `now` is monotonic [s], `size` is the drawn span of an aircraft [10 m]."""
-        worst = [v for v in fleet if v.uav != selected and (v.alerts or v.state(now) is State.LINK_LOST)]
+        flying = [v for v in fleet if v.uav != selected and not v.ended]
+        worst = [v for v in flying if v.alerts or v.state(now) is State.LINK_LOST]
         worst = [v for v in sorted(worst, key=lambda v: severity(v, now)) if v.where(now) is not None][:LABELS]
         for label, vehicle in zip(self._labels, worst, strict=False):
             at = vehicle.where(now)

@@ -10,12 +10,13 @@ import numpy as np
 
 from fleet.bus import Bus, key
 from fleet.codec import Stamp
-from fleet.contract import Alert, AlertKind, FleetState, Mission, Model, Prediction, Sample, State, Status
+from fleet.contract import Account, Alert, AlertKind, FleetState, Mission, Model, Prediction, Sample, State, Status
 from fleet.frames import Origin
 from viewer.place import Place, TooFar
-from viewer.vehicle import GIVE_UP_S, JUMP_S, Forecast, Vehicle, forecast
+from viewer.vehicle import ENDED_S, GIVE_UP_S, JUMP_S, Forecast, Vehicle, forecast
 
 MAX_VEHICLES = 2_000  # ids are written by strangers: more than this many are counted, not kept
+COASTING_S = 1.0  # a prediction so long after the last sample is of no flight that anything can be laid beside [s]
 MAX_WRITERS = 16  # workers whose sentences are kept: a restarted one is another
 LATE = (
     Status,
@@ -24,6 +25,7 @@ LATE = (
     Prediction,
     Alert,
     FleetState,
+    Account,
 )  # asked for at the start, so that a late viewer is complete
 
 
@@ -42,6 +44,7 @@ class Feed:
             Sample: self._sample,
             Status: self._keep("status"),
             Mission: self._keep("mission"),
+            Account: self._account,
             Model: self._model,
             Prediction: self._prediction,
             Alert: self._alert,
@@ -73,13 +76,13 @@ class Feed:
     def all(self) -> list[Vehicle]:
         """Copy the UAVs, in order of their ids: nothing changes in them while they are drawn."""
         with self.lock:
-            return [self.vehicles[uav].still() for uav in sorted(self.vehicles)]
+            return [self.vehicles[uav].still(self._clock()) for uav in sorted(self.vehicles)]
 
     def one(self, uav: int) -> Vehicle | None:
         """Copy one UAV; None where it was never heard of."""
         with self.lock:
             found = self.vehicles.get(uav)
-            return found.still() if found is not None else None
+            return found.still(self._clock()) if found is not None else None
 
     def said(self) -> list[str]:
         """Copy what the workers say of themselves."""
@@ -90,6 +93,11 @@ class Feed:
         """Copy the flown trail: (n, 5) fleet time [s], scene ENU [10 m], Va [m/s]."""
         with self.lock:
             return np.array(vehicle.trail, float).reshape(-1, 5)
+
+    def track(self, vehicle: Vehicle) -> np.ndarray:
+        """Copy the whole flown path, thinned: (n, 4) fleet time [s], scene ENU [10 m]."""
+        with self.lock:
+            return vehicle.track.rows()
 
     def past(self, vehicle: Vehicle) -> list[Forecast]:
         """Copy the forecasts of the last minute, oldest first."""
@@ -140,6 +148,7 @@ class Feed:
                 raise
             self._move(Place(origin))
             vehicle.hear_sample(sample, self.place, now)
+        vehicle.note(sample, now)
 
     def _move(self, place: Place) -> None:
         """Begin anew elsewhere: where we are, nobody flies any more; the first position was a wrong one, say."""
@@ -148,8 +157,10 @@ class Feed:
             vehicle.forget()
 
     def _keep(self, name: str) -> Callable[[Any, Stamp | None, float], None]:
-        def hear(message: Any, _: Stamp | None, __: float) -> None:
-            setattr(self._vehicle(message.uav), name, message)
+        def hear(message: Any, _: Stamp | None, now: float) -> None:
+            vehicle = self._vehicle(message.uav)
+            setattr(vehicle, name, message)
+            vehicle.note(message, now)
 
         return hear
 
@@ -166,6 +177,7 @@ class Feed:
         if not self._believe(vehicle, stamp.epoch if stamp else 0, now):
             return
         vehicle.model = model
+        vehicle.note(model, now)
         fits = [fit for fit in model.verdict.fit.values() if np.isfinite(fit)]
         if fits and np.isfinite(model.t):
             vehicle.fits.append((model.t, float(np.clip(np.mean(fits), 0, 100))))
@@ -184,11 +196,21 @@ class Feed:
             return
         if vehicle.past and found.t < vehicle.past[-1].t - JUMP_S:
             vehicle.past.clear()
-        if not vehicle.past or found.t - vehicle.past[-1].t >= 0.9:
+        coasting = message.coast_s > COASTING_S
+        if not coasting and (not vehicle.past or found.t - vehicle.past[-1].t >= 0.9):
             vehicle.past.append(found)
 
-    def _alert(self, alert: Alert, _: Stamp | None, __: float) -> None:
+    def _account(self, account: Account, _: Stamp | None, now: float) -> None:
+        """Learn who is played from a recording, and that the player still speaks; one who flies now is live again."""
+        played = bool(account.links) and all(link.startswith("replay:") for link in account.links)
+        for uav in account.uavs:
+            vehicle = self.vehicles.get(uav)
+            if vehicle is not None and (played or now - vehicle.player > ENDED_S):
+                vehicle.player = now if played else -np.inf
+
+    def _alert(self, alert: Alert, _: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(alert.uav)
+        vehicle.note(alert, now)
         others = {kind: held for kind, held in vehicle.alerts.items() if kind is not alert.kind}
         vehicle.alerts = {**others, alert.kind: alert} if alert.active else others
 
@@ -204,7 +226,9 @@ class Feed:
     def alerts(self) -> list[tuple[Vehicle, AlertKind, Alert]]:
         """Give the alerts in force, newest first."""
         with self.lock:
-            found = [(v.still(), kind, alert) for v in self.vehicles.values() for kind, alert in v.alerts.items()]
+            now = self._clock()
+            copies = [vehicle.still(now) for vehicle in self.vehicles.values() if vehicle.alerts]
+            found = [(copy, kind, alert) for copy in copies for kind, alert in copy.alerts.items()]
         return sorted(found, key=lambda one: -one[2].t)
 
 

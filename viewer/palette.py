@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.contract import State
+from viewer.events import Kind
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,23 @@ class Palette:
             State.IDENTIFYING: self.identifying,
             State.LINK_LOST: self.lost,
         }.get(state, self.muted)
+
+    def event(self, kind: Kind) -> str:
+        """Give the colour of an event; none but a verified model has that of "verified"."""
+        return {
+            Kind.MODE: self.predicting,
+            Kind.ITEM: self.route,
+            Kind.MISSION: self.route,
+            Kind.ARMED: self.ink,
+            Kind.DISARMED: self.ink,
+            Kind.WARNING: self.mismatch,
+            Kind.ALERT: self.mismatch,
+            Kind.VERIFIED: self.verified,
+            Kind.SOUND: self.verified,
+            Kind.DOUBTED: self.identifying,
+            Kind.NO_MODEL: self.identifying,
+            Kind.END: self.ink,
+        }.get(kind, self.lost)
 
 
 DARK = Palette(
@@ -88,6 +106,23 @@ GLYPH = {
     State.LINK_LOST: "✕",
     State.WAITING: "◌",
     State.UNCLAIMED: "○",
+}
+MARK = {
+    Kind.MODE: "◆",
+    Kind.ITEM: "›",
+    Kind.MISSION: "≡",
+    Kind.ARMED: "●",
+    Kind.DISARMED: "○",
+    Kind.WARNING: "!",
+    Kind.ALERT: "▲",
+    Kind.EASED: "△",
+    Kind.LOST: "✕",
+    Kind.BACK: "↺",
+    Kind.VERIFIED: "✓",
+    Kind.SOUND: "✓",
+    Kind.DOUBTED: "◑",
+    Kind.NO_MODEL: "◌",
+    Kind.END: "■",
 }
 WORD = {state: state.value.replace("_", " ") for state in State}
 

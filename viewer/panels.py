@@ -7,7 +7,9 @@ from typing import Any
 
 import viser
 
-from viewer.detail import Charts, about
+from viewer.charts import Charts
+from viewer.chronicle import listing
+from viewer.detail import about, facts
 from viewer.feed import Feed
 from viewer.palette import WORD, Palette, triple
 from viewer.vehicle import Vehicle
@@ -62,6 +64,8 @@ class Panels:
         panel = self._gui.add_panel()
         with panel.add_tab("Selected", viser.Icon.FOCUS_2):
             self._about = self._gui.add_html("")
+            self._events = self._gui.add_html("")
+            self._facts = self._gui.add_html("")
             self._charts = Charts(self._gui, self._palette)
         panel.dock_right()
         panel.set_width(350)
@@ -87,6 +91,10 @@ class Panels:
         self._alerts.content = alerts(feed, self._palette)
         nobody = '<div class="uav soft">Nobody is selected: click a row or an aircraft, or press Ctrl+K.</div>'
         self._about.content = about(chosen, self._palette, now) if chosen is not None else nobody
+        self._facts.content = facts(chosen, now) if chosen is not None else ""
+        told = listing(chosen.events, self._palette) if chosen is not None else ""
+        if told != self._events.content:  # written anew, a list somebody scrolls would jump to its top
+            self._events.content = told
         self._charts.draw(chosen, feed, now)
         self._offer(fleet)
 

@@ -22,6 +22,20 @@ AT_A_PLACE = {
     VTOL_TAKEOFF,
     VTOL_LAND,
 }
+ITEM_NAMES = {
+    WAYPOINT: "waypoint",
+    LOITER_UNLIM: "loiter",
+    LOITER_TURNS: "loiter turns",
+    LOITER_TIME: "loiter for a time",
+    RTL: "return",
+    LAND: "land",
+    TAKEOFF: "take-off",
+    LOITER_TO_ALT: "loiter to altitude",
+    SPLINE: "spline waypoint",
+    VTOL_TAKEOFF: "VTOL take-off",
+    VTOL_LAND: "VTOL landing",
+    DO_JUMP: "jump",
+}
 RADIUS_IN = {LOITER_UNLIM: "param3", LOITER_TURNS: "param3", LOITER_TIME: "", LOITER_TO_ALT: "param2"}
 ABSOLUTE = {0, 5}  # MAV_FRAME: GLOBAL, GLOBAL_INT; every other altitude counts from home
 RADIUS_M = 60.0  # where an item names no loiter radius: the default of ArduPlane's WP_LOITER_RAD [m]

@@ -9,10 +9,12 @@ from fleet.contract import State
 from viewer.palette import Palette, mesh_colour, mix, rgb, triple
 from viewer.place import UNIT_M, scene_quat
 from viewer.routes import NOTHING, Route, circle
+from viewer.shapes import aircraft
 from viewer.strokes import Strokes, chain, dash_lines, faded
 from viewer.vehicle import Vehicle
 
 CHUNKS, STEPS = 5, 12  # the trail: immutable chunks of 12 s, and a head of up to 12 s, one point a second
+MINUTE = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # how long ago each point of the trail is, (73,) [s]
 DASHES = 14  # dashes of one predicted path
 CROWD = 300  # above this many, stems go and only exceptions keep their predicted path
 LEAP_M = 1_000.0  # farther within a second is no flight but another one (a recording begun anew): a new trail [m]
@@ -29,6 +31,7 @@ class Scene:
         self._vehicles: Any = None
         self._on_click: Callable[[int], None] = lambda _: None
         self.uavs: tuple[int, ...] = ()  # instance index -> UAV
+        self._selected: int | None = None  # has its own, finer path
         self._colours = np.zeros((0, 3))
         self._ring = np.zeros((0, 0, 3))
         self._beat = 0
@@ -90,9 +93,11 @@ class Scene:
         quat = scene_quat(*np.array([vehicle.attitude for vehicle, _ in shown]).T)
         colours = np.array([rgb(self._palette.state(vehicle.state(now))) for vehicle, _ in shown])
         size = np.array([self.glyph * (1.25 if vehicle.uav == selected else 1.0) for vehicle, _ in shown])
-        uavs = tuple(vehicle.uav for vehicle, _ in shown)
+        uavs, before, self._selected = tuple(vehicle.uav for vehicle, _ in shown), self._selected, selected
         if uavs != self.uavs:
             self._enlist(uavs, at, quat, size, colours)
+        elif before != selected:
+            self._redraw()
         self._vehicles.batched_positions, self._vehicles.batched_wxyzs = at, quat
         self._vehicles.batched_scales = size.astype(np.float32)
         if not np.array_equal(colours, self._colours):
@@ -124,15 +129,19 @@ class Scene:
             flat_shading=True,
         )
         self._vehicles.on_click(lambda event: self._clicked(event.instance_index))
-        for age in range(CHUNKS):
-            self._chunk(age)
+        self._redraw()
 
     def _clicked(self, index: int | None) -> None:
         if index is not None and 0 <= index < len(self.uavs):
             self._on_click(self.uavs[index])
 
-    def beat(self, fleet: list[Vehicle]) -> None:
-        """Remember where everyone is, once a second; every twelfth call closes a chunk of trail."""
+    def beat(self, fleet: list[Vehicle], played: dict[int, np.ndarray]) -> None:
+        """Remember where everyone is, once a second; every twelfth call closes a chunk of trail.
+
+        Args:
+            fleet: all UAVs
+            played: of UAVs whose seconds are others than ours, the places `MINUTE` ago, (n, 3) [10 m]
+        """
         if not self.uavs:
             return
         where = {vehicle.uav: vehicle.at for vehicle in fleet}
@@ -141,15 +150,29 @@ class Scene:
         self._ring[:, -1] = [self._ring[i, -2] if at is None else at for i, at in enumerate(now)]
         leapt = np.linalg.norm(self._ring[:, -1] - self._ring[:, -2], axis=1) > LEAP_M / UNIT_M
         self._ring[leapt] = self._ring[leapt, -1:]
+        for i, uav in enumerate(self.uavs):
+            if uav in played:
+                self._ring[i] = played[uav]
         self._beat += 1
-        if self._beat % STEPS == 0 or leapt.any():
-            for age in range(CHUNKS):
-                self._chunk(age)
+        if self._beat % STEPS == 0 or leapt.any() or played:
+            self._redraw()
+
+    def _redraw(self) -> None:
+        for age in range(CHUNKS):
+            self._chunk(age)
+
+    def _others(self, points: np.ndarray) -> np.ndarray:
+        """Take away the trail of the selected UAV, points (n, k, 3): it has its own, finer path."""
+        if self._selected not in self.uavs:
+            return points
+        bare, i = points.copy(), self.uavs.index(self._selected)
+        bare[i] = bare[i, :1]
+        return bare
 
     def _chunk(self, age: int) -> None:
         """Draw one closed chunk; `age` 0 is the newest."""
         last = self._ring.shape[1] - 1 - self._beat % STEPS - age * STEPS
-        points = self._ring[:, last - STEPS : last + 1]
+        points = self._others(self._ring[:, last - STEPS : last + 1])
         shares = np.interp(age * STEPS + np.arange(STEPS, -1, -1), [-STEPS, CHUNKS * STEPS], [0.95, 0.03])
         colours = faded(self._colours, rgb(self._palette.ground), shares)
         self.trails[age].draw(chain(points), colours.reshape(-1, 2, 3))
@@ -163,7 +186,7 @@ class Scene:
         tip = np.array([self._ring[i, -1] if at is None else at for i, at in enumerate(now)])
         padded = np.concatenate([points, np.repeat(tip[:, None], STEPS + 1 - run, axis=1)], axis=1)
         colours = np.repeat(self._colours[:, None] * 0.95 + rgb(self._palette.ground) * 0.05, STEPS + 1, axis=1)
-        self.head.draw(chain(padded), colours.reshape(-1, 3))
+        self.head.draw(chain(self._others(padded)), colours.reshape(-1, 3))
 
     def draw_predicted(self, fleet: list[Vehicle], now: float, selected: int | None) -> None:
         """Draw every predicted path dashed, from now to its horizon; the selected one has its tube instead."""
@@ -212,30 +235,3 @@ def cut_at_horizon(ahead: np.ndarray, path: np.ndarray, start: float, until: flo
     at = np.linspace(min(max(start, 0.0), until), until, 2 * DASHES)
     points = np.stack([np.interp(at, ahead, path[:, i]) for i in range(3)], axis=-1)
     return chain(points)[::2]
-
-
-def aircraft() -> tuple[np.ndarray, np.ndarray]:
-    """Shape a small fixed-wing aircraft of one unit span that looks along +x: vertices (n, 3), triangles (m, 3)."""
-    boxes = [  # centre, half size, how far the tip is swept back
-        ((0.05, 0.0, 0.0), (0.38, 0.045, 0.05), 0.0),
-        ((0.08, 0.26, 0.02), (0.09, 0.24, 0.012), 0.07),
-        ((0.08, -0.26, 0.02), (0.09, -0.24, 0.012), 0.07),
-        ((-0.32, 0.09, 0.03), (0.05, 0.09, 0.01), 0.03),
-        ((-0.32, -0.09, 0.03), (0.05, -0.09, 0.01), 0.03),
-    ]
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    quads = np.array([(a, b, c, a, c, d) for a, b, c, d in sides]).reshape(-1, 3)
-    vertices, faces = [], []
-    for k, (centre, half, sweep) in enumerate(boxes):
-        box = np.array(centre) + corners * half
-        box[:, 0] -= np.where(corners[:, 1] > 0, sweep, 0.0)
-        vertices.append(box)
-        faces.append((quads if half[1] > 0 else quads[:, ::-1]) + 8 * k)
-    n = 8 * len(boxes)
-    vertices.append(
-        np.array([[-0.25, 0.01, 0.03], [-0.38, 0.01, 0.03], [-0.40, 0.0, 0.20], [-0.32, 0.0, 0.20], [0.58, 0, 0]])
-    )
-    faces.append(np.array([(0, 1, 2), (0, 2, 3), (2, 1, 0), (3, 2, 0)]) + n)
-    faces.append(np.array([(4, n + 4, 5), (6, n + 4, 4), (7, n + 4, 6), (5, n + 4, 7)]) * 1)
-    return 1.1 * np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)

@@ -4,8 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from fleet.contract import State
 from viewer.feed import Feed
 from viewer.palette import Palette, mix, rgb, triple
+from viewer.pins import Pins
 from viewer.routes import NOTHING, Route
 from viewer.strokes import Strokes, chain, dash_lines, dashed
 from viewer.tube import closed, curtain, marks, rings, skin
@@ -30,10 +32,13 @@ class Selection:
         steps = BANDS * BAND_STEPS + 1
         self._curtain = self._sheet("/selected/curtain", *curtain(np.zeros((steps, 3)), 0.0), 0.09, palette.tube)
         self._thin = Strokes(self._scene, "/selected/thin", 1.4)
+        self._flown = Strokes(self._scene, "/selected/flown", 1.6)
+        self._pins = Pins(server, palette)
         self._route = Strokes(self._scene, "/selected/route", 2.0)
         self._bold = Strokes(self._scene, "/selected/bold", 2.7)
         self._horizon = Strokes(self._scene, "/selected/horizon", 3.6)
         self._labels = {name: self._label(name) for name in LABELS}
+        self._flown_colour = mix(palette.flown, palette.ground, 0.5)
         self.tube = True
         self._clear_of = 0.0  # room round a label [10 m]
 
@@ -67,8 +72,9 @@ class Selection:
 
     def clear(self) -> None:
         """Hide everything: nobody is selected."""
-        for strokes in (self._thin, self._route, self._bold, self._horizon):
+        for strokes in (self._thin, self._flown, self._route, self._bold, self._horizon):
             strokes.draw(NOTHING.legs)
+        self._pins.draw((), NOTHING.points, None, 1.0)
         for node in (*self._bands, self._curtain, *self._labels.values()):
             node.visible = False
 
@@ -157,7 +163,15 @@ class Selection:
         at = np.arange(5.0, reach, 5.0)
         happened = np.stack([np.interp(told.t + at, trail[:, 0], trail[:, i]) for i in (1, 2, 3)], axis=-1)
         thin.add(np.stack([told.at(at), happened], axis=1), colour)
-        self.say("then", f"predicted {clock - told.t:.0f} s ago", told.at(0.4 * reach) - [0, 0, 0.6])
+        middle = told.at(0.4 * reach) - [0, 0, 0.6]
+        clear = np.linalg.norm(middle - trail[-1, 1:4]) > self._clear_of
+        self.say("then", f"predicted {clock - told.t:.0f} s ago", middle if clear else None)
+
+    def draw_flight(self, vehicle: Vehicle, feed: Feed, now: float, size: float) -> None:
+        """Draw the whole flown path, faintly, with what happened on it; `size` as for `draw`."""
+        rows = feed.track(vehicle)
+        self._flown.draw(chain(rows[:, 1:]) if len(rows) > 1 else NOTHING.legs, self._flown_colour)
+        self._pins.draw(vehicle.events, rows, vehicle.where(now), size)
 
     def draw_route(self, route: Route) -> None:
         """Draw the mission: legs and loiters solid, jumps and returns dashed, a small ring at each item."""
@@ -199,5 +213,7 @@ def caption(vehicle: Vehicle, now: float) -> str:
     """Say in one line who is selected and how it stands."""
     told = vehicle.forecast
     horizon = f"  horizon {told.until:.0f} s" if told is not None else "  no prediction yet"
-    lost = f"  link lost {vehicle.age(now):.0f} s" if vehicle.state(now).value == "link_lost" else ""
+    if vehicle.ended:
+        return f"{vehicle.name}  end of the recording"
+    lost = f"  link lost {vehicle.age(now):.0f} s" if vehicle.state(now) is State.LINK_LOST else ""
     return vehicle.name + (lost or horizon)

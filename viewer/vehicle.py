@@ -2,18 +2,23 @@
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fleet.contract import Alert, AlertKind, FleetRow, Link, Mission, Model, Prediction, Sample, State, Status
+from viewer.datatime import DataTime
+from viewer.events import Event, Known, closed, hear, merged
 from viewer.place import UNIT_M, Place
+from viewer.track import Track
 
 TRAIL_ROWS = 900  # about 90 s at 10 Hz
 SILENT_S = 3.0  # without a sample for this long the link counts as lost, whatever was last said [s]
 GIVE_UP_S = 10.0  # a writer silent for so long has lost its claim: a lower epoch (a restarted fleet) may speak [s]
 ABANDONED_S = 30.0  # without a word of any worker for so long, what was last said is no state any more [s]
+ENDED_S = 3.0  # a recording whose player is silent for so long is over [s]
 JUMP_S = 5.0  # a step back in time by more than this is another flight: start afresh [s]
+AWAY_S = 86_400.0  # a status whose time lies farther from the samples is of another flight [s]
 MAX_STEPS, MAX_AHEAD_S = 5_000, 3_600.0  # look-ahead accepted from outside: steps, and time [s]
 
 
@@ -85,9 +90,15 @@ class Vehicle:
     prediction: Prediction | None = None
     forecast: Forecast | None = None
     row: FleetRow | None = None
+    time: DataTime = field(default_factory=DataTime)
+    player: float = -np.inf  # when the gateway that plays it as a recording last spoke, monotonic [s]; -inf: live
+    ended: bool = False  # the recording is over: what is shown is its last instant
+    known: Known = field(default_factory=Known)
+    events: tuple[Event, ...] = ()  # oldest first; replaced as a whole, never changed
     alerts: dict[AlertKind, Alert] = field(default_factory=dict)  # replaced as a whole, never changed
     refused: tuple[float, str] = (-np.inf, "")  # when a message was refused, monotonic [s], and why
     trail: deque = field(default_factory=lambda: deque(maxlen=TRAIL_ROWS))  # t, east, north, up, Va
+    track: Track = field(default_factory=Track)  # the whole flight, thinned
     past: deque = field(default_factory=lambda: deque(maxlen=60))  # forecasts, about one a second
     fits: deque = field(default_factory=lambda: deque(maxlen=200))  # t, mean fit [%]
 
@@ -98,7 +109,7 @@ class Vehicle:
 
     def state(self, now: float) -> State:
         """Judge where its twin stands; the worst news wins. `now` is monotonic [s]."""
-        silent = now - self.heard > SILENT_S
+        silent = now - self.heard > SILENT_S / min(self.time.pace, 1.0)  # a slow recording may breathe
         if silent or (self.status is not None and self.status.link is Link.LOST):
             return State.LINK_LOST
         if now - self.believed > ABANDONED_S:
@@ -111,26 +122,49 @@ class Vehicle:
             return State.VERIFIED if self.model.in_force is not None else State.IDENTIFYING
         return State.WAITING
 
-    def still(self) -> "Vehicle":
-        """Give a copy that nobody changes any more; the histories stay shared, read them through the feed."""
+    def still(self, now: float) -> "Vehicle":
+        """Give a copy that nobody changes any more; the histories stay shared, read them through the feed.
+
+        A recording that is over stands still at its end: what a worker says after that is of no flight.
+        """
         copy = object.__new__(Vehicle)
         copy.__dict__.update(self.__dict__)
+        if self.recorded and now - self.player > ENDED_S and now - self.heard > ENDED_S:
+            copy.ended, copy.events = True, closed(self.events, self.time.t)
+            copy.alerts = {kind: alert for kind, alert in self.alerts.items() if kind is not AlertKind.LINK_LOST}
+            copy.forecast = self.past[-1] if self.past else None
+            copy.prediction = copy.forecast.message if copy.forecast is not None else self.prediction
         return copy
 
+    @property
+    def recorded(self) -> bool:
+        """Tell whether it is played from a recording."""
+        return self.player > -np.inf
+
     def age(self, now: float) -> float:
-        """Give the time since the last sample arrived [s]; infinite before any."""
-        return now - self.heard
+        """Give the data time since the last sample [s]; infinite before any."""
+        return max(self.clock(now) - self.t, 0.0)
 
     def clock(self, now: float) -> float:
-        """Estimate the aircraft's fleet time now [s], from the newest thing heard of it."""
-        told = [(self.t, self.heard)]
-        if self.forecast is not None:
-            told.append((self.forecast.t, self.forecast.heard))
-        t, heard = max(told)
-        return t + (now - heard)
+        """Estimate the aircraft's data time now [s], from the newest thing heard of it; it stops with a recording."""
+        if self.ended:
+            return self.time.t
+        if self.time.t == -np.inf and self.forecast is not None:
+            return self.forecast.t + (now - self.forecast.heard)
+        return self.time.at(now)
+
+    def note(self, message: Any, now: float) -> None:
+        """Take down what a message tells: data time and events."""
+        if isinstance(message, Sample | Status) and np.isfinite(message.t) and abs(message.t - self.t) < AWAY_S:
+            self.time = self.time.hear(message.t, now)
+        self.known, fresh = hear(self.known, message)
+        if fresh:
+            self.events = merged(self.events, fresh)
 
     def where(self, now: float) -> np.ndarray | None:
         """Give the place to draw it, (3,) [10 m]: the last sample's, or, link lost, the predicted ghost's."""
+        if self.ended and self.at is not None:
+            return self.at
         if self.forecast is not None and (self.at is None or self.state(now) is State.LINK_LOST):
             return self.forecast.at(self.clock(now) - self.forecast.t)
         return self.at
@@ -160,12 +194,14 @@ class Vehicle:
         if not fix.any():
             return
         enu = place.geodetic(*x[fix, :3].T)
+        self.track.add(t[fix], enu)
         self.trail.extend((float(k), *p, self.Va) for k, p in zip(t[fix], enu.tolist(), strict=True))
         self.at, self.alt_m = enu[-1], float(x[fix][-1, 2]) * 1e-3
 
     def forget(self) -> None:
         """Drop everything that belongs to a flight: the clock went back, or the scene begins anew elsewhere."""
         self.at, self.alerts = None, {}
+        self.time, self.known, self.events = DataTime(), Known(), ()
         self.t, self.forecast, self.prediction, self.model, self.row = -np.inf, None, None, None, None
-        for history in (self.trail, self.past, self.fits):
+        for history in (self.trail, self.past, self.fits, self.track):
             history.clear()

@@ -1,20 +1,41 @@
 """What the page says, as HTML. Everything that came over the bus is escaped here, at the edge, and nowhere else."""
 
+from collections import Counter
 from html import escape
 from math import isfinite
+from typing import NamedTuple
 
 from fleet.contract import State
+from viewer.datatime import stamp, times
+from viewer.events import Kind
 from viewer.feed import Feed
-from viewer.palette import GLYPH, WORD, Palette
+from viewer.palette import GLYPH, MARK, WORD, Palette
 from viewer.vehicle import Vehicle
 
 SEVERITY = (State.LINK_LOST, State.UNCLAIMED, State.WAITING, State.IDENTIFYING, State.PREDICTING, State.VERIFIED)
 MAX_ROWS = 50
 
 
+class Standing(NamedTuple):
+    """How a UAV stands, in a glyph, a word and a colour."""
+
+    glyph: str
+    word: str
+    colour: str
+
+
+def standing(vehicle: Vehicle, palette: Palette, now: float) -> Standing:
+    """Say how a UAV stands: its twin's state, or that its recording is over."""
+    if vehicle.ended:
+        return Standing(MARK[Kind.END], "recording ended", palette.event(Kind.END))
+    state = vehicle.state(now)
+    return Standing(GLYPH[state], WORD[state], palette.state(state))
+
+
 def severity(vehicle: Vehicle, now: float) -> tuple[bool, int, float, int]:
-    """Rank a UAV: alerts first, then the worst state, then the shortest horizon."""
-    return (not vehicle.alerts, SEVERITY.index(vehicle.state(now)), horizon_s(vehicle), vehicle.uav)
+    """Rank a UAV: alerts first, then the worst state, then the shortest horizon; ended recordings last."""
+    rank = len(SEVERITY) if vehicle.ended else SEVERITY.index(vehicle.state(now))
+    return (not vehicle.alerts, rank, horizon_s(vehicle), vehicle.uav)
 
 
 def horizon_s(vehicle: Vehicle) -> float:
@@ -50,19 +71,28 @@ def empty(feed: Feed, now: float) -> str:
 
 def summary(fleet: list[Vehicle], feed: Feed, palette: Palette, now: float) -> str:
     """Count the fleet by state, with the median horizon and the measured coverage."""
-    states = [vehicle.state(now) for vehicle in fleet]
+    worst = sorted(fleet, key=lambda vehicle: severity(vehicle, now)[1])
     chips = "".join(
-        f'<span class="chip"><b style="color:{palette.state(state)}">{GLYPH[state]}</b><b>{states.count(state)}</b>'
-        f'<span class="soft">{WORD[state]}</span></span>'
-        for state in SEVERITY
-        if state in states
+        f'<span class="chip"><b style="color:{one.colour}">{one.glyph}</b><b>{n}</b>'
+        f'<span class="soft">{one.word}</span></span>'
+        for one, n in Counter(standing(vehicle, palette, now) for vehicle in worst).items()
     )
     horizons = sorted(h for vehicle in fleet if (h := horizon_s(vehicle)) > 0)
     median = f" · median horizon {horizons[len(horizons) // 2]:.0f} s" if horizons else ""
     said = "".join(f'<div class="soft">{escape(text)}</div>' for text in feed.said())
     plural = "UAV" if len(fleet) == 1 else "UAVs"
     head = f"<h1>{len(fleet)} {plural}<small>{median}{_fleet_coverage(fleet)}</small></h1>"
-    return f'<div class="uav">{head}{chips}{said}</div>'
+    return f'<div class="uav">{head}{chips}{_recording(fleet, now)}{said}</div>'
+
+
+def _recording(fleet: list[Vehicle], now: float) -> str:
+    """Say that recordings are played, the data time they have come to, and how fast they run."""
+    played = [vehicle for vehicle in fleet if vehicle.recorded]
+    if not played:
+        return ""
+    newest = max(played, key=lambda vehicle: (not vehicle.ended, vehicle.clock(now)))
+    pace = "ended" if newest.ended else f"played {times(newest.time.pace)}"
+    return f'<div class="soft">Recording · <span class="now">{stamp(newest.clock(now))}</span> · {pace}</div>'
 
 
 def _fleet_coverage(fleet: list[Vehicle]) -> str:
@@ -90,16 +120,16 @@ def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pic
 
 
 def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, *, on: bool, longest: float) -> str:
-    state, horizon, mean = vehicle.state(now), horizon_s(vehicle), fit(vehicle)
-    colour = palette.mismatch if vehicle.alerts else palette.state(state)
-    glyph = "▲" if vehicle.alerts else GLYPH[state]
-    word = f"{WORD[state]} {ago(vehicle.age(now))}" if state is State.LINK_LOST else WORD[state]
+    one, horizon, mean = standing(vehicle, palette, now), horizon_s(vehicle), fit(vehicle)
+    colour = palette.mismatch if vehicle.alerts else one.colour
+    glyph = "▲" if vehicle.alerts else one.glyph
+    word = f"{one.word} {ago(vehicle.age(now))}" if one.word == WORD[State.LINK_LOST] else one.word
     bar = f'<i><i style="width:{min(horizon / longest, 1) * 100:.0f}%;background:{colour}"></i></i>'
     percent, seconds = "–" if mean is None else f"{mean:.0f}", f"{horizon:.0f} s" if horizon else "–"
     return (
         f'<tr class="pick{" on" if on else ""}" data-uav="{vehicle.uav}" onpointerdown="{pick.format(vehicle.uav)}">'
         f'<td style="color:{colour}">{glyph}</td><td>{vehicle.name}</td>'
-        f'<td style="color:{palette.state(state)}">{word}</td><td class="num">{percent}</td>'
+        f'<td style="color:{one.colour}">{word}</td><td class="num">{percent}</td>'
         f'<td><div class="bar">{bar}<span class="num" style="width:30px">{seconds}</span>'
         "</div></td></tr>"
     )

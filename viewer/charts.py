@@ -1,0 +1,114 @@
+"""The charts of the selected UAV: what was told of the last minute, and what is predicted, over data time."""
+
+from typing import Any
+
+import numpy as np
+from viser import uplot
+
+from viewer.feed import Feed
+from viewer.palette import Palette
+from viewer.place import UNIT_M
+from viewer.vehicle import Vehicle
+
+PAST_S = 60.0  # how far the histories reach back [s]
+
+
+class Charts:
+    """Four charts of the selected UAV; built once, their data replaced."""
+
+    def __init__(self, gui: Any, palette: Palette) -> None:
+        self._gui, p = gui, palette
+        two = np.array([0.0, 1.0])
+        self._tube = self._chart(
+            "Band, m",
+            (("along", p.predicting), ("cross", p.verified), ("vertical", p.identifying), ("horizon", p.horizon)),
+            (two,) * 5,
+        )
+        self._fit = self._chart("Mean fit of each verdict, %", (("fit", p.verified),), (two, two))
+        self._alt = self._chart("Altitude, m", (("flown", p.flown), ("predicted", p.predicting)), (two,) * 3)
+        self._va = self._chart("Airspeed, m/s", (("Va", p.flown),), (two,) * 2)
+
+    def _chart(self, title: str, lines: tuple, data: tuple) -> tuple[Any, Any]:
+        legend = " ".join(f'<span style="color:{colour};white-space:nowrap">━ {name}</span>' for name, colour in lines)
+        head = self._gui.add_html(f'<div class="uav" style="padding-bottom:0"><b>{title}</b> {legend}</div>')
+        series = tuple(
+            uplot.Series(label=name, stroke=colour, width=2, points={"show": False}) for name, colour in lines
+        )
+        plot = self._gui.add_uplot(
+            data,
+            (uplot.Series(label="s"), *series),
+            scales={"x": {"time": False}},
+            axes=({}, {"size": 44}),
+            legend={"show": False},
+            padding=(10, 16, 0, 0),
+            height=126,
+        )
+        return head, plot
+
+    def draw(self, vehicle: Vehicle | None, feed: Feed, now: float) -> None:
+        """Replace the data; a chart without any is hidden."""
+        trail = feed.trail(vehicle) if vehicle is not None else np.zeros((0, 5))
+        _put(self._tube, band(vehicle))
+        _put(self._fit, _history(feed.fits(vehicle), 1) if vehicle is not None else None)
+        _put(self._va, _history(trail[np.isfinite(trail[:, 4])], 4))
+        _put(self._alt, _altitude(vehicle, trail, now))
+
+
+def _put(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None) -> None:
+    """Show data, x first. The y scale is given: a gap (not a number) would spoil the chart's own."""
+    for part in chart:
+        part.visible = data is not None
+    if data is None:
+        return
+    x0, x1 = np.floor(data[0][0] / 10) * 10, np.ceil(data[0][-1] / 10) * 10
+    scales = {"x": {"time": False, "range": (float(x0), float(x1))}, "y": {"range": scale(np.concatenate(data[1:]))}}
+    if chart[1].scales != scales:  # a new scale builds the chart anew: rarely, please
+        chart[1].scales = scales
+    chart[1].data = data
+
+
+def scale(y: np.ndarray) -> tuple[float, float]:
+    """Choose a range for y that holds its finite values and seldom changes: whole multiples of 1, 2 or 5 times 10^k."""
+    y = y[np.isfinite(y)]
+    low, high = (float(y.min()), float(y.max())) if len(y) else (0.0, 1.0)
+    rough = max(high - low, 0.02 * abs(high), 1e-3) / 2
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = float(power * next(m for m in (1, 2, 5, 10) if m * power >= rough * 0.999))
+    return float(np.floor(low / step) * step), float((np.floor(high / step) + 1) * step)
+
+
+def band(vehicle: Vehicle | None) -> tuple[np.ndarray, ...] | None:
+    """Give half-axes against look-ahead, and an upright line at the horizon: x, along, cross, vertical, horizon."""
+    if vehicle is None or (told := vehicle.forecast) is None:
+        return None
+    x = np.sort(np.concatenate([np.linspace(0, told.ahead[-1], 60), [told.until, told.until + 1e-3]]))
+    axes = told.width(x) * UNIT_M
+    at = np.searchsorted(x, [told.until, told.until + 1e-3])
+    upright = np.full(len(x), np.nan)
+    upright[at] = [0.0, axes[:, :2].max()]
+    return x, axes[:, 0], axes[:, 1], axes[:, 2], upright
+
+
+def _history(rows: np.ndarray, column: int) -> tuple[np.ndarray, ...] | None:
+    """Give the last minute of one column against seconds ago: (x, y); None where there are fewer than two points."""
+    if len(rows) < 2:
+        return None
+    x = rows[:, 0] - rows[-1, 0]
+    keep = (x >= -PAST_S) & np.concatenate([np.diff(x) > 0, [True]])
+    return (x[keep], rows[keep, column]) if keep.sum() > 1 else None
+
+
+def _altitude(vehicle: Vehicle | None, trail: np.ndarray, now: float) -> tuple[np.ndarray, ...] | None:
+    """Join flown and predicted altitude: (x, flown, predicted) [s from now, m above mean sea level]."""
+    flown = _history(trail, 3)
+    if vehicle is None or flown is None:
+        return None
+    base = vehicle.alt_m - trail[-1, 3] * UNIT_M
+    x, up = flown[0], flown[1] * UNIT_M + base
+    if vehicle.forecast is None:
+        return x, up, np.full(len(x), np.nan)
+    told = vehicle.forecast
+    ahead = np.linspace(0.1, max(told.until, 0.2), 40)
+    predicted = told.at(ahead + max(float(trail[-1, 0]) - told.t, 0.0))[:, 2] * UNIT_M + base
+    blank = np.full(len(ahead), np.nan), np.full(len(x), np.nan)
+    return np.concatenate([x, ahead]), np.concatenate([up, blank[0]]), np.concatenate([blank[1], predicted])

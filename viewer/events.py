@@ -1,0 +1,189 @@
+"""What happened to a UAV, read off what is said of it: pure, message by message, nothing kept but what was last known.
+
+`hear(known, message)` gives what is known now and the events that this message tells; their times are data times, so
+a recording of 2013 tells 2013. What the words say is not escaped here but where they become HTML.
+"""
+
+from collections.abc import Callable
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fleet.contract import Alert, AlertKind, Item, Link, Mission, Model, Outcome, Sample, Status, Verdict
+from viewer.routes import ITEM_NAMES
+
+MAX_EVENTS = 200  # kept of one UAV; the oldest go first
+MAX_WORDS = 200  # letters kept of a sentence from outside
+MAX_STEPS = 20  # changes of the mission item believed of one sample
+LATEST = 4e9  # times beyond are noise [s since 1970]
+SOUND = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST)  # the newest try bears out a model, its own or the one in force
+
+
+class Kind(StrEnum):
+    """What sort of event it is; each has its glyph and its colour."""
+
+    MODE = "mode"
+    ITEM = "item"
+    MISSION = "mission"
+    ARMED = "armed"
+    DISARMED = "disarmed"
+    WARNING = "warning"
+    ALERT = "alert"
+    EASED = "eased"
+    LOST = "lost"
+    BACK = "back"
+    VERIFIED = "verified"
+    SOUND = "sound"
+    DOUBTED = "doubted"
+    NO_MODEL = "no model"
+    END = "end"
+
+
+class Event(NamedTuple):
+    """Something that happened."""
+
+    t: float  # data time [s since 1970]
+    kind: Kind
+    text: str  # from outside: escape it before it becomes HTML
+
+
+class Known(NamedTuple):
+    """What was last said of one UAV, as far as a change of it is an event."""
+
+    mode: str = ""
+    armed: bool = False
+    lost: bool = False
+    back_t: float = -np.inf  # when the link last came back [s since 1970]
+    sentence: str = ""
+    items: tuple[Item, ...] = ()
+    seq: int = -1
+    verdict: tuple[bool, Outcome | None] | None = None  # is a model in force; why the newest try is not sound
+    raised: frozenset[AlertKind] = frozenset()
+
+
+Told = tuple[Known, list[Event]]
+
+
+def hear(known: Known, message: Any) -> Told:
+    """Compare a message with what is known: what is known now, and what happened, in order.
+
+    Raises:
+        ValueError: when rows of a sample have no sound shape; the gateway must resend.
+    """
+    tell = _TELLS.get(type(message))
+    if tell is None:
+        return known, []
+    known, events = tell(known, message)
+    return known, [event for event in events if 0 < event.t < LATEST]
+
+
+def merged(events: tuple[Event, ...], fresh: list[Event]) -> tuple[Event, ...]:
+    """Add events in the order of their times; of too many the newest stay."""
+    return tuple(sorted((*events, *fresh), key=lambda event: event.t)[-MAX_EVENTS:])
+
+
+def closed(events: tuple[Event, ...], t: float) -> tuple[Event, ...]:
+    """End the events with the recording at time t [s]: that nothing came after it is no loss of the link."""
+    flown = tuple(event for event in events if event.t <= t or event.kind is not Kind.LOST)
+    return merged(flown, [Event(t, Kind.END, "end of the recording")] if 0 < t < LATEST else [])
+
+
+def _status(known: Known, status: Status) -> Told:
+    known, events = _link(known, status.t, status.link is Link.LOST, "link lost")
+    if status.mode and status.mode != known.mode:
+        events.append(Event(status.t, Kind.MODE, _clip(status.mode)))
+    if status.armed != known.armed:
+        kind = Kind.ARMED if status.armed else Kind.DISARMED
+        events.append(Event(status.t, kind, kind.value))
+    sentence = "" if status.link is Link.LOST else status.sentence  # lost: it only counts the seconds
+    if sentence and sentence != known.sentence:
+        events.append(Event(status.t, Kind.WARNING, _own_words(sentence, status.uav)))
+    return known._replace(mode=status.mode or known.mode, armed=status.armed, sentence=sentence), events
+
+
+def _link(known: Known, t: float, lost: bool, words: str) -> Told:
+    """Follow the link, of which gateway and worker both speak, one perhaps long after the other."""
+    if lost == known.lost or (lost and t <= known.back_t):
+        return known, []
+    if lost:
+        return known._replace(lost=True), [Event(t, Kind.LOST, words)]
+    return known._replace(lost=False, back_t=t), [Event(t, Kind.BACK, "link back")]
+
+
+def _alert(known: Known, alert: Alert) -> Told:
+    if alert.kind is AlertKind.LINK_LOST:
+        return _link(known, alert.t, alert.active, "link lost")
+    if alert.active == (alert.kind in known.raised):
+        return known, []
+    name = alert.kind.value.replace("_", " ")
+    if not alert.active:
+        return known._replace(raised=known.raised - {alert.kind}), [Event(alert.t, Kind.EASED, f"{name} is over")]
+    said = _own_words(alert.sentence, alert.uav) or name
+    return known._replace(raised=known.raised | {alert.kind}), [Event(alert.t, Kind.ALERT, said)]
+
+
+def _mission(known: Known, mission: Mission) -> Told:
+    if not mission.items or not mission.complete or mission.items[1:] == known.items[1:]:  # the first is but home
+        return known, []
+    said = f"{'another' if known.items else 'a'} mission on board, {len(mission.items)} items"
+    return known._replace(items=mission.items), [Event(mission.t, Kind.MISSION, said)]
+
+
+def _sample(known: Known, sample: Sample) -> Told:
+    if sample.leg is None:
+        return known, []
+    t, x = sample.leg.t.numpy(), sample.leg.x.numpy()
+    if x.ndim != 2 or x.shape[1] != 1 or t.shape != (len(x),):
+        raise ValueError(f"uav-{sample.uav}: leg rows have shape {x.shape}, expected (n, 1) and n times; resend")
+    sound = np.isfinite(x[:, 0]) & (np.abs(x[:, 0]) < 1e6)
+    t, seqs = t[sound], x[sound, 0].astype(int)
+    steps = np.flatnonzero(np.diff(seqs, prepend=known.seq))[-MAX_STEPS:]
+    if not len(steps):
+        return known, []
+    events = [Event(float(t[k]), Kind.ITEM, _item(known.items, int(seqs[k]))) for k in steps if seqs[k] > 0]
+    return known._replace(seq=int(seqs[-1])), events
+
+
+def _item(items: tuple[Item, ...], seq: int) -> str:
+    """Name a mission item; without the mission its number alone."""
+    command = next((item.command for item in items if item.seq == seq), None)
+    return f"item {seq}" if command is None else f"item {seq}: {ITEM_NAMES.get(command, f'command {command}')}"
+
+
+def _model(known: Known, model: Model) -> Told:
+    """Tell when the first model is verified, when tries stop bearing it out, and when they do again."""
+    newest = model.verdict
+    now = model.in_force is not None, None if newest.outcome in SOUND else newest.outcome
+    if now == known.verdict:
+        return known, []
+    before, known = known.verdict, known._replace(verdict=now)
+    if not now[0]:
+        return known, [Event(model.t, Kind.NO_MODEL, f"no model yet: {_outcome(newest)}")]
+    if before is None or not before[0]:
+        said = _own_words((model.in_force or newest).sentence, model.uav)
+        return known, [Event(model.t, Kind.VERIFIED, f"model verified: {said}")]
+    if now[1] is None:
+        return known, [Event(model.t, Kind.SOUND, "newest try sound again")]
+    return known, [Event(model.t, Kind.DOUBTED, f"newest try {_outcome(newest)}; an earlier model stays in force")]
+
+
+def _outcome(verdict: Verdict) -> str:
+    return verdict.outcome.value.replace("_", " ")
+
+
+def _own_words(sentence: str, uav: int) -> str:
+    return _clip(sentence.removeprefix(f"uav-{uav}: "))
+
+
+def _clip(text: str) -> str:
+    return text if len(text) <= MAX_WORDS else text[: MAX_WORDS - 1] + "…"
+
+
+_TELLS: dict[type, Callable[[Known, Any], Told]] = {
+    Status: _status,
+    Alert: _alert,
+    Mission: _mission,
+    Sample: _sample,
+    Model: _model,
+}

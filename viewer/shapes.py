@@ -1,0 +1,38 @@
+"""The shapes of what is drawn as a mesh: vertices and triangles, of about one unit."""
+
+import numpy as np
+
+
+def aircraft() -> tuple[np.ndarray, np.ndarray]:
+    """Shape a small fixed-wing aircraft of one unit span that looks along +x: vertices (n, 3), triangles (m, 3)."""
+    boxes = [  # centre, half size, how far the tip is swept back
+        ((0.05, 0.0, 0.0), (0.38, 0.045, 0.05), 0.0),
+        ((0.08, 0.26, 0.02), (0.09, 0.24, 0.012), 0.07),
+        ((0.08, -0.26, 0.02), (0.09, -0.24, 0.012), 0.07),
+        ((-0.32, 0.09, 0.03), (0.05, 0.09, 0.01), 0.03),
+        ((-0.32, -0.09, 0.03), (0.05, -0.09, 0.01), 0.03),
+    ]
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    quads = np.array([(a, b, c, a, c, d) for a, b, c, d in sides]).reshape(-1, 3)
+    vertices, faces = [], []
+    for k, (centre, half, sweep) in enumerate(boxes):
+        box = np.array(centre) + corners * half
+        box[:, 0] -= np.where(corners[:, 1] > 0, sweep, 0.0)
+        vertices.append(box)
+        faces.append((quads if half[1] > 0 else quads[:, ::-1]) + 8 * k)
+    n = 8 * len(boxes)
+    vertices.append(
+        np.array([[-0.25, 0.01, 0.03], [-0.38, 0.01, 0.03], [-0.40, 0.0, 0.20], [-0.32, 0.0, 0.20], [0.58, 0, 0]])
+    )
+    faces.append(np.array([(0, 1, 2), (0, 2, 3), (2, 1, 0), (3, 2, 0)]) + n)
+    faces.append(np.array([(4, n + 4, 5), (6, n + 4, 4), (7, n + 4, 6), (5, n + 4, 7)]) * 1)
+    return 1.1 * np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
+
+
+def diamond() -> tuple[np.ndarray, np.ndarray]:
+    """Shape an octahedron of radius 1: vertices (6, 3), triangles (8, 3)."""
+    vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1.3], [0, 0, -1.3]], np.float32)
+    ring = [0, 2, 1, 3]
+    faces = [(ring[k], ring[(k + 1) % 4], 4) for k in range(4)] + [(ring[(k + 1) % 4], ring[k], 5) for k in range(4)]
+    return vertices, np.array(faces, np.uint32)
