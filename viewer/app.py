@@ -24,6 +24,7 @@ from viewer.vehicle import Vehicle
 
 TICK_S = 0.1
 NEAR_M = 800.0  # items of the route within this are shown with an aircraft one turns to [m]
+ROOM = 1.35  # how much more than what was flown is framed, while it grows [-]
 IN_VIEW_M = 20_000.0  # what is farther from the middle of the fleet is not framed [m]
 SLOW_S = 10.0  # how often what is missing is asked for again [s]
 
@@ -63,6 +64,7 @@ class App:
         self.selected: int | None = None
         self._dirty = threading.Event()
         self._seen: tuple = ()
+        self._framed = np.zeros((2, 3))  # corners of what the cameras were last framed on [10 m]
         self._followed: tuple[int, np.ndarray] | None = None
         self._life = 1.2  # how much larger than life an aircraft of size 1 is drawn
 
@@ -113,8 +115,8 @@ class App:
         now, fleet, place = time.monotonic(), self.feed.all(), self.feed.place
         if changed := self._dirty.is_set():
             self._dirty.clear()
-        if self.selected is None and (known := [v for v in fleet if v.forecast is not None]):
-            self.selected, changed = known[0].uav, True
+        if self.selected is None and (known := [v for v in fleet if v.where(now) is not None]):
+            self.selected, changed = max(known, key=lambda v: (v.forecast is not None, -v.uav)).uav, True
         if tick % 10 == 0 or changed:
             self.panels.draw(fleet, self.feed, now, self.selected)
         if not fleet or place is None:
@@ -140,9 +142,13 @@ class App:
     def _slowly(self, fleet: list[Vehicle], now: float, place: Place, tick: int) -> None:
         """Draw trails, predicted paths, routes, ground and camera: once a second, and when the selection changes."""
         options, scene, chosen = self.panels, self.scene, self._chosen(fleet)
+        paths = {v.uav: self.feed.track(v) for v in fleet if v.recorded or v is chosen}
         scene.set_ground(_ground(fleet, place, scene.ground))
         if tick % 10 == 0:
-            scene.beat(fleet, self._played(fleet))
+            scene.beat(
+                fleet,
+                {v.uav: placed(paths[v.uav], v.t - MINUTE, np.inf) for v in fleet if v.recorded and len(paths[v.uav])},
+            )
         scene.draw_predicted(fleet, now, self.selected if options.tube.value else None)
         scene.predicted.show(options.predicted.value)
         scene.stems.show(options.stems.value)
@@ -152,28 +158,34 @@ class App:
         scene.draw_routes([route(v.mission, place, scene.ground) for v in others])
         self.selection.tube = options.tube.value
         if chosen is not None:
-            self.selection.draw_flight(chosen, self.feed, now, scene.glyph)
+            self.selection.draw_flight(chosen, paths[chosen.uav], now, scene.glyph)
         own = route(chosen.mission if chosen else None, place, scene.ground)
         self.selection.draw_route(own)
-        self._frame(fleet, now, place, own.points)
+        flown = [rows[:: max(len(rows) // 40, 1), 1:] for rows in paths.values()]
+        self._frame(fleet, now, place, [own.points, *flown])
         scene.glyph = options.glyph.value * self._life
 
-    def _played(self, fleet: list[Vehicle]) -> dict[int, np.ndarray]:
-        """Give where the UAVs of recordings were in the last minute of data time, one place a second: (n, 3) [10 m]."""
-        tracks = {v.uav: (self.feed.track(v), v.t) for v in fleet if v.recorded}
-        return {uav: placed(rows, t - MINUTE, np.inf) for uav, (rows, t) in tracks.items() if len(rows)}
+    def _frame(self, fleet: list[Vehicle], now: float, place: Place, paths: list[np.ndarray]) -> None:
+        """Frame fleet, routes, flown and predicted paths when one of them is new or outgrows the frame, or who looks.
 
-    def _frame(self, fleet: list[Vehicle], now: float, place: Place, points: np.ndarray) -> None:
-        """Frame fleet, route and prediction when something new of these appears or someone new looks."""
+        Args:
+            fleet: all UAVs
+            now: monotonic time [s]
+            place: the scene's frame
+            paths: the route first, then what was flown, each (n, 3) [10 m]
+        """
         at = [spot for v in fleet if (spot := v.where(now)) is not None]
         if not at:
             return
         told = [v.forecast.path[:: max(len(v.forecast.path) // 8, 1)] for v in fleet if v.forecast is not None]
-        seen = (place.origin, len(at), len(told), bool(len(points)), self.cameras.watchers())
-        if seen == self._seen:
+        cloud = near(np.vstack([np.array(at), *told, *paths]), IN_VIEW_M / UNIT_M)
+        seen = (place.origin, len(at), len(told), bool(len(paths[0])), self.cameras.watchers())
+        if seen == self._seen and not outgrown(cloud, self._framed):
             return
-        self._seen = seen
-        cloud = near(np.vstack([np.array(at), *told, points]), IN_VIEW_M / UNIT_M)
+        grown, self._seen = seen == self._seen, seen
+        self._framed = np.stack([cloud.min(axis=0), cloud.max(axis=0)])
+        if grown:  # it will go on growing: make room, rather than move the picture every second
+            cloud = cloud.mean(axis=0) + (cloud - cloud.mean(axis=0)) * [ROOM, ROOM, 1.0]
         span = float(np.linalg.norm(np.ptp(cloud, axis=0)))
         self._life = float(np.clip(span / 42, 1.2, 12.0))
         self.cameras.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, self.scene.ground]]))
@@ -192,6 +204,12 @@ def near(points: np.ndarray, reach: float) -> np.ndarray:
     """Keep the points (n, 3) within `reach` of the most central one: never none [10 m]."""
     centre = points[np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1))]
     return points[np.linalg.norm(points - centre, axis=1) < reach]
+
+
+def outgrown(cloud: np.ndarray, framed: np.ndarray) -> bool:
+    """Tell whether points (n, 3) have left a framed box (2, 3), its corners, by more than what was left free."""
+    spare = 0.4 * (ROOM - 1) * max(float(np.linalg.norm(framed[1] - framed[0])), 10.0)
+    return bool(((framed[0] - cloud.min(axis=0)) > spare).any() or ((cloud.max(axis=0) - framed[1]) > spare).any())
 
 
 def _ground(fleet: list[Vehicle], place: Place, before: float) -> float:

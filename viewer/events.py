@@ -53,7 +53,7 @@ class Known(NamedTuple):
 
     mode: str = ""
     armed: bool = False
-    lost: bool = False
+    lost: bool | None = None  # None: not heard of alive yet, so it cannot be lost
     back_t: float = -np.inf  # when the link last came back [s since 1970]
     sentence: str = ""
     items: tuple[Item, ...] = ()
@@ -90,30 +90,33 @@ def closed(events: tuple[Event, ...], t: float) -> tuple[Event, ...]:
 
 
 def _status(known: Known, status: Status) -> Told:
-    known, events = _link(known, status.t, status.link is Link.LOST, "link lost")
+    lost = status.link is Link.LOST
+    if known.lost is None:
+        known = known._replace(lost=None if lost else False)
+    known, events = _link(known, status.t, lost) if known.lost is not None else (known, [])
     if status.mode and status.mode != known.mode:
         events.append(Event(status.t, Kind.MODE, _clip(status.mode)))
     if status.armed != known.armed:
         kind = Kind.ARMED if status.armed else Kind.DISARMED
         events.append(Event(status.t, kind, kind.value))
-    sentence = "" if status.link is Link.LOST else status.sentence  # lost: it only counts the seconds
+    sentence = "" if lost else status.sentence  # lost: it only counts the seconds
     if sentence and sentence != known.sentence:
         events.append(Event(status.t, Kind.WARNING, _own_words(sentence, status.uav)))
     return known._replace(mode=status.mode or known.mode, armed=status.armed, sentence=sentence), events
 
 
-def _link(known: Known, t: float, lost: bool, words: str) -> Told:
+def _link(known: Known, t: float, lost: bool) -> Told:
     """Follow the link, of which gateway and worker both speak, one perhaps long after the other."""
-    if lost == known.lost or (lost and t <= known.back_t):
+    if lost == bool(known.lost) or (lost and t <= known.back_t):
         return known, []
     if lost:
-        return known._replace(lost=True), [Event(t, Kind.LOST, words)]
+        return known._replace(lost=True), [Event(t, Kind.LOST, "link lost")]
     return known._replace(lost=False, back_t=t), [Event(t, Kind.BACK, "link back")]
 
 
 def _alert(known: Known, alert: Alert) -> Told:
     if alert.kind is AlertKind.LINK_LOST:
-        return _link(known, alert.t, alert.active, "link lost")
+        return _link(known, alert.t, alert.active)
     if alert.active == (alert.kind in known.raised):
         return known, []
     name = alert.kind.value.replace("_", " ")

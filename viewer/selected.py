@@ -167,9 +167,8 @@ class Selection:
         clear = np.linalg.norm(middle - trail[-1, 1:4]) > self._clear_of
         self.say("then", f"predicted {clock - told.t:.0f} s ago", middle if clear else None)
 
-    def draw_flight(self, vehicle: Vehicle, feed: Feed, now: float, size: float) -> None:
-        """Draw the whole flown path, faintly, with what happened on it; `size` as for `draw`."""
-        rows = feed.track(vehicle)
+    def draw_flight(self, vehicle: Vehicle, rows: np.ndarray, now: float, size: float) -> None:
+        """Draw the whole flown path (n, 4), faintly, with what happened on it; `size` as for `draw`."""
         self._flown.draw(chain(rows[:, 1:]) if len(rows) > 1 else NOTHING.legs, self._flown_colour)
         self._pins.draw(vehicle.events, rows, vehicle.where(now), size)
 

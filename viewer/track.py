@@ -2,8 +2,12 @@
 
 import numpy as np
 
+from viewer.place import UNIT_M
+
 POINTS = 800
 STEP_S = 0.5  # between two points, until they are full for the first time [s]
+SETTLE_S = 30.0  # so long first positions may be wrong: a leap among them begins the path anew [s]
+LEAP_M, LEAP_M_S = 50.0, 60.0  # farther than this, and this for every second between, is a leap [m], [m/s]
 
 
 class Track:
@@ -13,8 +17,10 @@ class Track:
         self._rows = np.empty((POINTS, 4))  # t [s], scene ENU [10 m]
         self._n, self._step = 0, STEP_S
 
-    def add(self, t: np.ndarray, enu: np.ndarray) -> None:
-        """Add places, t (n,) rising [s], enu (n, 3) [10 m]; what does not rise is left out."""
+    def add(self, t: np.ndarray, enu: np.ndarray) -> bool:
+        """Add places, t (n,) rising [s], enu (n, 3) [10 m]; what does not rise is left out. Tell of a leap."""
+        if leapt := self._leaps(float(t[0]), enu[0]):
+            self.clear()
         last = self._rows[self._n - 1, 0] if self._n else -np.inf
         for at, place in zip(t, enu, strict=True):
             if at < last + self._step:
@@ -24,6 +30,13 @@ class Track:
                 self._rows[: self._n] = self._rows[::2].copy()
             self._rows[self._n] = at, *place
             self._n, last = self._n + 1, at
+        return leapt
+
+    def _leaps(self, t: float, place: np.ndarray) -> bool:
+        if not self._n or t - self._rows[0, 0] > SETTLE_S:
+            return False
+        last = self._rows[self._n - 1]
+        return bool(np.linalg.norm(place - last[1:]) * UNIT_M > LEAP_M + LEAP_M_S * max(t - last[0], 0.0))
 
     def clear(self) -> None:
         """Forget the flight."""

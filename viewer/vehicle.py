@@ -194,7 +194,8 @@ class Vehicle:
         if not fix.any():
             return
         enu = place.geodetic(*x[fix, :3].T)
-        self.track.add(t[fix], enu)
+        if self.track.add(t[fix], enu):
+            self.trail.clear()
         self.trail.extend((float(k), *p, self.Va) for k, p in zip(t[fix], enu.tolist(), strict=True))
         self.at, self.alt_m = enu[-1], float(x[fix][-1, 2]) * 1e-3
 
