@@ -18,7 +18,7 @@ from viewer.panels import Panels
 from viewer.place import UNIT_M, Place
 from viewer.routes import home_alt_m, route
 from viewer.scene import MINUTE, Scene
-from viewer.selected import Selection
+from viewer.selected import BEYOND_S, Selection
 from viewer.track import placed
 from viewer.vehicle import Vehicle
 
@@ -160,9 +160,9 @@ class App:
         if chosen is not None:
             self.selection.draw_flight(chosen, paths[chosen.uav], now, scene.glyph)
         own = route(chosen.mission if chosen else None, place, scene.ground)
-        self.selection.draw_route(own)
-        flown = [rows[:: max(len(rows) // 40, 1), 1:] for rows in paths.values()]
-        self._frame(fleet, now, place, [own.points, *flown])
+        self.selection.draw_route(own, scene.glyph)
+        round_route = own.circles.reshape(-1, 3)
+        self._frame(fleet, now, place, [own.points, round_route, *(rows[:, 1:] for rows in paths.values())])
         scene.glyph = options.glyph.value * self._life
 
     def _frame(self, fleet: list[Vehicle], now: float, place: Place, paths: list[np.ndarray]) -> None:
@@ -177,9 +177,18 @@ class App:
         at = [spot for v in fleet if (spot := v.where(now)) is not None]
         if not at:
             return
-        told = [v.forecast.path[:: max(len(v.forecast.path) // 8, 1)] for v in fleet if v.forecast is not None]
+        told = [
+            v.forecast.at(np.linspace(0, max(v.forecast.until, BEYOND_S), 8)) for v in fleet if v.forecast is not None
+        ]
         cloud = near(np.vstack([np.array(at), *told, *paths]), IN_VIEW_M / UNIT_M)
-        seen = (place.origin, len(at), len(told), bool(len(paths[0])), self.cameras.watchers())
+        seen = (
+            place.origin,
+            len(at),
+            len(told),
+            bool(len(paths[0])),
+            sum(v.ended for v in fleet),
+            self.cameras.watchers(),
+        )
         if seen == self._seen and not outgrown(cloud, self._framed):
             return
         grown, self._seen = seen == self._seen, seen
@@ -187,7 +196,7 @@ class App:
         if grown:  # it will go on growing: make room, rather than move the picture every second
             cloud = cloud.mean(axis=0) + (cloud - cloud.mean(axis=0)) * [ROOM, ROOM, 1.0]
         span = float(np.linalg.norm(np.ptp(cloud, axis=0)))
-        self._life = float(np.clip(span / 42, 1.2, 12.0))
+        self._life = float(np.clip(span / 42, 0.25, 12.0))
         self.cameras.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, self.scene.ground]]))
 
     def _follow(self, chosen: Vehicle | None, now: float) -> None:
@@ -213,8 +222,10 @@ def outgrown(cloud: np.ndarray, framed: np.ndarray) -> bool:
 
 
 def _ground(fleet: list[Vehicle], place: Place, before: float) -> float:
-    """Guess the ground: the lowest home of a mission, else 60 m below the lowest ever seen, scene [10 m]."""
+    """Guess the ground: the lowest home, else where the lowest stood, else 60 m below all, scene [10 m]."""
     homes = [alt for vehicle in fleet if (alt := home_alt_m(vehicle.mission)) is not None]
     if homes:
         return (min(homes) - place.origin.alt_mm * 1e-3) / UNIT_M
+    if floors := [vehicle.floor for vehicle in fleet if np.isfinite(vehicle.floor)]:
+        return min(floors) - 0.05
     return min([before, *(float(v.at[2]) - 6.0 for v in fleet if v.at is not None)])

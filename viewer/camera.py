@@ -5,10 +5,11 @@ from typing import Any
 import numpy as np
 
 FOV = np.radians(50.0)  # vertical field of view [rad]
+CLOSEST = 5.0  # no nearer, however little there is to see [10 m]
 VIEW = (np.radians(-125.0), np.radians(38.0))  # where the camera stands: azimuth from east, elevation [rad]
 
 
-def frame(points: np.ndarray, aspect: float, margin: float = 1.05) -> tuple[np.ndarray, np.ndarray]:
+def frame(points: np.ndarray, aspect: float, margin: float = 1.1) -> tuple[np.ndarray, np.ndarray]:
     """Place the camera so that every point is in view.
 
     Args:
@@ -29,9 +30,9 @@ def frame(points: np.ndarray, aspect: float, margin: float = 1.05) -> tuple[np.n
         distance = float(np.max(np.maximum(np.abs(x) / (tall * aspect), np.abs(y) / tall) * margin + z))
         depth = distance - z
         look_at = look_at + right * _middle(x / depth) * distance + up * _middle(y / depth) * distance
-    eye = look_at + to_eye * max(distance, 12.0)
+    eye = look_at + to_eye * max(distance, CLOSEST)
     sink = (eye[2] - float(points[:, 2].mean())) / to_eye[2]  # orbit about the fleet, not about a point underground
-    return eye, eye - to_eye * max(sink, 6.0)
+    return eye, eye - to_eye * max(sink, CLOSEST / 2)
 
 
 def _middle(x: np.ndarray) -> float:

@@ -38,7 +38,7 @@ class Charts:
             data,
             (uplot.Series(label="s"), *series),
             scales={"x": {"time": False}},
-            axes=({}, {"size": 44}),
+            axes=({}, {"size": 54}),
             legend={"show": False},
             padding=(10, 16, 0, 0),
             height=126,

@@ -7,7 +7,7 @@ from fleet.contract import Outcome, State
 from viewer.datatime import stamp, times
 from viewer.palette import Palette
 from viewer.vehicle import Vehicle
-from viewer.words import ago, fit, horizon_s, standing
+from viewer.words import CLAIMS_S, ago, fit, horizon_s, standing
 
 REFUSED_S = 10.0  # how long a refused message is spoken of [s]
 
@@ -29,7 +29,7 @@ def facts(vehicle: Vehicle, now: float) -> str:
 def _cards(vehicle: Vehicle) -> str:
     told, mean = vehicle.forecast, fit(vehicle)
     horizon = "–"
-    if told is not None and told.until > 0:
+    if told is not None and told.until >= CLAIMS_S:
         horizon = f"{'≥ ' if told.message.horizon_open else ''}{horizon_s(vehicle):.0f} s"
     cards = {
         "fit": "–" if mean is None else f"{mean:.0f} %",
@@ -78,7 +78,8 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
         f'<div class="say" style="border-color:{palette.mismatch}">▲ {escape(a.sentence)}</div>'
         for a in vehicle.alerts.values()
     ]
-    cards += [f'<div class="say">{escape(text)}</div>' for text in why(vehicle, now)]
+    said = why(vehicle, now)
+    cards += [f'<div class="say">{escape(text)}</div>' for text in said]
     verdict = vehicle.model.verdict if vehicle.model is not None else None
     if verdict is not None:
         colour = palette.verified if verdict.outcome is Outcome.VERIFIED else palette.identifying
@@ -87,7 +88,7 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
             f'<span class="soft">newest try, number {verdict.tries}, threshold {verdict.threshold:.0f} %</span><br>'
             f"{escape(verdict.sentence)}</div>"
         )
-    elif vehicle.row is not None and vehicle.row.verdict:
+    elif vehicle.row is not None and not any(vehicle.row.verdict in text for text in ("", *said)):
         cards.append(f'<div class="say">{escape(vehicle.row.verdict)}</div>')
     return "".join(cards)
 
@@ -142,6 +143,8 @@ def _facts(vehicle: Vehicle, now: float) -> str:
     }
     return (
         "<table>"
-        + "".join(f'<tr><td class="soft">{k}</td><td class="num">{escape(v)}</td></tr>' for k, v in figures.items())
+        + "".join(
+            f'<tr><td class="soft key">{k}</td><td class="value">{escape(v)}</td></tr>' for k, v in figures.items()
+        )
         + "</table>"
     )

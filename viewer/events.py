@@ -127,10 +127,17 @@ def _alert(known: Known, alert: Alert) -> Told:
 
 
 def _mission(known: Known, mission: Mission) -> Told:
-    if not mission.items or not mission.complete or mission.items[1:] == known.items[1:]:  # the first is but home
+    if not mission.items or not mission.complete:
         return known, []
+    if known.items and _plan(mission.items) == _plan(known.items):
+        return known._replace(items=mission.items), []
     said = f"{'another' if known.items else 'a'} mission on board, {len(mission.items)} items"
     return known._replace(items=mission.items), [Event(mission.t, Kind.MISSION, said)]
+
+
+def _plan(items: tuple[Item, ...]) -> list[tuple[int, int, int, str]]:
+    """Reduce a mission to what makes it another: without home, and without what a link or a log writes differently."""
+    return [(item.command, item.lat_e7, item.lon_e7, f"{item.alt_m:.1f}") for item in items[1:]]
 
 
 def _sample(known: Known, sample: Sample) -> Told:

@@ -9,7 +9,7 @@ from fleet.contract import State
 from viewer.palette import Palette, mesh_colour, mix, rgb, triple
 from viewer.place import UNIT_M, scene_quat
 from viewer.routes import NOTHING, Route, circle
-from viewer.shapes import aircraft
+from viewer.shapes import aircraft, rotorcraft
 from viewer.strokes import Strokes, chain, dash_lines, faded
 from viewer.vehicle import Vehicle
 
@@ -18,6 +18,7 @@ MINUTE = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # how long ago each p
 DASHES = 14  # dashes of one predicted path
 CROWD = 300  # above this many, stems go and only exceptions keep their predicted path
 LEAP_M = 1_000.0  # farther within a second is no flight but another one (a recording begun anew): a new trail [m]
+HOVER = ("multirotor", "helicopter")  # kinds of vehicle drawn with rotors
 RINGS_M = (500, 1000, 2000)
 
 
@@ -28,11 +29,12 @@ class Scene:
         self._server, self._scene, self._palette = server, server.scene, palette
         self.ground = 0.0  # height of the ground, scene [10 m]
         self.glyph = 1.0  # how much larger than life aircraft are drawn
-        self._vehicles: Any = None
+        self._vehicles: list[Any] = []  # a batch for each shape; those of another shape have no size in it
         self._on_click: Callable[[int], None] = lambda _: None
         self.uavs: tuple[int, ...] = ()  # instance index -> UAV
         self._selected: int | None = None  # has its own, finer path
         self._colours = np.zeros((0, 3))
+        self._hover = np.zeros(0, bool)  # who has rotors instead of wings
         self._ring = np.zeros((0, 0, 3))
         self._beat = 0
         self._ground_node = self._environment()
@@ -94,42 +96,51 @@ class Scene:
         colours = np.array([rgb(self._palette.state(vehicle.state(now))) for vehicle, _ in shown])
         size = np.array([self.glyph * (1.25 if vehicle.uav == selected else 1.0) for vehicle, _ in shown])
         uavs, before, self._selected = tuple(vehicle.uav for vehicle, _ in shown), self._selected, selected
-        if uavs != self.uavs:
-            self._enlist(uavs, at, quat, size, colours)
+        hover = np.array([v.status is not None and v.status.vehicle in HOVER for v, _ in shown])
+        if uavs != self.uavs or not np.array_equal(hover, self._hover):
+            self._enlist(uavs, at, colours, hover)
         elif before != selected:
             self._redraw()
-        self._vehicles.batched_positions, self._vehicles.batched_wxyzs = at, quat
-        self._vehicles.batched_scales = size.astype(np.float32)
-        if not np.array_equal(colours, self._colours):
-            self._colours = colours
-            self._vehicles.batched_colors = mesh_colour(colours * 0.85)
+        for batch, own in zip(self._vehicles, (~hover, hover), strict=False):
+            batch.batched_positions, batch.batched_wxyzs = at, quat
+            batch.batched_scales = np.where(own, size, 0.0).astype(np.float32)
+            if not np.array_equal(colours, self._colours):
+                batch.batched_colors = mesh_colour(colours * 0.85)
+        self._colours = colours
 
-    def _enlist(
-        self, uavs: tuple[int, ...], at: np.ndarray, quat: np.ndarray, size: np.ndarray, colours: np.ndarray
-    ) -> None:
-        """Start the batch anew for another set of UAVs; those who stay keep their trails."""
+    def _enlist(self, uavs: tuple[int, ...], at: np.ndarray, colours: np.ndarray, hover: np.ndarray) -> None:
+        """Start the batches anew for another set of UAVs; those who stay keep their trails."""
         old = {uav: i for i, uav in enumerate(self.uavs)}
         ring = np.repeat(at[:, None], (CHUNKS + 1) * STEPS + 1, axis=1)
         for i, uav in enumerate(uavs):
             if uav in old:
                 ring[i] = self._ring[old[uav]]
-        self._ring, self.uavs, self._colours = ring, uavs, colours
-        vertices, faces = aircraft()
-        self._vehicles = self._scene.add_batched_meshes_simple(
-            "/fleet/vehicles",
+        self._ring, self.uavs, self._colours, self._hover = ring, uavs, colours, hover
+        for batch in self._vehicles[1:]:
+            batch.remove()
+        self._vehicles = [self._batch("/fleet/vehicles", *aircraft())]
+        if hover.any():
+            self._vehicles.append(self._batch("/fleet/rotors", *rotorcraft()))
+        self._redraw()
+
+    def _batch(self, name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+        """Make a batch of one shape with room for every UAV, so that an index in it names one."""
+        n = len(self.uavs)
+        batch = self._scene.add_batched_meshes_simple(
+            name,
             vertices,
             faces,
-            quat,
-            at,
-            batched_scales=size.astype(np.float32),
-            batched_colors=mesh_colour(colours * 0.85),
+            np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+            np.zeros((n, 3)),
+            batched_scales=np.zeros(n, np.float32),
+            batched_colors=mesh_colour(self._colours * 0.85),
             lod="off",
             cast_shadow=False,
             receive_shadow=False,
             flat_shading=True,
         )
-        self._vehicles.on_click(lambda event: self._clicked(event.instance_index))
-        self._redraw()
+        batch.on_click(lambda event: self._clicked(event.instance_index))
+        return batch
 
     def _clicked(self, index: int | None) -> None:
         if index is not None and 0 <= index < len(self.uavs):

@@ -12,6 +12,7 @@ from viewer.routes import NOTHING, Route
 from viewer.strokes import Strokes, chain, dash_lines, dashed
 from viewer.tube import closed, curtain, marks, rings, skin
 from viewer.vehicle import Forecast, Vehicle
+from viewer.words import CLAIMS_S
 
 BANDS, BAND_STEPS = 4, 10  # the tube fades in bands, each of so many slices
 HINDCAST_S = 25.0  # how old the prediction is that is laid beside what happened
@@ -120,7 +121,9 @@ class Selection:
         self._horizon.draw(closed(hoop[-1]), rgb(p.horizon))
         self._say_marks(steps, hoop)
         said = "below 10 % to the end" if told.message.horizon_open else "error reaches 10 %"
-        self.say("horizon", f"{until:.0f} s: {said}", hoop[-1][np.argmax(hoop[-1][:, 2])] + [0, 0, 0.3])
+        top = hoop[-1][np.argmax(hoop[-1][:, 2])]
+        clear = np.linalg.norm(top - path[0]) > self._clear_of  # the aircraft's own label says the horizon too
+        self.say("horizon", f"{until:.0f} s: {said}", _above(top, 0.3) if clear else None)
         thin.add(self._beyond(told, until), rgb(p.muted))
 
     def _say_marks(self, steps: list[float], hoop: np.ndarray) -> None:
@@ -155,7 +158,7 @@ class Selection:
         if not old or len(trail) < 2:
             return self.say("then", "", None)
         told = min(old, key=lambda one: abs(clock - one.t - HINDCAST_S))
-        reach = min(clock - told.t, float(told.ahead[-1]), float(trail[-1, 0] - told.t))
+        reach = min(clock - told.t, told.until, float(trail[-1, 0] - told.t))  # past its horizon it claimed nothing
         if reach < 5:
             return self.say("then", "", None)
         colour = mix(self._palette.horizon, self._palette.ground, 0.85)
@@ -172,14 +175,14 @@ class Selection:
         self._flown.draw(chain(rows[:, 1:]) if len(rows) > 1 else NOTHING.legs, self._flown_colour)
         self._pins.draw(vehicle.events, rows, vehicle.where(now), size)
 
-    def draw_route(self, route: Route) -> None:
+    def draw_route(self, route: Route, size: float) -> None:
         """Draw the mission: legs and loiters solid, jumps and returns dashed, a small ring at each item."""
-        p, lines = self._palette, _Sheaf()
+        p, lines, radius = self._palette, _Sheaf(), min(1.2, 0.9 * size)
         lines.add(np.concatenate([route.legs, route.circles]), mix(p.route, p.ground, 0.8))
         lines.add(dash_lines(route.back, 3.0), mix(p.route, p.ground, 0.6))
         if len(route.points):
             lines.add(
-                closed(np.stack([_disc(point, 1.2, 12) for point in route.points])).reshape(-1, 2, 3), rgb(p.route)
+                closed(np.stack([_disc(point, radius, 12) for point in route.points])).reshape(-1, 2, 3), rgb(p.route)
             )
         self._route.draw(*lines.all())
 
@@ -211,7 +214,10 @@ def _above(at: np.ndarray, height: float) -> np.ndarray:
 def caption(vehicle: Vehicle, now: float) -> str:
     """Say in one line who is selected and how it stands."""
     told = vehicle.forecast
-    horizon = f"  horizon {told.until:.0f} s" if told is not None else "  no prediction yet"
+    if told is None:
+        horizon = "  no prediction yet"
+    else:
+        horizon = f"  horizon {told.until:.0f} s" if told.until >= CLAIMS_S else "  no horizon"
     if vehicle.ended:
         return f"{vehicle.name}  end of the recording"
     lost = f"  link lost {vehicle.age(now):.0f} s" if vehicle.state(now) is State.LINK_LOST else ""

@@ -36,3 +36,21 @@ def diamond() -> tuple[np.ndarray, np.ndarray]:
     ring = [0, 2, 1, 3]
     faces = [(ring[k], ring[(k + 1) % 4], 4) for k in range(4)] + [(ring[(k + 1) % 4], ring[k], 5) for k in range(4)]
     return vertices, np.array(faces, np.uint32)
+
+
+def rotorcraft() -> tuple[np.ndarray, np.ndarray]:
+    """Shape a small multirotor of one unit span that looks along +x: vertices (n, 3), triangles (m, 3)."""
+    turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    disc = 0.24 * np.stack([np.cos(turn), np.sin(turn), np.zeros(12)], axis=-1)
+    fan = np.array([(0, k, k + 1) for k in range(1, 11)])
+    body, sides = diamond()
+    vertices, faces = [body * [0.2, 0.13, 0.07]], [sides]
+    arm = np.array([[0, 0.025, 0], [0, -0.025, 0], [1, -0.025, 0], [1, 0.025, 0]])
+    for k, azimuth in enumerate(np.radians([45, 135, 225, 315])):
+        c, s = np.cos(azimuth), np.sin(azimuth)
+        beam = arm * [0.38, 1, 1] @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        rotor = disc + np.array([0.38 * c, 0.38 * s, 0.04])
+        n = 6 + 16 * k
+        vertices += [beam, rotor]
+        faces += [np.array([(0, 1, 2), (0, 2, 3), (2, 1, 0), (3, 2, 0)]) + n, fan + n + 4, fan[:, ::-1] + n + 4]
+    return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)

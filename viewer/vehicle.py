@@ -81,6 +81,7 @@ class Vehicle:
     heard: float = -np.inf  # when a sample last arrived, monotonic [s]
     t: float = -np.inf  # fleet time of the newest sample [s]
     at: np.ndarray | None = None  # newest position, scene ENU, (3,) [10 m]
+    floor: float = np.nan  # the lowest it was while disarmed, scene [10 m]
     alt_m: float = np.nan  # above mean sea level [m]
     attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)  # phi theta psi [rad]
     Va: float = np.nan  # [m/s]
@@ -196,12 +197,15 @@ class Vehicle:
         enu = place.geodetic(*x[fix, :3].T)
         if self.track.add(t[fix], enu):
             self.trail.clear()
+            self.floor = np.nan
         self.trail.extend((float(k), *p, self.Va) for k, p in zip(t[fix], enu.tolist(), strict=True))
+        if self.status is not None and not self.status.armed:
+            self.floor = float(np.fmin(self.floor, enu[-1, 2]))
         self.at, self.alt_m = enu[-1], float(x[fix][-1, 2]) * 1e-3
 
     def forget(self) -> None:
         """Drop everything that belongs to a flight: the clock went back, or the scene begins anew elsewhere."""
-        self.at, self.alerts = None, {}
+        self.at, self.alerts, self.floor = None, {}, np.nan
         self.time, self.known, self.events = DataTime(), Known(), ()
         self.t, self.forecast, self.prediction, self.model, self.row = -np.inf, None, None, None, None
         for history in (self.trail, self.past, self.fits, self.track):

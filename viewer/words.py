@@ -14,6 +14,8 @@ from viewer.vehicle import Vehicle
 
 SEVERITY = (State.LINK_LOST, State.UNCLAIMED, State.WAITING, State.IDENTIFYING, State.PREDICTING, State.VERIFIED)
 MAX_ROWS = 50
+CLAIMS_S = 0.5  # a shorter horizon claims nothing [s]
+BAR_S = 10.0  # a bar of the table that is full stands for at least this horizon [s]
 
 
 class Standing(NamedTuple):
@@ -77,7 +79,7 @@ def summary(fleet: list[Vehicle], feed: Feed, palette: Palette, now: float) -> s
         f'<span class="soft">{one.word}</span></span>'
         for one, n in Counter(standing(vehicle, palette, now) for vehicle in worst).items()
     )
-    horizons = sorted(h for vehicle in fleet if (h := horizon_s(vehicle)) > 0)
+    horizons = sorted(h for vehicle in fleet if (h := horizon_s(vehicle)) >= CLAIMS_S)
     median = f" · median horizon {horizons[len(horizons) // 2]:.0f} s" if horizons else ""
     said = "".join(f'<div class="soft">{escape(text)}</div>' for text in feed.said())
     plural = "UAV" if len(fleet) == 1 else "UAVs"
@@ -110,7 +112,8 @@ def _fleet_coverage(fleet: list[Vehicle]) -> str:
 def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pick: str, selected: int | None) -> str:
     """List the worst up to 50 of those that pass the filter; `pick` is the handler of a row, `{}` its UAV."""
     worst = sorted(fleet, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
-    longest = max((horizon_s(vehicle) for vehicle in worst), default=0.0) or 1.0
+    longest = max((horizon_s(vehicle) for vehicle in worst), default=0.0)
+    longest = max(longest, BAR_S)
     rows = "".join(_row(vehicle, palette, now, pick, on=vehicle.uav == selected, longest=longest) for vehicle in worst)
     return (
         '<div class="uav list"><table><tr><th></th><th>UAV</th><th>status</th><th class="num">fit %</th>'
@@ -125,7 +128,7 @@ def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, *, on: bool,
     glyph = "▲" if vehicle.alerts else one.glyph
     word = f"{one.word} {ago(vehicle.age(now))}" if one.word == WORD[State.LINK_LOST] else one.word
     bar = f'<i><i style="width:{min(horizon / longest, 1) * 100:.0f}%;background:{colour}"></i></i>'
-    percent, seconds = "–" if mean is None else f"{mean:.0f}", f"{horizon:.0f} s" if horizon else "–"
+    percent, seconds = "–" if mean is None else f"{mean:.0f}", f"{horizon:.0f} s" if horizon >= CLAIMS_S else "–"
     return (
         f'<tr class="pick{" on" if on else ""}" data-uav="{vehicle.uav}" onpointerdown="{pick.format(vehicle.uav)}">'
         f'<td style="color:{colour}">{glyph}</td><td>{vehicle.name}</td>'

@@ -1,0 +1,201 @@
+"""What happened, read off what is said: events from messages, and the list they make."""
+
+import numpy as np
+import pytest
+from pretend_feed import HOSTILE, T
+
+from fleet.contract import (
+    Alert,
+    AlertKind,
+    Array,
+    Item,
+    Link,
+    Mission,
+    Model,
+    Outcome,
+    Rows,
+    Sample,
+    Status,
+    Verdict,
+)
+from viewer.chronicle import ROWS, listing
+from viewer.events import MAX_EVENTS, MAX_STEPS, MAX_WORDS, Event, Kind, Known, closed, hear, merged
+from viewer.palette import DARK, LIGHT, MARK
+
+
+def told(*messages) -> list[tuple[float, Kind, str]]:
+    """Everything that happened, times counted from T."""
+    known, events = Known(), []
+    for message in messages:
+        known, fresh = hear(known, message)
+        events += [(event.t - T, event.kind, event.text) for event in fresh]
+    return events
+
+
+def status(t: float, mode: str = "AUTO", *, armed: bool = True, lost: bool = False, sentence: str = "") -> Status:
+    return Status(uav=7, t=T + t, mode=mode, armed=armed, link=Link.LOST if lost else Link.LIVE, sentence=sentence)
+
+
+def alert(t: float, kind: AlertKind = AlertKind.LINK_LOST, *, active: bool = True, sentence: str = "") -> Alert:
+    return Alert(uav=7, t=T + t, kind=kind, active=active, sentence=sentence)
+
+
+def model(t: float, outcome: Outcome, *, in_force: bool) -> Model:
+    newest = Verdict(outcome=outcome, sentence="uav-7: mean fit 88 %")
+    return Model(uav=7, t=T + t, method="paper", verdict=newest, in_force=newest if in_force else None)
+
+
+def legs(*seqs: float) -> Sample:
+    x = np.array(seqs, float)[:, None]
+    return Sample(uav=7, t=T + len(x), leg=Rows(t=Array.of(T + np.arange(len(x)), "<f8"), x=Array.of(x)))
+
+
+def mission(t: float, *, alt_m: float = 60.0, frame: int = 3, complete: bool = True, home: float = 0.0) -> Mission:
+    items = (
+        Item(seq=0, command=16, frame=0, alt_m=home),
+        Item(seq=1, command=22, frame=frame, alt_m=alt_m),
+        Item(seq=2, command=999, frame=frame, lat_e7=5, lon_e7=5, alt_m=alt_m),
+    )
+    return Mission(uav=7, t=T + t, items=items, complete=complete)
+
+
+NAN = float("nan")
+STORIES = {
+    "nothing new": (
+        [status(0), status(1), status(2)],
+        [(0, Kind.MODE, "AUTO"), (0, Kind.ARMED, "armed")],
+    ),
+    "a mode changes, an unknown one does not": (
+        [status(0, armed=False), status(1, "", armed=False), status(2, "RTL", armed=False)],
+        [(0, Kind.MODE, "AUTO"), (2, Kind.MODE, "RTL")],
+    ),
+    "armed and disarmed": (
+        [status(0, "", armed=False), status(1, ""), status(9, "", armed=False)],
+        [(1, Kind.ARMED, "armed"), (9, Kind.DISARMED, "disarmed")],
+    ),
+    "a sentence stands for half a minute": (
+        [
+            status(k, "", armed=False, sentence=said)
+            for k, said in enumerate(["uav-7: EKF", "uav-7: EKF", "", "x", "y"])
+        ],
+        [(0, Kind.WARNING, "EKF"), (3, Kind.WARNING, "x"), (4, Kind.WARNING, "y")],
+    ),
+    "what counts the seconds of a lost link is no warning": (
+        [status(0, "", armed=False)] + [status(k, "", armed=False, lost=True, sentence=f"{k} s") for k in (4, 5, 6)],
+        [(4, Kind.LOST, "link lost")],
+    ),
+    "who was never heard is not lost": ([status(0, "", armed=False, lost=True), status(1, "", armed=False)], []),
+    "two speak of one loss": (
+        [
+            status(0, "", armed=False),
+            alert(3),
+            status(4, "", armed=False, lost=True),
+            status(9, "", armed=False),
+            alert(9.1, active=False),
+        ],
+        [(3, Kind.LOST, "link lost"), (9, Kind.BACK, "link back")],
+    ),
+    "and one of them late": (
+        [
+            status(0, "", armed=False),
+            status(4, "", armed=False, lost=True),
+            status(9, "", armed=False),
+            alert(3),
+            alert(9, active=False),
+        ],
+        [(4, Kind.LOST, "link lost"), (9, Kind.BACK, "link back")],
+    ),
+    "an alert is raised once and withdrawn once": (
+        [alert(k, AlertKind.GROUND, active=k < 3, sentence="uav-7: ground in 8 s") for k in range(5)],
+        [(0, Kind.ALERT, "ground in 8 s"), (3, Kind.EASED, "ground is over")],
+    ),
+    "a model that was never verified is none": (
+        [model(0, Outcome.STARVED, in_force=False), model(4, Outcome.STARVED, in_force=False)],
+        [(0, Kind.NO_MODEL, "no model yet: starved")],
+    ),
+    "a model is verified, doubted, and sound again": (
+        [
+            model(0, Outcome.BELOW_THRESHOLD, in_force=False),
+            model(4, Outcome.VERIFIED, in_force=True),
+            model(8, Outcome.WORSE_THAN_LAST, in_force=True),
+            model(12, Outcome.DIVERGED, in_force=True),
+            model(16, Outcome.VERIFIED, in_force=True),
+        ],
+        [
+            (0, Kind.NO_MODEL, "no model yet: below threshold"),
+            (4, Kind.VERIFIED, "model verified: mean fit 88 %"),
+            (12, Kind.DOUBTED, "newest try diverged; an earlier model stays in force"),
+            (16, Kind.SOUND, "newest try sound again"),
+        ],
+    ),
+    "a late viewer meets a model in force whose newest try failed": (
+        [model(0, Outcome.STARVED, in_force=True)],
+        [(0, Kind.VERIFIED, "model verified: mean fit 88 %")],
+    ),
+    "items by name, number or nothing": (
+        [legs(0, 0, 3), mission(5), legs(1, 1, 2, 2)],
+        [
+            (2, Kind.ITEM, "item 3"),
+            (5, Kind.MISSION, "a mission on board, 3 items"),
+            (0, Kind.ITEM, "item 1: take-off"),
+            (2, Kind.ITEM, "item 2: command 999"),
+        ],
+    ),
+    "the same mission read twice, and another": (
+        [mission(0), mission(1, frame=6, home=584.0), mission(2, complete=False, alt_m=9.0), mission(3, alt_m=70.0)],
+        [(0, Kind.MISSION, "a mission on board, 3 items"), (3, Kind.MISSION, "another mission on board, 3 items")],
+    ),
+    "a mission with no number for a height is no other one every time": (
+        [mission(0, alt_m=NAN), mission(10, alt_m=NAN)],
+        [(0, Kind.MISSION, "a mission on board, 3 items")],
+    ),
+    "times that cannot be": ([status(NAN), status(1e300, "RTL"), status(-1e11, "LAND", armed=False)], []),
+}
+
+
+@pytest.mark.parametrize(("messages", "expected"), STORIES.values(), ids=STORIES)
+def test_what_is_said_becomes_what_happened(messages: list, expected: list) -> None:
+    assert told(*messages) == expected
+
+
+@pytest.mark.parametrize("x", [np.zeros(3), np.zeros((3, 2)), np.zeros((2, 1))], ids=["flat", "wide", "short"])
+def test_legs_of_no_sound_shape_are_refused(x: np.ndarray) -> None:
+    rows = Rows(t=Array.of([T, T, T], "<f8"), x=Array.of(x))
+    with pytest.raises(ValueError, match="leg rows have shape"):
+        hear(Known(), Sample(uav=7, t=T, leg=rows))
+
+
+def test_wild_messages_stay_within_bounds() -> None:
+    flood = np.random.default_rng(3).integers(1, 900, 5_000).astype(float)
+    flood[::7] = np.nan
+    known, events = hear(Known(), legs(*flood))
+    assert len(events) == MAX_STEPS and known.seq == int(flood[np.isfinite(flood)][-1])
+    _, (event, *_) = hear(Known(), status(0, "M" * 10_000))
+    assert len(event.text) == MAX_WORDS
+    many: tuple[Event, ...] = ()
+    for k in np.random.default_rng(4).permutation(1_000):
+        many = merged(many, [Event(T + float(k), Kind.MODE, "x")])
+    assert len(many) == MAX_EVENTS and [e.t for e in many] == sorted(e.t for e in many)
+
+
+def test_every_kind_has_its_mark_and_only_verified_looks_verified() -> None:
+    assert set(MARK) == set(Kind)
+    for palette in (DARK, LIGHT):
+        green = {kind for kind in Kind if palette.event(kind) == palette.verified}
+        assert green == {Kind.VERIFIED, Kind.SOUND}
+    assert MARK[Kind.NO_MODEL] != MARK[Kind.VERIFIED] != MARK[Kind.DOUBTED]
+
+
+def test_the_end_takes_away_only_losses_after_it() -> None:
+    events = (Event(T, Kind.LOST, "link lost"), Event(T + 5, Kind.BACK, "x"), Event(T + 13, Kind.LOST, "link lost"))
+    assert [e.kind for e in closed(events, T + 10)] == [Kind.LOST, Kind.BACK, Kind.END]
+
+
+# --- the list ---
+
+
+def test_the_list_is_newest_first_bounded_and_escaped() -> None:
+    events = tuple(Event(T + k, Kind.WARNING, f"{k} {HOSTILE}") for k in range(ROWS + 12))
+    page = listing(events, DARK)
+    assert page.count('class="event"') == ROWS and "and 12 earlier" in page and "<img" not in page
+    assert page.index(f"{ROWS + 11} &lt;img") < page.index(f"{ROWS + 10} &lt;img")

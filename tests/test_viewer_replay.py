@@ -1,0 +1,169 @@
+"""Recordings on the page: data time, the flown path with its marks, the end, and what real flights tell."""
+
+import numpy as np
+import pytest
+from pretend_feed import STAMP, Clock, PretendUav, T, feed_of
+
+from fleet.contract import Account, Alert, AlertKind, State, Status
+from fleet.telemetry.onboard_news import UNDATED_S
+from viewer import datatime
+from viewer.datatime import DataTime, day, is_dated, moment, stamp, times
+from viewer.detail import about, facts
+from viewer.events import Event, Kind
+from viewer.palette import DARK
+from viewer.pins import LABELS, MINOR, apart, caption
+from viewer.track import POINTS, Track, placed
+from viewer.vehicle import ENDED_S, SILENT_S
+from viewer.words import severity, standing, summary
+
+REPLAY = "replay:flight.tlog?speed=4"
+NAN = float("nan")
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.mark.parametrize(
+    ("t", "short", "whole", "date"),
+    [
+        (T, "22:13:20", "2023-11-14 22:13:20 UTC", "2023-11-14 UTC"),
+        (1_357_000_000.0, "00:26:40", "2013-01-01 00:26:40 UTC", "2013-01-01 UTC"),
+        (UNDATED_S + 125.7, "+2:05", "undated +2:05", "undated, since its start"),
+        (72.0, "+1:12", "undated +1:12", "undated, since its start"),
+        (NAN, "–", "undated –", "undated, since its start"),
+        (1e300, "–", "undated –", "undated, since its start"),
+    ],
+)
+def test_a_time_is_said_as_the_recording_has_it(t: float, short: str, whole: str, date: str) -> None:
+    assert (moment(t), stamp(t), day(t)) == (short, whole, date)
+
+
+def test_undated_means_what_the_reader_means() -> None:
+    assert datatime.UNDATED_S == UNDATED_S and not is_dated(UNDATED_S) and is_dated(T)
+
+
+# --- data time ---
+
+
+@pytest.mark.parametrize("pace", [0.25, 1.0, 4.0, 150.0])
+def test_data_time_runs_at_the_pace_of_the_recording(pace: float) -> None:
+    data = DataTime()
+    for k in range(101):
+        data = data.hear(T + 0.1 * k * pace, 50 + 0.1 * k)
+    assert data.pace == pytest.approx(pace) and float(times(data.pace)[:-1]) == pytest.approx(pace)
+    assert data.at(60.5) == pytest.approx(T + 10.5 * pace, abs=1e-4)
+    assert data.at(70.0) == pytest.approx(T + 11 * pace + 9, abs=1e-4)  # silent for long: as the wall clock
+
+
+def test_a_late_message_does_not_turn_data_time_back() -> None:
+    data = DataTime().hear(T, 50.0)
+    assert data.hear(T - 3, 51.0) == data and data.hear(NAN, 51.0) == data
+
+
+# --- on the path ---
+
+
+def test_the_track_keeps_the_whole_flight_in_a_fixed_number_of_points() -> None:
+    track, t = Track(), T + 0.1 * np.arange(60_000)
+    enu = np.stack([np.cos(t / 40), np.sin(t / 40), t * 0 + 3], axis=-1) * 20
+    for part in np.array_split(np.arange(len(t)), 500):
+        assert not track.add(t[part], enu[part])
+    rows = track.rows()
+    assert POINTS // 2 <= len(rows) <= POINTS
+    assert rows[0, 0] == t[0] and t[-1] - rows[-1, 0] < 30
+    assert np.linalg.norm(placed(rows, t[::100]) - enu[::100], axis=1)[:-10].max() < 2.0
+
+
+def test_a_leap_among_the_first_positions_begins_the_path_anew() -> None:
+    track = Track()
+    track.add(np.array([T]), np.array([[0, 0, -45.0]]))
+    assert track.add(np.array([T + 2.9]), np.zeros((1, 3))) and len(track.rows()) == 1
+    assert not track.add(np.array([T + 60.0]), np.array([[0, 0, 90.0]]))
+    assert not track.add(np.array([T + 61.0]), np.array([[0, 0, -90.0]]))  # later a leap is what was recorded
+    assert len(track.rows()) == 3
+
+
+def test_what_happened_off_the_flown_path_has_no_place() -> None:
+    rows = np.array([[T, 0, 0, 0], [T + 10, 10, 0, 0]])
+    spots = placed(rows, T + np.array([-60, -1, 4, 11, 300]))
+    assert np.isnan(spots[[0, 4]]).all() and np.allclose(spots[1:4, 0], [0, 4, 10])
+    assert np.isnan(placed(rows[:0], np.array([T]))).all()
+
+
+def test_labels_are_few_and_apart() -> None:
+    kinds = [Kind.MODE, Kind.ITEM, Kind.WARNING, Kind.DOUBTED, Kind.LOST, Kind.BACK, Kind.MODE, Kind.MODE]
+    found = [(Event(T + k, kind, "x"), np.array([10.0 * k, 0, 0])) for k, kind in enumerate(kinds)]
+    chosen = apart(found, np.array([70.0, 0, 0]), 8.0)
+    assert [event.t - T for event, _ in chosen] == [6, 5, 4] and len(chosen) == LABELS
+    assert [event.t - T for event, _ in apart(found, None, 15.0)] == [7, 5, 2]
+    assert not any(event.kind in MINOR for event, _ in chosen)
+    assert caption(Event(T, Kind.VERIFIED, "model verified: mean fit 88 %")) == "✓ model verified 22:13:20"
+    assert len(caption(Event(T, Kind.MODE, "M" * 500))) < 45
+
+
+# --- through the feed: a replayed recording ---
+
+
+def test_a_recording_is_told_in_its_own_time_and_ends(clock: Clock) -> None:
+    """Four times real time, with old dates; then the player falls silent, and the twin's coasting is not shown."""
+    feed, _, bus = feed_of(clock, 1)
+    one = PretendUav(0)
+    for k in range(1, 41):
+        clock.now += 0.25
+        bus.publish(one.sample(T + k - 1, T + k))
+        bus.publish(one.status(T + k))
+        bus.publish(one.prediction(T + k, 0.0), STAMP)
+        bus.publish(Account(t=T + k, links=(REPLAY,), uavs=(0,)))
+    vehicle = feed.one(0)
+    assert vehicle.recorded and not vehicle.ended and vehicle.time.pace == pytest.approx(4.0)
+    assert f"{stamp(T + 40)}" in facts(vehicle, clock.now) and "played 4×" in summary([vehicle], feed, DARK, clock.now)
+    assert vehicle.age(clock.now) == 0 and vehicle.age(clock.now + 0.5) == pytest.approx(2.0)
+    clock.now += ENDED_S + 0.5
+    bus.publish(Alert(uav=0, t=T + 43, kind=AlertKind.LINK_LOST))
+    bus.publish(one.prediction(T + 43, 3.0), STAMP)
+    over = feed.one(0)
+    assert over.ended and not over.alerts and feed.alerts() == []
+    assert over.events[-1] == Event(T + 40, Kind.END, "end of the recording")
+    assert all(event.kind is not Kind.LOST for event in over.events)
+    assert over.forecast.t == T + 40 and np.array_equal(over.where(clock.now), over.at)
+    assert standing(over, DARK, clock.now).word == "recording ended"
+    assert "recording ended" in about(over, DARK, clock.now) and "link lost" not in about(over, DARK, clock.now)
+    assert f"{stamp(T + 40)} · ended" in summary([over], feed, DARK, clock.now).replace("</span>", "")
+    bus.publish(one.sample(T + 40, T + 41))  # it was only a pause
+    bus.publish(Account(t=T + 41, links=(REPLAY,), uavs=(0,)))
+    assert not feed.one(0).ended
+
+
+def test_a_live_aircraft_that_falls_silent_is_lost_not_over(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 2)
+    bus.publish(Account(t=T, links=("udpin:0.0.0.0:14550",), uavs=(0, 1)))
+    clock.now += SILENT_S + ENDED_S
+    one = feed.one(0)
+    assert not one.recorded and not one.ended and one.state(clock.now) is State.LINK_LOST
+
+
+def test_a_slow_recording_may_breathe(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    for k in range(1, 8):
+        clock.now += 4.0
+        bus.publish(PretendUav(0).sample(T + k - 1, T + k))
+        bus.publish(PretendUav(0).prediction(T + k, 0.0), STAMP)
+    assert feed.one(0).state(clock.now + 3.9) is State.PREDICTING
+
+
+def test_ended_recordings_stand_last(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 2)
+    bus.publish(Account(t=T, links=(REPLAY,), uavs=(0,)))
+    clock.now += ENDED_S + 0.1
+    bus.publish(PretendUav(1).sample(T, T + 3))
+    assert sorted(feed.all(), key=lambda v: severity(v, clock.now))[-1].uav == 0
+
+
+def test_a_recording_begun_anew_begins_its_events_anew(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    bus.publish(Status(uav=0, t=T + 1, mode="RTL"))
+    assert [event.text for event in feed.one(0).events][-2:] == ["RTL", "disarmed"]
+    bus.publish(PretendUav(0).sample(T - 1_000, T - 999))
+    assert feed.one(0).events == () and len(feed.track(feed.one(0))) == 2
