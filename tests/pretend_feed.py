@@ -137,7 +137,8 @@ class PretendUav:
             threshold=75.0,
             tries=3,
         )
-        return Model(uav=self.uav, t=t, method="paper", verdict=verdict, window_s=40.0)
+        force = verdict if good else None
+        return Model(uav=self.uav, t=t, method="paper", verdict=verdict, in_force=force, window_s=40.0)
 
     def prediction(self, t: float, coast: float) -> Prediction | None:
         """Give the path ahead, a little wrong, the more the farther; None while identifying."""

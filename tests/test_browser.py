@@ -146,7 +146,7 @@ def test_the_page_draws_the_fleet(page, errors: list[str]) -> None:
 
 def test_few_nodes_whatever_the_fleet(page) -> None:
     page.wait_for_function(f"{NODES} > 25", timeout=10_000)
-    assert page.evaluate(NODES) <= 40
+    assert page.evaluate(NODES) <= 46
 
 
 def test_a_click_in_3d_selects_the_same_uav(page) -> None:
@@ -173,6 +173,20 @@ def test_a_row_click_selects(page) -> None:
         selected(page, f"UAV-{uav:03d}")
 
 
+def test_what_happened_is_listed_and_marked_in_one_batch(page, errors: list[str]) -> None:
+    page.locator('tr[data-uav="7"]').click()
+    selected(page, "UAV-007")
+    for kind, words in (("mode", "AUTO"), ("armed", "armed"), ("verified", "model verified"), ("mission", "11 items")):
+        page.locator(f'.uav .event[data-kind="{kind}"]', has_text=words).wait_for(timeout=8_000)
+    before = page.evaluate(NODES)
+    assert page.evaluate("'/selected/events' in window.__viserMutable.nodeRefFromName")
+    page.locator('tr[data-uav="1"]').click()  # its model was never verified
+    selected(page, "UAV-001")
+    page.locator('.uav .event[data-kind="no model"]', has_text="no model yet: starved").wait_for(timeout=8_000)
+    assert page.locator('.uav .event[data-kind="verified"]').count() == 0
+    assert page.evaluate(NODES) == before and errors == []
+
+
 def test_ctrl_k_finds_and_selects(page) -> None:
     page.keyboard.press("Control+k")
     page.get_by_placeholder("Search commands...").fill("UAV-015")
@@ -184,7 +198,8 @@ def test_ctrl_k_finds_and_selects(page) -> None:
 def test_hostile_words_stay_words(page, errors: list[str]) -> None:
     page.locator(f'tr[data-uav="{EVIL}"]').click()
     selected(page, f"UAV-{EVIL:03d}")
-    page.locator(".uav .say", has_text=HOSTILE).first.wait_for(timeout=8_000)
+    for place in (".uav .say", ".uav .event"):
+        page.locator(place, has_text=HOSTILE).first.wait_for(timeout=8_000)
     assert page.locator("img[src='x']").count() == 0
     assert page.evaluate("window.pwned") is None
     assert errors == []

@@ -1,15 +1,20 @@
 """Recordings on the page: data time, the flown path with its marks, the end, and what real flights tell."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pretend_feed import STAMP, Clock, PretendUav, T, feed_of
 
+from fleet.bus import MemoryBus
 from fleet.contract import Account, Alert, AlertKind, State, Status
 from fleet.telemetry.onboard_news import UNDATED_S
+from fleet.telemetry.recordings import Recording
 from viewer import datatime
 from viewer.datatime import DataTime, day, is_dated, moment, stamp, times
 from viewer.detail import about, facts
 from viewer.events import Event, Kind
+from viewer.feed import Feed
 from viewer.palette import DARK
 from viewer.pins import LABELS, MINOR, apart, caption
 from viewer.track import POINTS, Track, placed
@@ -55,6 +60,14 @@ def test_data_time_runs_at_the_pace_of_the_recording(pace: float) -> None:
     assert data.pace == pytest.approx(pace) and float(times(data.pace)[:-1]) == pytest.approx(pace)
     assert data.at(60.5) == pytest.approx(T + 10.5 * pace, abs=1e-4)
     assert data.at(70.0) == pytest.approx(T + 11 * pace + 9, abs=1e-4)  # silent for long: as the wall clock
+
+
+def test_before_the_first_sample_there_is_no_data_time(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    bus.publish(Status(uav=1, t=T, mode="AUTO"))
+    one = feed.one(1)
+    assert one.clock(clock.now) == -np.inf and one.age(clock.now) == np.inf
+    assert "none yet" in facts(one, clock.now) and "undated –" in facts(one, clock.now)
 
 
 def test_a_late_message_does_not_turn_data_time_back() -> None:
@@ -167,3 +180,34 @@ def test_a_recording_begun_anew_begins_its_events_anew(clock: Clock) -> None:
     assert [event.text for event in feed.one(0).events][-2:] == ["RTL", "disarmed"]
     bus.publish(PretendUav(0).sample(T - 1_000, T - 999))
     assert feed.one(0).events == () and len(feed.track(feed.one(0))) == 2
+
+
+# --- real flights ---
+
+FLIGHTS = {
+    "sitl/s02_nominal_light_wind.tlog.xz": (3, "2025-11-20", ["MANUAL", "AUTO", "armed", "item 16: land", "disarmed"]),
+    "sitl/s09_quadplane_nominal.tlog.xz": (9, "2025-11-21", ["AUTO", "armed", "item 6: VTOL landing", "disarmed"]),
+    "real/alfa_20180718_155331_1_engine_failure.tlog": (1, "2018-07-18", ["GUIDED", "armed"]),
+    "real/dronekit_copter_log171_crash.bin": (1, "2015-11-21", ["LOITER", "armed", "ACRO", "ERR subsystem 16"]),
+}
+
+
+@pytest.mark.parametrize("name", FLIGHTS, ids=lambda name: name.split("/")[1].split(".")[0])
+def test_a_recorded_flight_tells_its_events_on_its_path(recordings: Path, clock: Clock, name: str) -> None:
+    uav, date, expected = FLIGHTS[name]
+    feed = Feed(bus := MemoryBus(), clock)
+    for now, news in Recording(str(recordings / name), 0).steps():
+        clock.now += 0.025
+        for message in news:
+            bus.publish(message)
+        heard = uav in feed.vehicles and feed.vehicles[uav].t > 0
+        assert not heard or abs(feed.vehicles[uav].clock(clock.now) - now) < 4.0
+    one = feed.one(uav)
+    page = [event.text for event in one.events]
+    found = [next((k for k, text in enumerate(page) if text.startswith(words)), -1) for words in expected]
+    assert -1 not in found and len(page) == len({(e.t, e.text) for e in one.events}), page
+    assert stamp(one.clock(clock.now)).startswith(date)
+    assert one.age(clock.now) < 10 and "link lost" not in page
+    spots = placed(feed.track(one), np.array([event.t for event in one.events]))
+    assert np.isfinite(spots[-1]).all() and np.isfinite(spots).mean() > 0.6  # before its first fix it was nowhere
+    assert feed.counts["strange"] == 0

@@ -35,8 +35,8 @@ class DataTime(NamedTuple):
         return DataTime(t, now, 1.0 if abs(pace - 1) < STEADY else pace, (t, now))
 
     def at(self, now: float) -> float:
-        """Estimate data time now [s since 1970]."""
-        silent = now - self.heard
+        """Estimate data time now [s since 1970]; -inf before any was heard."""
+        silent = now - self.heard if np.isfinite(self.heard) else 0.0
         return self.t + min(silent, COAST_S) * self.pace + max(silent - COAST_S, 0.0)
 
 

@@ -132,7 +132,7 @@ def _facts(vehicle: Vehicle, now: float) -> str:
         else "–",
         "recorded" if vehicle.recorded else "data time": stamp(at)
         + (f", played {times(vehicle.time.pace)}" if vehicle.recorded and not vehicle.ended else ""),
-        "sample": f"{ago(vehicle.age(now))} old",
+        "sample": f"{ago(vehicle.age(now))} old" if isfinite(vehicle.age(now)) else "none yet",
         "prediction": f"{ago(max(at - vehicle.forecast.t, 0.0))} old, coasted {told.coast_s:.0f} s"
         if vehicle.forecast and told
         else "–",

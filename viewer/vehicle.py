@@ -144,7 +144,7 @@ class Vehicle:
 
     def age(self, now: float) -> float:
         """Give the data time since the last sample [s]; infinite before any."""
-        return max(self.clock(now) - self.t, 0.0)
+        return max(self.clock(now) - self.t, 0.0) if np.isfinite(self.t) else np.inf
 
     def clock(self, now: float) -> float:
         """Estimate the aircraft's data time now [s], from the newest thing heard of it; it stops with a recording."""
