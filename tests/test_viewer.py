@@ -22,7 +22,7 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin, body_to_ned, to_geodetic
-from viewer.app import near
+from viewer.app import ROOM, near, outgrown
 from viewer.camera import FOV, frame
 from viewer.charts import band, scale
 from viewer.chronicle import listing
@@ -32,7 +32,7 @@ from viewer.palette import DARK, LIGHT, line_colour, rgb, shown_line
 from viewer.place import UNIT_M, Place, scene_quat
 from viewer.routes import route
 from viewer.scene import DASHES, cut_at_horizon
-from viewer.shapes import aircraft
+from viewer.shapes import aircraft, diamond, rotorcraft
 from viewer.tube import curtain, marks, rings, skin
 from viewer.words import empty, summary, table
 
@@ -120,6 +120,12 @@ def test_however_far_apart_somebody_is_in_view(apart: float) -> None:
     assert len(near(points, 2_000.0)) == (2 if apart < 2_000 else 1)
 
 
+def test_the_picture_moves_only_when_a_path_has_outgrown_it() -> None:
+    framed, spare = np.array([[0, 0, 0], [100.0, 0, 0]]), 0.4 * (ROOM - 1) * 100
+    assert not outgrown(np.array([[-0.9 * spare, 0, 0], [100 + 0.9 * spare, 0, 0]]), framed)
+    assert outgrown(np.array([[50, 1.1 * spare, 0]]), framed) and outgrown(np.array([[-1.1 * spare, 0, 0]]), framed)
+
+
 def test_the_tube_is_as_wide_as_told() -> None:
     path = np.stack([np.linspace(0, 50, 21), np.zeros(21), np.full(21, 10.0)], axis=-1)
     axes = np.tile([3.0, 2.0, 0.5], (21, 1))
@@ -167,10 +173,22 @@ def test_the_camera_sees_every_point() -> None:
         assert max(np.abs(x).max(), np.abs(y).max()) > 0.85  # and not from the moon
 
 
-def test_the_aircraft_is_a_sound_mesh() -> None:
-    vertices, faces = aircraft()
-    assert np.isfinite(vertices).all() and faces.max() == len(vertices) - 1
-    assert vertices[:, 0].max() > -vertices[:, 0].min() * 0.9  # the nose is in front
+@pytest.mark.parametrize("points", [np.zeros((1, 3)), np.ones((4, 3)), np.array([[0, 0, 0], [0, 0, 1e-9]])])
+def test_the_camera_stands_off_however_little_there_is_to_see(points: np.ndarray) -> None:
+    eye, look_at = frame(points, 1.5)
+    assert np.isfinite([eye, look_at]).all() and np.linalg.norm(eye - points[0]) > 3
+
+
+@pytest.mark.parametrize("shape", [aircraft, rotorcraft, diamond])
+def test_every_shape_is_a_sound_mesh(shape) -> None:
+    vertices, faces = shape()
+    assert np.isfinite(vertices).all() and faces.min() == 0 and faces.max() == len(vertices) - 1
+    assert 0.3 < np.ptp(vertices, axis=0).max() <= 2.6
+
+
+def test_the_nose_is_in_front() -> None:
+    vertices, _ = aircraft()
+    assert vertices[:, 0].max() > -vertices[:, 0].min() * 0.9
 
 
 # --- missions ---

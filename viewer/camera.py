@@ -28,9 +28,10 @@ def frame(points: np.ndarray, aspect: float, margin: float = 1.1) -> tuple[np.nd
         x, y, z = (points - look_at) @ right, (points - look_at) @ up, (points - look_at) @ to_eye
         tall = np.tan(FOV / 2)
         distance = float(np.max(np.maximum(np.abs(x) / (tall * aspect), np.abs(y) / tall) * margin + z))
+        distance = max(distance, CLOSEST)
         depth = distance - z
         look_at = look_at + right * _middle(x / depth) * distance + up * _middle(y / depth) * distance
-    eye = look_at + to_eye * max(distance, CLOSEST)
+    eye = look_at + to_eye * distance
     sink = (eye[2] - float(points[:, 2].mean())) / to_eye[2]  # orbit about the fleet, not about a point underground
     return eye, eye - to_eye * max(sink, CLOSEST / 2)
 
