@@ -105,6 +105,15 @@ STORIES = {
         ],
         [(4, Kind.LOST, "link lost"), (9, Kind.BACK, "link back")],
     ),
+    "a worker that is behind calls a link lost that its gateway hears": (
+        [status(60, "", armed=False), alert(20), alert(31, active=False), status(61, "", armed=False)],
+        [],
+    ),
+    "where the gateway has fallen silent the worker tells": (
+        [status(0, "", armed=False), alert(3), alert(40, active=False)],
+        [(3, Kind.LOST, "link lost"), (40, Kind.BACK, "link back")],
+    ),
+    "home alone is no mission": ([Mission(uav=7, t=T, items=(Item(seq=0, command=16),), complete=True)], []),
     "an alert is raised once and withdrawn once": (
         [alert(k, AlertKind.GROUND, active=k < 3, sentence="uav-7: ground in 8 s") for k in range(5)],
         [(0, Kind.ALERT, "ground in 8 s"), (3, Kind.EASED, "ground is over")],

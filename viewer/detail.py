@@ -62,6 +62,11 @@ def why(vehicle: Vehicle, now: float) -> list[str]:
         )
     elif vehicle.forecast is None:
         said.append("No horizon yet: nothing is claimed before a model is verified.")
+    if late := vehicle.late(now):
+        said.append(
+            f"The newest prediction is {ago(late)} old: its worker has fallen behind; play the recording more slowly, "
+            "or let fewer UAVs share a worker."
+        )
     if vehicle.prediction is not None and vehicle.prediction.sentence:
         said.append(vehicle.prediction.sentence)
     if vehicle.status is not None and vehicle.status.sentence:

@@ -15,6 +15,7 @@ from viewer.routes import ITEM_NAMES
 
 MAX_EVENTS = 200  # kept of one UAV; the oldest go first
 MAX_WORDS = 200  # letters kept of a sentence from outside
+QUIET_S = 2.5  # a gateway that has not spoken for so long leaves it to the worker to call the link lost [s]
 MAX_STEPS = 20  # changes of the mission item believed of one sample
 LATEST = 4e9  # times beyond are noise [s since 1970]
 SOUND = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST)  # the newest try bears out a model, its own or the one in force
@@ -54,7 +55,7 @@ class Known(NamedTuple):
     mode: str = ""
     armed: bool = False
     lost: bool | None = None  # None: not heard of alive yet, so it cannot be lost
-    back_t: float = -np.inf  # when the link last came back [s since 1970]
+    status_t: float = -np.inf  # when the gateway last spoke of the link [s since 1970]
     sentence: str = ""
     items: tuple[Item, ...] = ()
     seq: int = -1
@@ -94,6 +95,7 @@ def _status(known: Known, status: Status) -> Told:
     if known.lost is None:
         known = known._replace(lost=None if lost else False)
     known, events = _link(known, status.t, lost) if known.lost is not None else (known, [])
+    known = known._replace(status_t=status.t)
     if status.mode and status.mode != known.mode:
         events.append(Event(status.t, Kind.MODE, _clip(status.mode)))
     if status.armed != known.armed:
@@ -106,17 +108,15 @@ def _status(known: Known, status: Status) -> Told:
 
 
 def _link(known: Known, t: float, lost: bool) -> Told:
-    """Follow the link, of which gateway and worker both speak, one perhaps long after the other."""
-    if lost == bool(known.lost) or (lost and t <= known.back_t):
+    if lost == bool(known.lost):
         return known, []
-    if lost:
-        return known._replace(lost=True), [Event(t, Kind.LOST, "link lost")]
-    return known._replace(lost=False, back_t=t), [Event(t, Kind.BACK, "link back")]
+    event = Event(t, Kind.LOST, "link lost") if lost else Event(t, Kind.BACK, "link back")
+    return known._replace(lost=lost), [event]
 
 
 def _alert(known: Known, alert: Alert) -> Told:
-    if alert.kind is AlertKind.LINK_LOST:
-        return _link(known, alert.t, alert.active)
+    if alert.kind is AlertKind.LINK_LOST:  # of a worker, which may be far behind the gateway and short of messages
+        return _link(known, alert.t, alert.active) if alert.t > known.status_t + QUIET_S else (known, [])
     if alert.active == (alert.kind in known.raised):
         return known, []
     name = alert.kind.value.replace("_", " ")
@@ -127,7 +127,7 @@ def _alert(known: Known, alert: Alert) -> Told:
 
 
 def _mission(known: Known, mission: Mission) -> Told:
-    if not mission.items or not mission.complete:
+    if len(mission.items) < 2 or not mission.complete:  # one alone is home
         return known, []
     if known.items and _plan(mission.items) == _plan(known.items):
         return known._replace(items=mission.items), []

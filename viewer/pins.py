@@ -13,7 +13,7 @@ from viewer.track import placed
 PINS = 40  # drawn: the newest of those that lie on the path
 LABELS = 3  # labels do not make room for each other: few are readable
 LETTERS = 26  # of a label
-CLEAR = 4.0  # a label keeps this far from the aircraft and from the others [drawn spans of an aircraft]
+CLEAR = 6.0  # a label keeps this far from the aircraft and from the others [drawn spans of an aircraft]
 RADIUS = 0.3  # of a diamond [drawn spans of an aircraft]
 MINOR = {Kind.ITEM, Kind.MISSION, Kind.SOUND, Kind.DOUBTED}  # come often: drawn smaller, and without a label
 MODEL = {Kind.VERIFIED, Kind.NO_MODEL}  # a label has room for the first words of their sentence alone
@@ -40,7 +40,12 @@ class Pins:
         )
         self._labels = [
             server.scene.add_label(
-                f"/selected/event{k}", "", font_screen_scale=0.75, anchor="bottom-left", depth_test=False, visible=False
+                f"/selected/event{k}",
+                "",
+                font_screen_scale=0.75,
+                anchor="bottom-center",
+                depth_test=False,
+                visible=False,
             )
             for k in range(LABELS)
         ]

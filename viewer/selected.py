@@ -218,6 +218,8 @@ def caption(vehicle: Vehicle, now: float) -> str:
         horizon = "  no prediction yet"
     else:
         horizon = f"  horizon {told.until:.0f} s" if told.until >= CLAIMS_S else "  no horizon"
+    if late := vehicle.late(now):
+        horizon = f"  prediction {late:.0f} s old"
     if vehicle.ended:
         return f"{vehicle.name}  end of the recording"
     lost = f"  link lost {vehicle.age(now):.0f} s" if vehicle.state(now) is State.LINK_LOST else ""

@@ -16,6 +16,7 @@ TRAIL_ROWS = 900  # about 90 s at 10 Hz
 SILENT_S = 3.0  # without a sample for this long the link counts as lost, whatever was last said [s]
 GIVE_UP_S = 10.0  # a writer silent for so long has lost its claim: a lower epoch (a restarted fleet) may speak [s]
 ABANDONED_S = 30.0  # without a word of any worker for so long, what was last said is no state any more [s]
+LATE_S = 5.0  # a prediction older than this is no news, in wall time [s]
 ENDED_S = 3.0  # a recording whose player is silent for so long is over [s]
 JUMP_S = 5.0  # a step back in time by more than this is another flight: start afresh [s]
 AWAY_S = 86_400.0  # a status whose time lies farther from the samples is of another flight [s]
@@ -145,6 +146,11 @@ class Vehicle:
     def age(self, now: float) -> float:
         """Give the data time since the last sample [s]; infinite before any."""
         return max(self.clock(now) - self.t, 0.0) if np.isfinite(self.t) else np.inf
+
+    def late(self, now: float) -> float:
+        """Give how far the newest prediction lies behind data time [s], where that is more than a worker should need."""
+        behind = self.clock(now) - self.forecast.t if self.forecast is not None else 0.0
+        return behind if behind > LATE_S * max(self.time.pace, 1.0) else 0.0
 
     def clock(self, now: float) -> float:
         """Estimate the aircraft's data time now [s], from the newest thing heard of it; it stops with a recording."""
