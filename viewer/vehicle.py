@@ -148,7 +148,7 @@ class Vehicle:
         return max(self.clock(now) - self.t, 0.0) if np.isfinite(self.t) else np.inf
 
     def late(self, now: float) -> float:
-        """Give how far the newest prediction lies behind data time [s], where that is more than a worker should need."""
+        """Give how far the newest prediction lies behind data time [s]; 0 while its worker keeps up."""
         behind = self.clock(now) - self.forecast.t if self.forecast is not None else 0.0
         return behind if behind > LATE_S * max(self.time.pace, 1.0) else 0.0
 
