@@ -127,15 +127,23 @@ STORIES = {
             model(0, Outcome.BELOW_THRESHOLD, in_force=False),
             model(4, Outcome.VERIFIED, in_force=True),
             model(8, Outcome.WORSE_THAN_LAST, in_force=True),
-            model(12, Outcome.DIVERGED, in_force=True),
-            model(16, Outcome.VERIFIED, in_force=True),
+            *(model(t, Outcome.DIVERGED, in_force=True) for t in (12, 16, 20, 24)),
+            model(28, Outcome.VERIFIED, in_force=True),
         ],
         [
             (0, Kind.NO_MODEL, "no model yet: below threshold"),
             (4, Kind.VERIFIED, "model verified: mean fit 88 %"),
-            (12, Kind.DOUBTED, "newest try diverged; an earlier model stays in force"),
-            (16, Kind.SOUND, "newest try sound again"),
+            (20, Kind.DOUBTED, "12 s without a sound try (diverged); an earlier model stays in force"),
+            (28, Kind.SOUND, "newest try sound again"),
         ],
+    ),
+    "verdicts that alternate are not told one by one": (
+        [model(t, Outcome.VERIFIED if t % 4 else Outcome.DIVERGED, in_force=True) for t in range(2, 90, 2)],
+        [(2, Kind.VERIFIED, "model verified: mean fit 88 %")],
+    ),
+    "a model that is withdrawn is none": (
+        [model(0, Outcome.VERIFIED, in_force=True), model(4, Outcome.STARVED, in_force=False)],
+        [(0, Kind.VERIFIED, "model verified: mean fit 88 %"), (4, Kind.NO_MODEL, "no model yet: starved")],
     ),
     "a late viewer meets a model in force whose newest try failed": (
         [model(0, Outcome.STARVED, in_force=True)],

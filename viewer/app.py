@@ -227,5 +227,5 @@ def _ground(fleet: list[Vehicle], place: Place, before: float) -> float:
     if homes:
         return (min(homes) - place.origin.alt_mm * 1e-3) / UNIT_M
     if floors := [vehicle.floor for vehicle in fleet if np.isfinite(vehicle.floor)]:
-        return min(floors) - 0.05
+        return min([*floors, *(float(v.at[2]) for v in fleet if v.at is not None)]) - 0.05
     return min([before, *(float(v.at[2]) - 6.0 for v in fleet if v.at is not None)])

@@ -17,6 +17,7 @@ MAX_EVENTS = 200  # kept of one UAV; the oldest go first
 MAX_WORDS = 200  # letters kept of a sentence from outside
 QUIET_S = 2.5  # a gateway that has not spoken for so long leaves it to the worker to call the link lost [s]
 MAX_STEPS = 20  # changes of the mission item believed of one sample
+LASTS_S = 12.0  # tries that fail for so long throw doubt on a model: about three verdicts [s]
 LATEST = 4e9  # times beyond are noise [s since 1970]
 SOUND = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST)  # the newest try bears out a model, its own or the one in force
 
@@ -59,7 +60,8 @@ class Known(NamedTuple):
     sentence: str = ""
     items: tuple[Item, ...] = ()
     seq: int = -1
-    verdict: tuple[bool, Outcome | None] | None = None  # is a model in force; why the newest try is not sound
+    verdict: str | None = None  # last told of: none (no model), sound or doubted; None before any
+    sound_t: float = -np.inf  # when a try last was sound [s since 1970]
     raised: frozenset[AlertKind] = frozenset()
 
 
@@ -162,20 +164,26 @@ def _item(items: tuple[Item, ...], seq: int) -> str:
 
 
 def _model(known: Known, model: Model) -> Told:
-    """Tell when the first model is verified, when tries stop bearing it out, and when they do again."""
-    newest = model.verdict
-    now = model.in_force is not None, None if newest.outcome in SOUND else newest.outcome
-    if now == known.verdict:
+    """Tell when the first model is verified, when tries fail for a while, and when one bears it out again.
+
+    Verdicts come every few seconds, and near a threshold they alternate: a change that does not last is no event.
+    """
+    newest, before = model.verdict, known.verdict
+    sound_t = model.t if before is None or newest.outcome in SOUND else known.sound_t
+    known = known._replace(sound_t=sound_t)
+    if model.in_force is None:
+        news, event = "none", Event(model.t, Kind.NO_MODEL, f"no model yet: {_outcome(newest)}")
+    elif before in (None, "none"):
+        said = _own_words(model.in_force.sentence, model.uav)
+        news, event = "sound", Event(model.t, Kind.VERIFIED, f"model verified: {said}")
+    elif newest.outcome in SOUND:
+        news, event = "sound", Event(model.t, Kind.SOUND, "newest try sound again")
+    elif model.t - sound_t >= LASTS_S:
+        words = f"{LASTS_S:.0f} s without a sound try ({_outcome(newest)}); an earlier model stays in force"
+        news, event = "doubted", Event(model.t, Kind.DOUBTED, words)
+    else:
         return known, []
-    before, known = known.verdict, known._replace(verdict=now)
-    if not now[0]:
-        return known, [Event(model.t, Kind.NO_MODEL, f"no model yet: {_outcome(newest)}")]
-    if before is None or not before[0]:
-        said = _own_words((model.in_force or newest).sentence, model.uav)
-        return known, [Event(model.t, Kind.VERIFIED, f"model verified: {said}")]
-    if now[1] is None:
-        return known, [Event(model.t, Kind.SOUND, "newest try sound again")]
-    return known, [Event(model.t, Kind.DOUBTED, f"newest try {_outcome(newest)}; an earlier model stays in force")]
+    return (known, []) if news == before else (known._replace(verdict=news), [event])
 
 
 def _outcome(verdict: Verdict) -> str:

@@ -60,7 +60,8 @@ class Pins:
             size: drawn span of an aircraft [10 m]
         """
         spots = placed(rows, np.array([event.t for event in events]))
-        found = [(event, spot) for event, spot in zip(events, spots, strict=True) if np.isfinite(spot).all()][-PINS:]
+        found = [(event, spot) for event, spot in zip(events, spots, strict=True) if np.isfinite(spot).all()]
+        found = sorted(found, key=lambda one: one[0].kind not in MINOR)[-PINS:]  # rather the major ones
         where, scales, colours = np.zeros((PINS, 3)), np.zeros(PINS, np.float32), np.zeros((PINS, 3))
         for k, (event, spot) in enumerate(found):
             where[k], colours[k] = spot, rgb(self._palette.event(event.kind))

@@ -205,7 +205,7 @@ class Vehicle:
             self.trail.clear()
             self.floor = np.nan
         self.trail.extend((float(k), *p, self.Va) for k, p in zip(t[fix], enu.tolist(), strict=True))
-        if self.status is not None and not self.status.armed:
+        if self.status is not None and self.status.mode and not self.status.armed:  # no mode: not yet known
             self.floor = float(np.fmin(self.floor, enu[-1, 2]))
         self.at, self.alt_m = enu[-1], float(x[fix][-1, 2]) * 1e-3
 
