@@ -87,7 +87,7 @@ def identify(
         window: the stretch
         wind: mean wind, NED, the direction it blows to, (2,) or (3,) [m/s]
         airframe: what is known of the aircraft before it has flown, or a class
-        last: the last verified model of an earlier stretch, none of whose data are in this one; it holds the parameters
+        last: the last verified model; it holds the parameters by what it knows from before this window
         near: a model of nearly this stretch, where the search starts; it holds nothing
     Raises:
         ValueError: when too little of the window is whole, or nothing descends; wait for more.
@@ -96,7 +96,7 @@ def identify(
     if not len(segments):
         raise ValueError("identify: found no 2 s of unbroken data, needs them; wait")
     y, delta = states(window), lagged(window.u, window.dt, TAU)
-    mean, precision, at, nominal = _held(window, wind, airframe, last, near)
+    mean, precision, at, nominal = _held(window, wind, airframe, last)
     problem = Problem(y, delta, segments, at, window.dt, DISCOUNT)
     if near is not None:
         found = search(problem, near.par, (mean, precision), WARM, near.weight)
@@ -119,25 +119,29 @@ def _good(found: Found) -> bool:
 
 
 def _held(
-    window: Window, wind: np.ndarray, airframe: Airframe, last: Coupled | None, near: Coupled | None
+    window: Window, wind: np.ndarray, airframe: Airframe, last: Coupled | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Give mean and precision the parameters are held by, U0 W0, and what the airframe alone says."""
-    known = last or near
-    if known is None:
+    """Give mean and precision the parameters are held by, U0 W0, and what the airframe alone says.
+
+    Of what the last model's data said, the share from before this window counts, and fades: none is counted twice.
+    """
+    if last is None:
         ok = window.ok
         air = window.x[ok, :3].mean(axis=0)
         at = np.array([max(np.linalg.norm(window.x[ok, :3], axis=1).mean(), 1.0), air[2]])
         mean, sigma = prior(airframe, at, window.u[ok].mean(axis=0), wind)
         precision = np.diag(sigma**-2.0)
         return mean, precision, at, (mean, precision)
-    nominal, firm = known.airframe
-    if last is None:
-        return nominal, firm, known.at, known.airframe
-    keep = np.full(N_PAR, _FORGET)
-    keep[list(OFFSETS)] *= _FORGET_OFFSETS
-    keep[WIND:] *= _FORGET_WIND
-    root = np.sqrt(keep)
-    kept, fresh = (last.information + last.precision) * root[:, None] * root, (1 - _FORGET) * firm
-    precision = kept + fresh
-    mean = np.linalg.solve(precision, kept @ last.par + fresh @ nominal)
+    nominal, firm = last.airframe
+    moved = float(np.clip((window.t[0] - last.t0) / (last.t1 - last.t0), 0.0, 1.0))
+    root = np.sqrt(_KEEP**moved)
+    before, told = (root[:, None] * each * root for each in (last.precision, moved * last.information))
+    fresh = (1.0 - _FORGET**moved) * firm
+    precision = before + told + fresh
+    mean = np.linalg.solve(precision, before @ last.mean + told @ last.par + fresh @ nominal)
     return mean, precision, last.at, last.airframe
+
+
+_KEEP = np.full(N_PAR, _FORGET)
+_KEEP[list(OFFSETS)] *= _FORGET_OFFSETS
+_KEEP[WIND:] *= _FORGET_WIND

@@ -17,7 +17,7 @@ from fleet.physics.kernel import kernel
 from fleet.physics.wrench import OFFSETS
 from twin_worker.coupled import Coupled
 
-TAU = 1.0  # a gust fades in [s]
+TAU = np.array([0.5, 0.5, 0.5, 0.1, 0.1, 0.1])  # gusts in u v w p q r fade in [s]
 _ALPHA = np.array([0.8, 0.8, 0.8, 1.0, 1.0, 1.0, 0.9, 0.9, 0.9])  # u v w over the ground, p q r, angles
 _BETA = np.array([0.08, 0.08, 0.08, 0.25, 0.25, 0.25, 0.0, 0.0, 0.0])
 _DRIVEN = (0, 2, 4, 1, 3, 5)  # state each offset drives, in the order of `OFFSETS`
@@ -32,9 +32,9 @@ class Observer:
     dt: float
 
     @property
-    def left(self) -> float:
-        """Give how much of a gust is left after one sample [-]."""
-        return float(np.exp(-self.dt / TAU))
+    def left(self) -> np.ndarray:
+        """Give how much of each gust is left after one sample, (6,) [-]."""
+        return np.exp(-self.dt / TAU)
 
     def track(self, y: np.ndarray, delta: np.ndarray) -> np.ndarray:
         """Filter a stretch: states and gusts at every row, from the rows up to it, (n, 15).
@@ -61,7 +61,7 @@ def _track(
     par: np.ndarray,
     at: np.ndarray,
     dt: float,
-    left: float,
+    left: np.ndarray,
     out: np.ndarray,
 ) -> None:
     x, d, blown, work = y[0].copy(), np.zeros(6), par.copy(), np.empty((3, N_X))
@@ -87,14 +87,14 @@ def _blow(
     par: np.ndarray,
     at: np.ndarray,
     dt: float,
-    left: float,
+    left: np.ndarray,
     blown: np.ndarray,
     work: np.ndarray,
 ) -> None:
     """Advance x by dt in the gust d, and let that fade."""
     for i in range(6):
         blown[_OFFSET[i]] = par[_OFFSET[i]] + d[i]
-        d[i] *= left
+        d[i] *= left[i]
     step(x, delta, blown, at, dt, work)
 
 
@@ -106,7 +106,7 @@ def _fly(
     par: np.ndarray,
     at: np.ndarray,
     dt: float,
-    left: float,
+    left: np.ndarray,
     out: np.ndarray,
 ) -> None:
     x, d, blown, work = np.empty(N_X), np.empty(6), par.copy(), np.empty((3, N_X))

@@ -12,7 +12,7 @@ from fleet.airframes import Airframe, load
 from fleet.frames import body_to_ned, ned_to_body
 from fleet.physics.actuators import TAU, lagged
 from fleet.window import Window
-from twin_worker.coupled import Coupled, identify
+from twin_worker.coupled import identify
 from twin_worker.earned import Earned
 from twin_worker.observer import Observer
 from twin_worker.wind import WindFilter
@@ -69,7 +69,6 @@ class Ours:
     def __init__(self) -> None:
         self._wind = WindFilter()
         self._heard = 0
-        self._found: list[Coupled] = []
         self._seen: Seen | None = None
         self._earned = Earned()
         self._taught = 0  # rows of the flight the lessons have reached
@@ -87,9 +86,7 @@ class Ours:
         s = slice(start, None)
         n = len(known) - start
         window = Window(known.t[s], air[s], known.u[s], np.zeros((n, 3)), v[s], known.ok[s], np.zeros(n, bool))
-        last = next((one for one in reversed(self._found) if one.t1 <= window.t[0]), None)
-        model = identify(window, wind, airframe(known), last)
-        self._found.append(model)
+        model = identify(window, wind, airframe(known), self._seen.eye.model if self._seen else None)
         stretch = known.part(start, len(known))
         if self._seen:
             self._seen.look_back(stretch.part(len(stretch) - (len(known) - self._taught), len(stretch)), 1.0)
