@@ -18,6 +18,7 @@ from fleet import cli, commands
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 OFFERED = {"msgpack"}  # not imported: the wire format, for tools such as the README's
+PEERS = {"jax-sysid", "nfoursid", "pandas", "pysindy", "sippy-unipi"}  # of the bench, in an environment of their own
 TOOLS = {"ruff", "mypy", "pytest"}  # development dependencies that are run rather than imported
 
 
@@ -56,6 +57,9 @@ def third_party(*folders: str) -> set[str]:
         if path.startswith(folders):
             tops = {name.split(".")[0] for _, name in imported(path, ast.parse((ROOT / path).read_text()))}
             for top in tops - set(sys.stdlib_module_names) - local:
+                if bare(top) in PEERS:
+                    found.add(bare(top))
+                    continue
                 assert top in offered, f"{path} imports {top}, which is not installed"
                 found |= {bare(offer) for offer in offered[top]}
     return found
@@ -65,17 +69,19 @@ def test_what_is_imported_is_declared_and_what_is_declared_is_imported() -> None
     run_time = {bare(line) for line in PROJECT["dependencies"]}
     development = {bare(line) for line in PROJECT["optional-dependencies"]["dev"]}
     assert third_party(*PACKAGES) == run_time - OFFERED
-    assert third_party("tests") <= run_time | development
+    assert {bare(line) for line in PROJECT["optional-dependencies"]["bench"]} == PEERS <= third_party("tests/bench")
+    assert third_party("tests") <= run_time | development | PEERS
     assert development <= third_party("tests") | TOOLS
 
 
-def test_the_lock_holds_every_dependency_by_version_and_hash_and_no_address() -> None:
-    text = (ROOT / "requirements.lock").read_text()
+@pytest.mark.parametrize(("lock", "extra"), [("requirements.lock", "dev"), ("requirements-bench.lock", "bench")])
+def test_the_lock_holds_every_dependency_by_version_and_hash_and_no_address(lock: str, extra: str) -> None:
+    text = (ROOT / lock).read_text()
     assert "http" not in text and "--index" not in text and "--find-links" not in text
     entries = re.split(r"\n(?=[a-z0-9])", text.replace("\\\n", " "))[1:]
     assert all(re.match(r"[a-z0-9._-]+==[^ ]+ +--hash=sha256:[0-9a-f]{64}", entry) for entry in entries), entries
     locked = {entry.split("==")[0] for entry in entries}
-    wanted = {*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["dev"], "setuptools"}
+    wanted = {*PROJECT["dependencies"], *PROJECT["optional-dependencies"][extra], "setuptools"}
     assert {bare(line) for line in wanted} <= locked
 
 

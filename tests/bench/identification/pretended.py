@@ -25,7 +25,7 @@ from .flight import Case, Flight, true_airspeed, unwrapped
 
 UAVS = 10
 SECONDS, SETTLE_S = 300.0, 15.0
-WIND, TURBULENCE = 4.0, 3  # mean [m/s], severity (light)
+WIND, TURBULENCE = 4.0, 2  # mean [m/s], severity: the weather that pretend aircraft usually fly in
 _SPAN = 2.9  # [m]
 _ROW = 4  # ticks per row
 _EVERY = 10  # rows between two starts of the short horizons
