@@ -60,15 +60,18 @@ def assembled(matrices: Iterable[np.ndarray | None], y: np.ndarray, u: np.ndarra
     D = np.zeros((y.shape[1], u.shape[1])) if given[3] is None else given[3]
     if not all(np.isfinite(each).all() for each in (A, B, C, D)):
         raise ValueError("the model is not finite")
-    model = StateSpace(A, B, C, D, np.zeros((len(A), len(C))), _state(A, B, C, D, y, u, round(_START_S / dt)))
+    model = StateSpace(A, B, C, D, np.zeros((len(A), len(C))), np.zeros(len(A)))
+    n = round(_START_S / dt)
+    model.x = _state(model, y[-n:], u[-n:])
     model.K = _gain(model, given[4], y, u, dt)
     return model
 
 
-def _state(A, B, C, D, y, u, n: int) -> np.ndarray:
-    """Find the state that explains the last n rows best by least squares, and carry it to the row after them."""
+def _state(model: StateSpace, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Find the state that explains these rows best by least squares, and carry it to the row after them."""
+    A, B, C, D = model.A, model.B, model.C, model.D
     rows, rest, power, x = [], [], np.eye(len(A)), np.zeros(len(A))
-    for seen, now in zip(y[-n:], u[-n:], strict=True):
+    for seen, now in zip(y, u, strict=True):
         rows.append(C @ power)
         rest.append(seen - C @ x - D @ now)
         power, x = A @ power, A @ x + B @ now
