@@ -1,7 +1,7 @@
 """Public identification packages behind one face: identify(x, u, dt, axis) -> forecast(u), kstep(y, u, k).
 
 Every peer gets the window standardised, without inputs that stand still or repeat another, and chooses its order on the
-window's last quarter. Whatever it throws, even SystemExit, is a failed axis; the other axis counts.
+window's last quarter where that helps it. Whatever it throws, even SystemExit, is a failed axis; the other axis counts.
 """
 
 import contextlib
@@ -46,9 +46,9 @@ Identify = Callable[[np.ndarray, np.ndarray, float, str], AxisModel]
 
 
 def orders(axis: str) -> tuple[int, ...]:
-    """Give the orders worth a try: one less than the states, as many, some more, twice as many."""
+    """Give the orders worth a try. Laterally that is the number of states: a choice cost every peer, when tried."""
     n = len(AXES[axis])
-    return n - 1, n, n + 2, 2 * n
+    return (n - 1, n, n + 2, 2 * n) if axis == "lon" else (n,)
 
 
 def nfoursid(x: np.ndarray, u: np.ndarray, dt: float, axis: str) -> StateSpace:
@@ -100,7 +100,7 @@ def jax_sysid(x: np.ndarray, u: np.ndarray, dt: float, axis: str) -> StateSpace:
         A, B, C, D = model.ssdata()
         return assembled((A, B, C, D, None), y, u, dt)
 
-    return chosen(fit, orders(axis)[1:2], x, u, dt)  # a second for each fit: the order of the states
+    return chosen(fit, (len(AXES[axis]),), x, u, dt)  # a second for each fit: no trials
 
 
 def pysindy(x: np.ndarray, u: np.ndarray, dt: float, axis: str) -> Any:

@@ -169,7 +169,7 @@ def steer(seen, commands, pushed, memory, trim):
     theta_c = min(max(0.022 * low + memory[0] + 0.03, -0.3), 0.35)
     slow = commands[2] - Va
     memory[1] = min(max(memory[1] + 0.015 * DT * slow, -0.3), 0.3)
-    memory[2] += 0.8 * DT * (r - memory[2])
+    memory[2] += 0.8 * DT * (r - 2 * memory[2])  # half of a steady turn rate passes to the rudder
     delta = np.empty(4)
     delta[0] = 0.7 * (phi_c - phi) - 0.06 * p
     delta[1] = trim[1] + 1.8 * (theta_c - theta) - 0.24 * q
