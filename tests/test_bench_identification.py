@@ -1,6 +1,7 @@
 """The identification bench's own pieces: the yardstick flies, the scores are right, nobody sees what comes."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -194,9 +195,9 @@ def test_the_oracle_beats_the_window_mean(calm):
 def test_ours_runs_end_to_end_and_sees_nothing_of_what_comes(calm):
     case, ours = calm[0], Ours()
     flight = case.flight
-    broken = made_up(flight.x.copy(), flight.u.copy())
-    broken.x[2000:] = np.nan
-    broken.u[2000:] = np.nan
+    broken = replace(flight, x=flight.x.copy(), u=flight.u.copy(), Va=flight.Va.copy())
+    for rows in (broken.x, broken.u, broken.Va):
+        rows[2000:] = np.nan
     models = [Ours().identify(f.part(0, 2000), 1000) for f in (flight, broken)]
     runs = [model.forecast(flight.part(0, 2000), flight.u[2000:3000]) for model in models]
     assert np.array_equal(*runs) and runs[0].shape == (1000, 9)
