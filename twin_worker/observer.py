@@ -17,7 +17,7 @@ from fleet.physics.kernel import kernel
 from fleet.physics.wrench import OFFSETS
 from twin_worker.coupled import Coupled
 
-TAU = np.array([0.5, 0.5, 0.5, 0.1, 0.1, 0.1])  # gusts in u v w p q r fade in [s]
+TAU = np.array([0.3, 0.3, 0.3, 0.1, 0.1, 0.1])  # gusts in u v w p q r fade in [s]
 _ALPHA = np.array([0.8, 0.8, 0.8, 1.0, 1.0, 1.0, 0.9, 0.9, 0.9])  # u v w over the ground, p q r, angles
 _BETA = np.array([0.08, 0.08, 0.08, 0.25, 0.25, 0.25, 0.0, 0.0, 0.0])
 _DRIVEN = (0, 2, 4, 1, 3, 5)  # state each offset drives, in the order of `OFFSETS`
