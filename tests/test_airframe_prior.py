@@ -82,5 +82,5 @@ def test_doubt_is_a_share_of_what_is_known_and_offsets_are_not():
     assert np.allclose(wide[:WIND], 10 * sure[:WIND]) and np.array_equal(wide[WIND:], sure[WIND:])
     derived = [k for k in range(WIND) if k not in OFFSETS]
     assert (wide[derived] >= np.abs(par[derived])).all()
-    _, other = prior(CLASS, at, TRIM + [0.0, 0.3, 0.0, 0.3], CALM)
+    _, other = prior(CLASS, at, TRIM + np.array([0.0, 0.3, 0.0, 0.3]), CALM)
     assert np.array_equal(wide, other)  # a trim that lies elsewhere is no better known

@@ -1,4 +1,4 @@
-"""The wrench and the rigid body against independent calculations: terms by hand, slopes by differences, laws of motion."""
+"""The wrench and the rigid body against independent calculations: by hand, by differences, by laws of motion."""
 
 import numpy as np
 import pytest
@@ -115,7 +115,7 @@ def test_without_a_wrench_a_throw_keeps_its_energy_and_turns_no_more():
         step(spun, np.zeros(4), np.zeros(N_PAR), AT, 0.01, work)
         t += 0.01
         now = Rotation.from_euler("ZYX", spun[8:5:-1]).apply(spun[:3])
-        assert np.allclose(now, earth + [0.0, 0.0, G * t], atol=1e-7)
+        assert np.allclose(now, earth + np.array([0.0, 0.0, G * t]), atol=1e-7)
         assert np.array_equal(spun[3:6], x[3:6])
 
 
