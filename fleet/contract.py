@@ -222,7 +222,7 @@ class Linear(msgspec.Struct, frozen=True, kw_only=True):
     B: Array
     C: Array
     D: Array
-    x_trim: Annotated[Array, Meta(description="state at trim, (n,) [m/s, rad, rad/s]")]
+    x_trim: Annotated[Array, Meta(description="state at trim, u v w through the air, (n,) [m/s, rad, rad/s]")]
     u_trim: Annotated[Array, Meta(description="input at trim, (m,) [-]")]
     dt_s: Annotated[float, Meta(description="sample time [s]")]
 
