@@ -1,5 +1,7 @@
 """One grid for one aircraft's life: laid piece by piece it is what one look at everything would lay."""
 
+from itertools import pairwise
+
 import flights as f
 import numpy as np
 import pytest
@@ -30,7 +32,7 @@ def stream(seed: int, seconds: float = 60.0, *, late: float = 0.0, gaps: int = 0
         laid[name] = t[keep], noisy[keep]
     out, cuts = [], np.concatenate([[T0], T0 + np.cumsum(rng.uniform(0.05, 0.9, int(3 * seconds)))])
     held = {name: rng.uniform(0.0, late, len(t)) if late else np.zeros(len(t)) for name, (t, _) in laid.items()}
-    for a, b in zip(cuts, cuts[1:], strict=False):
+    for a, b in pairwise(cuts):
         kinds = {}
         for name, (t, x) in laid.items():
             now = (t + held[name] >= a) & (t + held[name] < b)
