@@ -53,7 +53,7 @@ class Found:
         information: what the data said of them, start states eliminated, (37, 37)
         weight: inverse residual variances, (9,)
         steps: Gauss-Newton steps that descended
-        cost: of the end point, nan where even the start left its envelope
+        cost: of the end point, nan where even the start left its envelope or its slopes did
     """
 
     par: np.ndarray
@@ -87,7 +87,8 @@ class _Search:
 
     def __init__(self, problem: Problem, par0: np.ndarray, Lambda: np.ndarray) -> None:
         self.problem, self.par0, self.Lambda = problem, par0, Lambda
-        self.prior = np.array([line_start(problem.y[a:b]) for a, b in problem.segments])
+        flown = [problem.y[a:b] for a, b in problem.segments]
+        self.prior, self.spread = np.array([line_start(y) for y in flown]), np.concatenate(flown).std(axis=0)
         self.K = 1.0 / SIGMA**2
         lengths = (problem.segments[:, 1] - problem.segments[:, 0]) // GROUP
         self.bounds = np.concatenate([[0], np.cumsum(lengths)])
@@ -144,9 +145,16 @@ def search(
         steps: most steps that descend
         weight: W of an earlier search of like data; None: from the data, refreshed twice
     """
-    look = _Search(problem, *prior)
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # slopes may explode where the free run does not yet
+            return _descend(_Search(problem, *prior), par, steps, weight)
+    except np.linalg.LinAlgError:
+        return Found(par, np.zeros((N_PAR, N_PAR)), SIGMA**-2, 0, float("nan"))
+
+
+def _descend(look: _Search, par: np.ndarray, steps: int, weight: np.ndarray | None) -> Found:
     cold = weight is None
-    W = 1.0 / np.maximum(0.05 * problem.y.var(axis=0), SIGMA**2) if weight is None else weight
+    W = 1.0 / np.maximum(0.05 * look.spread**2, SIGMA**2) if weight is None else weight
     starts, mu, taken = look.prior.copy(), 1e-3 if cold else 1e-5, 0
     cost = look.fly(par, starts, W, True)
     H = np.zeros((N_PAR, N_PAR))
