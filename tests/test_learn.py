@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from flights import linear_flight
+from coupled_flights import aircraft, known
+from flights import T0, linear_flight
 
 from fleet.contract import Outcome, Verdict
 from twin_worker import choose as choosing
@@ -71,3 +72,37 @@ def test_a_model_that_has_flown_a_route_goes_before_one_that_has_not(choose):
 def test_the_pool_stays_small(choose):
     twin, _ = choose({str(k): float(k) for k in range(20)}, pool=[(str(k), float(k)) for k in range(20)], new="3")
     assert len(twin.pool) == choosing._KEEP and twin.plant == "0"
+
+
+# --- coupled models --------------------------------------------------------------------------------------------------
+
+
+def verified(twin: Twin, t: float, misses: float, monkeypatch) -> Verdict:
+    """Let a coupled model that ends at t join the pool."""
+    monkeypatch.setattr(choosing, "hindcast", lambda *_: misses)
+    window = linear_flight(20.0)
+    window.t[:] += t
+    return choosing.choose(twin, window, 400, known(aircraft(0), T0 + t, T0 + t + 20.0), VERDICT)
+
+
+def test_models_are_flown_now_and_then_not_every_hop(monkeypatch):
+    twin = Twin(1)
+    for t in (0.0, 1.0, 3.9):
+        verified(twin, t, 5.0, monkeypatch)
+    assert len(twin.pool) == 1
+    verified(twin, choosing.FLY_S + 0.1, 5.0, monkeypatch)
+    assert len(twin.pool) == 2
+
+
+def test_one_anchor_a_stretch_holds_what_follows(monkeypatch):
+    twin = Twin(1)
+    for t in np.arange(0.0, 100.0, 5.0):
+        verified(twin, t, 5.0, monkeypatch)
+    ends = np.array([one.t1 for one in twin.anchors])
+    assert len(ends) >= 4 and (np.diff(ends) > 20.0).all()
+    verified(twin, 300.0, np.inf, monkeypatch)
+    assert twin.anchors[-1].t1 == ends[-1]  # what cannot fly the route holds nothing
+
+
+def test_without_a_route_there_is_nothing_to_fly():
+    assert np.isnan(choosing.hindcast(Twin(1), WINDOW, 100, known(aircraft(0))))
