@@ -82,6 +82,18 @@ def test_a_recorded_flight_is_learnt_live(bus, worker, heard):
     assert row.sample_age_s == pytest.approx(0.0)
 
 
+def test_the_paper_s_method_may_be_asked_for(bus, clock, heard):
+    models = told(bus, Model)
+    worker = Worker(bus, range(1, 2), omega=0.0, method="paper")
+    worker.listen()
+    for message in heard:
+        bus.publish(message)
+    worker.turn()
+    assert models and {m.method for m, _ in models} == {"paper"}
+    assert all(m.derivatives is None for m, _ in models)
+    assert any(m.longitudinal is not None for m, _ in models)
+
+
 def test_results_carry_the_claim(bus, worker):
     made = told(bus, Prediction)
     fly(bus, 2)

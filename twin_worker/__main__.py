@@ -21,7 +21,7 @@ def _run(args: argparse.Namespace) -> int:
         from twin_worker.warm import warm_up  # numba is slow to import: say what happens first
         from twin_worker.worker import Worker
 
-        worker = Worker(bus, args.uavs, omega=args.omega)
+        worker = Worker(bus, args.uavs, omega=args.omega, method=args.method)
         worker.listen()
         worker.sentence = "compiling the twin's physics, once"
         bus.publish(worker.state())
@@ -37,7 +37,10 @@ def main(argv: list[str] | None = None) -> int:
     parser = parser_for("twin_worker", "Identify, verify and predict each UAV of a range.", EXAMPLES)
     parser.add_argument("--uavs", type=id_range, default=range(50), metavar="LO-HI", help="ids to hold (0-49)")
     parser.add_argument("--router", default=ROUTER, help=f"Zenoh router ({ROUTER})")
-    parser.add_argument("--method", choices=("paper",), default="paper", help="prediction method (paper)")
+    methods = ("dynamics", "paper")
+    parser.add_argument(
+        "--method", choices=methods, default=methods[0], help="coupled model or two linear axes (dynamics)"
+    )
     parser.add_argument("--omega", type=float, default=0.0, help="least mean fit to verify, %% (0, as in the paper)")
     args = parser.parse_args(argv)
     return guarded("twin_worker", _run, args)

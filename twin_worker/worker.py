@@ -14,6 +14,7 @@ import numpy as np
 from fleet.bus import Bus
 from fleet.codec import Stamp
 from fleet.contract import Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, Status
+from twin_worker.plant import DYNAMICS
 from twin_worker.twin import Twin, advance, fleet_row
 
 _log = logging.getLogger(__name__)
@@ -37,10 +38,10 @@ class Held:
 class Worker:
     """Twins of the UAVs in one range of ids."""
 
-    def __init__(self, bus: Bus, uavs: range, *, omega: float) -> None:
+    def __init__(self, bus: Bus, uavs: range, *, omega: float, method: str = DYNAMICS) -> None:
         self.bus = bus
         self.uavs = uavs
-        self.omega = omega
+        self.omega, self.method = omega, method
         self.sentence = ""
         self._held: dict[int, Held] = {}
         self._lock = threading.Lock()
@@ -64,7 +65,7 @@ class Worker:
             held = self._held.get(message.uav)
             if held is None:
                 epoch = int(time.time() * 1000)
-                held = self._held[message.uav] = Held(Twin(message.uav, omega=self.omega), epoch)
+                held = self._held[message.uav] = Held(Twin(message.uav, omega=self.omega, method=self.method), epoch)
         if isinstance(message, Sample):
             held.arrived = time.monotonic()
         held.shed += len(held.inbox) == _INBOX
