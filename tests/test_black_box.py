@@ -5,9 +5,9 @@ import pytest
 from test_subspace import closed_loop, miss
 
 from twin_worker.black_box import fit_inputs, normal_equations, refine_black_box, squared_errors
-from twin_worker.order import choose
 from twin_worker.disturbance import with_disturbance
 from twin_worker.linear import StateSpace
+from twin_worker.order import choose
 from twin_worker.projection import projection
 from twin_worker.subspace import pbsid
 

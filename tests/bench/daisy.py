@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from tests.bench.daisy_peers import Peer, peers, quietly
-from twin_worker.order import choose
 from twin_worker.linear import StateSpace
+from twin_worker.order import choose
 
 # name: columns to skip, inputs, outputs
 SETS = {
@@ -110,8 +110,14 @@ def methods() -> dict[str, Method]:
 
 
 def daisy(chosen: dict[str, Method], sets: Iterable[str] = SETS, folder: Path | None = None) -> dict:
-    """Give {set: {method: fit}}; a method that fails on a set gets none there."""
-    folder = folder or Path(os.environ["PARAUAV_RECORDINGS"]) / "daisy"
+    """Give {set: {method: fit}}; a method that fails on a set gets none there.
+
+    Args:
+        chosen: some of `methods()`
+        sets: names from `SETS`
+        folder: of the .dat files; not given: `daisy` among the recordings
+    """
+    folder = folder or Path(os.environ.get("PARAUAV_RECORDINGS") or "../shared/recordings") / "daisy"
     rows: dict[str, dict[str, float | None]] = {}
     for name in sets:
         data = halves(folder, name)

@@ -1,0 +1,98 @@
+"""Repeat the paper's experiments: fly pretend aircraft, identify them in two steps, draw the figures."""
+
+import argparse
+import contextlib
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event
+
+from fleet.cli import id_range, stop_on_signal
+
+EXAMPLES = """
+  fleet paper identify --out figures --json paper.json
+  fleet paper identify --uavs 0-1 --for 180 --first pbsid
+  fleet paper identify flight.tlog.xz          on recordings instead of pretend flights
+"""
+_PATIENCE_S = 10.0
+_LOSS = 0.01  # share of frames lost on the way [-]
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument("experiment", choices=("identify",), help="identify: figures 7 and 8, first step and refined")
+    parser.add_argument("file", nargs="*", type=Path, metavar="FILE", help="recordings (none: fly pretend aircraft)")
+    parser.add_argument("--uavs", type=id_range, default=range(12), metavar="A-B", help="aircraft to fly (0-11)")
+    parser.add_argument("--seed", type=int, default=5, help="draws aircraft, missions, weather and noise (5)")
+    parser.add_argument("--for", dest="seconds", type=float, default=300.0, metavar="S", help="flown time (300)")
+    parser.add_argument("--wind", type=float, default=3.0, metavar="M/S", help="mean wind at 100 m (3)")
+    parser.add_argument("--turbulence", default="1", metavar="LEVEL", help="MIL-F-8785C: none, light … or 0..7 (1)")
+    parser.add_argument(
+        "--first", choices=("projection", "pbsid", "both"), default="both", help="first step: the paper's, PBSID (both)"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="draw the figures into DIR")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers to FILE")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly where no recording is named, then start the experiment; its exit code is ours.
+
+    Raises:
+        ValueError: when an option makes no sense; the sentence says which.
+    """
+    if not 70 <= args.seconds <= 3600:
+        raise ValueError(f"for: found {args.seconds:.0f} s, expected 70..3600 (20 + 40 + 8 s at least); change --for")
+    stop = stop_on_signal()
+    with _recordings(args, stop) as files:
+        return 0 if stop.is_set() else _identify(args, files, stop)
+
+
+@contextlib.contextmanager
+def _recordings(args: argparse.Namespace, stop: Event) -> Iterator[list[Path]]:
+    """Give the recordings named, or fly some into a folder that is gone afterwards."""
+    if args.file:
+        yield args.file
+        return
+    with tempfile.TemporaryDirectory(prefix="fleet-paper-") as folder:
+        path = Path(folder) / "flight.tlog"
+        _fly(args, path, stop)
+        yield [path]
+
+
+def _fly(args: argparse.Namespace, path: Path, stop: Event) -> None:
+    """Fly as fast as possible into a recording, under a progress bar."""
+    from rich.progress import Progress
+
+    from fleet.pretend import drive  # loads JSBSim and the compiler: not for --help
+    from fleet.pretend.uav import PretendUav
+    from fleet.pretend.weather import turbulence_level
+
+    level = turbulence_level(args.turbulence)
+    uavs = [PretendUav(i, args.seed, wind=args.wind, turbulence=level) for i in args.uavs]
+    with Progress(transient=True) as bar:
+        task = bar.add_task(f"flying {len(uavs)} aircraft", total=args.seconds)
+        drive.to_tlog(
+            path,
+            uavs,
+            seconds=args.seconds,
+            loss=_LOSS,
+            seed=args.seed,
+            progress=lambda t: bar.update(task, completed=t),
+            stop=stop,
+        )
+
+
+def _identify(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
+    command = [sys.executable, "-m", "twin_worker.paper", args.experiment, f"--first={args.first}"]
+    command += [f"--{name}={value}" for name, value in (("out", args.out), ("json", args.json)) if value]
+    child = subprocess.Popen([*command, *map(str, files)])
+    try:
+        while child.poll() is None and not stop.wait(0.2):
+            pass
+    finally:
+        if child.poll() is None:
+            child.terminate()
+    code = child.wait(_PATIENCE_S)
+    return code if code >= 0 else 128 - code
