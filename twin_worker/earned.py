@@ -50,6 +50,10 @@ class Earned:
             self.H[knot] += weight * np.einsum("aknj,bknj->jab", z, z) / power[:, None, None]
             self.g[knot] += weight * np.einsum("aknj,knj->ja", z, flown) / power[:, None]
 
+    def copy(self) -> "Earned":
+        """Give one that may learn apart."""
+        return Earned(self.H.copy(), self.g.copy())
+
     def shares(self) -> np.ndarray:
         """Give kappa and hold at each knot, (knots, 9, 2), each within 0..1, as is their sum."""
         ridge = _WEIGHT * np.eye(2)

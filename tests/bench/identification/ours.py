@@ -23,7 +23,7 @@ from .gusty import WEATHER
 _LEAD = 250  # rows that settle lags and filter
 _SETTLE = 50  # rows that settle the filter before runs are judged
 _AHEAD_S, _EVERY_S = 40.0, 2.0  # runs judged: how long, how often
-_IN_SAMPLE = 0.5  # worth of runs over data the model has seen, where there are no others
+_IN_SAMPLE = 0.5  # worth of runs over data the model has seen
 _WIND_S = 0.2  # between rows the wind filter takes [s]
 
 
@@ -52,7 +52,7 @@ class Seen:
         run = self.runs(flight.x, flight.u, begins, k + 1)[:, k:]
         return self.earned.forecast(run, flight.x[begins], self.mean, self.eye.dt * np.array([k]))[:, 0]
 
-    def look_back(self, flight: Flight, weight: float) -> None:
+    def look_back(self, flight: Flight, weight: float, earned: Earned | None = None) -> None:
         """Learn from a stretch what the runs are worth."""
         length = min(round(_AHEAD_S / flight.dt) + 1, len(flight))
         begins = np.arange(_SETTLE, len(flight) - round(1 / flight.dt), round(_EVERY_S / flight.dt))
@@ -60,7 +60,7 @@ class Seen:
         rows = begins[:, None] + np.arange(length)
         y = np.where(flight.ok[:, None], flight.x, np.nan)[np.minimum(rows, len(flight) - 1)]
         y[rows >= len(flight)] = np.nan
-        self.earned.learn(runs, y, self.mean, flight.dt, weight)
+        (earned or self.earned).learn(runs, y, self.mean, flight.dt, weight)
 
 
 class Ours:
@@ -89,10 +89,9 @@ class Ours:
         model = identify(window, wind, airframe(known), self._seen.eye.model if self._seen else None)
         stretch = known.part(start, len(known))
         if self._seen:
-            self._seen.look_back(stretch.part(len(stretch) - (len(known) - self._taught), len(stretch)), 1.0)
-        seen = Seen(Observer(model, known.dt), self._earned, stretch.x[stretch.ok].mean(axis=0))
-        if not self._seen:
-            seen.look_back(stretch, _IN_SAMPLE)
+            self._seen.look_back(known.part(self._taught, len(known)), 1.0, self._earned)
+        seen = Seen(Observer(model, known.dt), self._earned.copy(), stretch.x[stretch.ok].mean(axis=0))
+        seen.look_back(stretch, _IN_SAMPLE)
         self._seen, self._taught = seen, len(known)
         return seen
 
