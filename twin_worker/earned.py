@@ -46,7 +46,7 @@ class Earned:
             good = np.isfinite(run) & np.isfinite(flown) & np.isfinite(held)
             z = np.where(good, np.stack([run, held]), 0.0)
             flown = np.where(good, flown, 0.0)
-            power = np.maximum(np.einsum("knj,knj->j", flown, flown), 1e-9)
+            power = np.maximum(np.einsum("knj,knj->j", flown, flown), np.einsum("knj,knj->j", z[0], z[0])) + 1e-9
             self.H[knot] += weight * np.einsum("aknj,bknj->jab", z, z) / power[:, None, None]
             self.g[knot] += weight * np.einsum("aknj,knj->ja", z, flown) / power[:, None]
 

@@ -16,7 +16,7 @@ from fleet.physics.wrench import N_PAR
 from twin_worker.sweep import GROUP, N_COLUMN, sweep
 
 SIGMA = np.array([0.08, 0.08, 0.08, 0.005, 0.005, 0.005, 0.004, 0.004, 0.008])  # least residual of each state
-SEGMENT_S = 8.0  # free run [s]
+SEGMENT_S = 10.0  # free run [s]
 LEAST_S = 2.0  # shorter pieces between gaps are left out [s]
 LINE = 6  # samples of the line a segment's start state is read off [-]
 _DONE = 1e-3  # relative descent that ends the search [-]
