@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 
@@ -116,6 +117,17 @@ def test_too_short_a_recording_is_said(tmp_path, capfd):
     to_tlog(path, [PretendUav(0, 5)], seconds=30, loss=0.0, seed=5)
     assert paper.main(["identify", str(path)]) == 2
     assert "no 48 s of whole data; fly longer" in capfd.readouterr().err
+
+
+def test_ctrl_c_ends_it_cleanly(recorded, tmp_path):
+    numbers = tmp_path / "paper.json"
+    command = [sys.executable, "-m", "fleet.cli", "paper", "identify", str(recorded), "--json", str(numbers)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert "reading" in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        rest = process.stderr.read()
+    assert process.returncode == 0 and "Traceback" not in rest and "stopped" in rest
+    assert not numbers.exists()
 
 
 def test_the_bench_runs_our_method_on_daisy(recordings, tmp_path):

@@ -14,13 +14,12 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 import numpy as np
 import scipy.stats
 
-from fleet.cli import guarded, parser_for, stop_on_signal
+from fleet.cli import guarded, parser_for
 from twin_worker.experiment import FIRST, NAMES, Experiment, Plan, experiments
 from twin_worker.flown import MODES, flown
 from twin_worker.paper_figures import draw
@@ -86,8 +85,10 @@ def text(first: str, rows: dict[str, dict[str, Any]]) -> str:
 
 
 def _run(args: argparse.Namespace) -> int:
-    stop = stop_on_signal()
-    flights = [flight for path in args.files for flight in flown(path)]
+    flights = []
+    for path in args.files:
+        print(f"paper: reading {path.name}", file=sys.stderr, flush=True)
+        flights += flown(path)
     if not flights:
         raise ValueError("paper: found no flight with attitude, velocity, position and servo rows; name another FILE")
     plan = Plan(args.seen, args.unseen, args.every)
@@ -96,10 +97,7 @@ def _run(args: argparse.Namespace) -> int:
         raise ValueError(f"paper: found no {plan.seen_s + plan.unseen_s:.0f} s of whole data; fly longer")
     result: dict[str, Any] = {"plan": asdict(plan), "first_step": {}}
     for first in FIRST if args.first == "both" else (args.first,):
-        done = _carried_out(experiments(flights, first, plan), total, first, stop)
-        if stop.is_set():
-            print("paper: stopped before the end; nothing is written", file=sys.stderr)
-            return 0
+        done = _carried_out(experiments(flights, first, plan), total, first)
         result["first_step"][first] = rows = summary(done)
         print(text(first, rows), flush=True)
         if args.out:
@@ -109,7 +107,7 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _carried_out(tried: Iterable[Experiment | str], total: int, first: str, stop: Event) -> list[Experiment]:
+def _carried_out(tried: Iterable[Experiment | str], total: int, first: str) -> list[Experiment]:
     """Collect experiments under a progress line; what could not be done is said once for each reason."""
     done: list[Experiment] = []
     refused: Counter[str] = Counter()
@@ -120,8 +118,6 @@ def _carried_out(tried: Iterable[Experiment | str], total: int, first: str, stop
             done.append(one)
         if (k + 1) % _SAY_EVERY == 0:
             print(f"paper: {first}, {k + 1} of {total} experiments", file=sys.stderr, flush=True)
-        if stop.is_set():
-            break
     for sentence, count in refused.items():
         print(f"paper: {count} not done, {sentence}", file=sys.stderr)
     return done

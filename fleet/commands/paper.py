@@ -95,4 +95,7 @@ def _identify(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
         if child.poll() is None:
             child.terminate()
     code = child.wait(_PATIENCE_S)
+    if stop.is_set():
+        print("paper: stopped; what was not finished is not written", file=sys.stderr)
+        return 0
     return code if code >= 0 else 128 - code
