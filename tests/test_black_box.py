@@ -66,22 +66,28 @@ def test_in_a_closed_loop_the_projection_is_biased_and_pbsid_is_not():
 def test_the_data_choose_the_order(order):
     truth = known(order)
     y, u = recorded(truth, 700, 0.1)
-    model, recipe = choose(y, u, orders=range(1, 7))
+    found = choose(y, u, orders=range(1, 7))
+    model, recipe = found.model, found.recipe
     assert order <= recipe.order <= order + 1 and not recipe.feedthrough
     assert missed(model, truth) < 0.05
     assert not model.D.any()
+    fresh = np.random.default_rng(7).standard_normal((300, 2))
+    runs = [member.run(fresh, np.zeros(member.order)) for member in found.committee]
+    wanted = truth.run(fresh)
+    assert np.linalg.norm(np.median(runs, axis=0) - wanted) < 0.05 * np.linalg.norm(wanted)
 
 
 def test_feedthrough_is_found_where_there_is_one_and_it_may_be_tried():
     plant = known(2)  # whose input acts a sample sooner
     truth = StateSpace.of(plant.A, plant.A @ plant.B, plant.C, D=plant.C @ plant.B)
     y, u = recorded(truth, 700, 0.05)
-    model, recipe = choose(y, u, orders=(1, 2, 3), feedthrough=True)
+    found = choose(y, u, orders=(1, 2, 3), feedthrough=True)
+    model, recipe = found.model, found.recipe
     assert recipe.feedthrough and np.abs(model.D - truth.D).max() < 0.05 * np.abs(truth.D).max()
     assert missed(model, truth) < 0.05
     fitted = np.linalg.norm(y - model.run(u)) / np.linalg.norm(y)
     assert fitted < 0.06  # x0 too
-    assert not choose(y, u, orders=(1, 2, 3))[0].D.any()
+    assert not choose(y, u, orders=(1, 2, 3)).model.D.any()
 
 
 def test_similarity_keeps_what_the_model_does():

@@ -83,12 +83,12 @@ def test_the_paired_gain_is_of_pairs():
     def one(first: float, refined: float) -> Experiment:
         fit = np.array([np.full(9, first), np.full(9, refined)])
         runs = np.zeros((3, 9))
-        return Experiment(1, 0.0, "turn", np.zeros(3), runs, runs, runs, fit, fit, Outcome.VERIFIED, "good")
+        return Experiment(1, 0.0, "turn", "turn", np.zeros(3), runs, runs, runs, fit, fit, Outcome.VERIFIED, "good")
 
     rows = paper.summary([one(-80, -70), one(80, 90), one(-60, 70)])
     assert rows["turn"]["paired_gain"] == 10.0 and rows["turn"]["share_better"] == 1.0
     assert rows["turn"]["fit"] == {"first": -60.0, "refined": 70.0}
-    assert list(rows) == ["turn"] and "1.0" not in rows["turn"]["sentence"]
+    assert list(rows) == ["turn"] and rows["turn"]["sentence"] == "good"
 
 
 def test_what_cannot_be_identified_is_said_and_not_done(recorded):

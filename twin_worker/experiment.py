@@ -50,17 +50,18 @@ class Experiment:
 
     Attributes:
         uav, t: whose, and when the unseen stretch begins [s since 1970]
-        mode: of the unseen stretch
+        mode, mode_seen: of the unseen stretch, of the one before it
         seconds: since the start of the unseen stretch, (n,) [s]
         actual, first, refined: states in the order of `NAMES`, (n, 9) [m/s, rad/s, rad]
         fit: both steps over the unseen stretch, (2, 9) [%]
-        fit_seen: both steps over the last unseen-long stretch identified on, (2, 9) [%]
+        fit_seen: both steps over that stretch before, the last they were identified on, (2, 9) [%]
         outcome, sentence: verdict on the refined model
     """
 
     uav: int
     t: float
     mode: str
+    mode_seen: str
     seconds: np.ndarray
     actual: np.ndarray
     first: np.ndarray
@@ -113,6 +114,7 @@ def experiment(flight: Flown, start: int, first: str, plan: Plan) -> Experiment:
         uav=flight.uav,
         t=float(window.t[known]),
         mode=mode_of(window.part(known, known + length)),
+        mode_seen=mode_of(window.part(known - length, known)),
         seconds=window.t[known : known + length] - window.t[known],
         actual=actual,
         first=runs[0],

@@ -1,9 +1,10 @@
 """Which order, and is there more than A, B and C? Tried on held-out thirds of the data, never on anything else.
 
 Every order is started by subspace identification with several horizons, its inputs are fitted to the free run, the
-best start is refined by output error; with and without a constant push, with and without feedthrough. What runs best
-over the thirds it has not seen is kept; of the best dozen, refined on all data, the one nearest to their median run is
-the choice: one lucky fold does not decide.
+best start is refined by output error; with and without a constant push, with and without feedthrough. The score that
+turn out best over the thirds they have not seen are made again from all data: a committee, whose median run is steadier
+than any one of them where data are few and noisy. Where one model is wanted, it is the smallest member that is about as
+near to that run as any: one lucky fold does not decide.
 """
 
 from collections.abc import Iterable, Iterator
@@ -17,7 +18,8 @@ from twin_worker.subspace import candidates, instructive
 
 PASTS = (6, 10, 15, 25)  # horizons tried [samples]
 _THIRDS = 3
-_DOZEN = 12
+_SCORE = 20  # members of the committee
+_AS_NEAR = 2.0  # squared distance, as a multiple of the nearest member's [-]
 _LEAST = 30  # samples for the state at the start of a held-out third
 
 
@@ -38,10 +40,23 @@ class Recipe:
     refined: bool
 
 
-def choose(
-    y: np.ndarray, u: np.ndarray, *, orders: Iterable[int] = range(1, 11), feedthrough: bool = False
-) -> tuple[StateSpace, Recipe]:
-    """Identify a model whose order the data choose.
+@dataclass(frozen=True)
+class Choice:
+    """What was chosen.
+
+    Attributes:
+        model: the smallest member about as near to the committee's median run as any
+        recipe: how that was made
+        committee: the models that did best on data they had not seen, refitted to all
+    """
+
+    model: StateSpace
+    recipe: Recipe
+    committee: tuple[StateSpace, ...]
+
+
+def choose(y: np.ndarray, u: np.ndarray, *, orders: Iterable[int] = range(1, 11), feedthrough: bool = False) -> Choice:
+    """Identify models whose order the data choose.
 
     Args:
         y: outputs, zero mean and unit scale, (N, l)
@@ -54,6 +69,19 @@ def choose(
     n, orders = len(y), tuple(orders)
     instructive(y, u, np.ones(n, bool))
     through = (False, True) if feedthrough else (False,)
+    ranked = _ranked(y, u, orders, through)
+    best = set(ranked[:_SCORE])
+    whole = {r: m for r, m in _models(y, u, np.ones(n, bool), orders, through) if r in best}
+    runs = np.array([model.run(u) for model in whole.values()])
+    far = ((runs - np.median(runs, axis=0)) ** 2).sum(axis=(1, 2))
+    near = [recipe for recipe, d in zip(whole, far, strict=True) if d <= _AS_NEAR * far.min()]
+    recipe = min(near, key=lambda r: (r.order, ranked.index(r)))
+    return Choice(whole[recipe], recipe, tuple(whole.values()))
+
+
+def _ranked(y: np.ndarray, u: np.ndarray, orders: tuple[int, ...], through: tuple[bool, ...]) -> list[Recipe]:
+    """Put the recipes in the order of how well they run over thirds they have not seen, the best first."""
+    n = len(y)
     fits: dict[Recipe, list[float]] = {}
     for fold in range(_THIRDS):
         held = slice(fold * n // _THIRDS, (fold + 1) * n // _THIRDS)
@@ -61,15 +89,10 @@ def choose(
         ok[held] = False
         for recipe, model in _models(y, u, ok, orders, through):
             fits.setdefault(recipe, []).append(_fit(model, y[held], u[held]))
-    ranked = sorted((r for r in fits if len(fits[r]) == _THIRDS), key=lambda r: -float(np.mean(fits[r])))
-    if not ranked:
+    whole = [recipe for recipe, each in fits.items() if len(each) == _THIRDS]
+    if not whole:
         raise ValueError(f"order: found {n} samples, too few for order {min(orders)}; record for longer")
-    best = set(ranked[:_DOZEN])
-    whole = {r: m for r, m in _models(y, u, np.ones(n, bool), orders, through) if r in best}
-    runs = np.array([model.run(u) for model in whole.values()])
-    far = ((runs - np.median(runs, axis=0)) ** 2).sum(axis=(1, 2))
-    recipe = list(whole)[int(np.argmin(far))]
-    return whole[recipe], recipe
+    return sorted(whole, key=lambda recipe: -float(np.mean(fits[recipe])))
 
 
 def _models(

@@ -21,7 +21,7 @@ import scipy.stats
 
 from fleet.cli import guarded, parser_for
 from twin_worker.experiment import FIRST, NAMES, Experiment, Plan, experiments
-from twin_worker.flown import MODES, flown
+from twin_worker.flown import MODES, Flown, flown
 from twin_worker.paper_figures import draw
 
 _SAY_EVERY = 20  # experiments between two words of progress
@@ -42,19 +42,19 @@ def summary(done: list[Experiment]) -> dict[str, dict[str, Any]]:
     for mode in MODES:
         its = [one for one in done if one.mode == mode]
         if its:
-            rows[mode] = _row(its)
+            rows[mode] = _row(its, [one.fit_seen for one in done if one.mode_seen == mode])
     return rows
 
 
-def _row(its: list[Experiment]) -> dict[str, Any]:
-    fit, seen = np.array([one.fit for one in its]), np.array([one.fit_seen for one in its])
+def _row(its: list[Experiment], seen: list[np.ndarray]) -> dict[str, Any]:
+    fit = np.array([one.fit for one in its])
     gain = np.diff(fit.mean(axis=2), axis=1)[:, 0]
     verdicts = Counter(str(one.outcome) for one in its)
     usual = verdicts.most_common(1)[0][0]
     return {
         "n": len(its),
         "fit": _steps(np.median(fit.mean(axis=2), axis=0)),
-        "fit_seen": _steps(np.median(seen.mean(axis=2), axis=0)),
+        "fit_seen": _steps(np.median(np.mean(seen, axis=2), axis=0)) if seen else None,
         "paired_gain": round(float(np.median(gain)), 1),
         "share_better": round(float((gain > 0).mean()), 3),
         "p": float(scipy.stats.wilcoxon(gain, alternative="greater").pvalue) if gain.any() else 1.0,
@@ -76,16 +76,19 @@ def text(first: str, rows: dict[str, dict[str, Any]]) -> str:
         step = row["fit"]
         lines.append(
             f"  {mode:8} n {row['n']:4}   first {step['first']:6.1f}   refined {step['refined']:6.1f}   "
-            f"paired {row['paired_gain']:+5.1f}, better in {row['share_better']:.0%} (p {row['p']:.1g})   "
-            f"seen: {row['fit_seen']['first']:.0f}, {row['fit_seen']['refined']:.0f}"
+            f"paired {row['paired_gain']:+5.1f}, better in {row['share_better']:.0%} (p {row['p']:.1g})"
         )
+        if seen := row["fit_seen"]:
+            lines.append(
+                f"           over data identified on: first {seen['first']:.1f}, refined {seen['refined']:.1f}"
+            )
         told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in sorted(row["verdicts"].items()))
         lines.append(f"           {told}; e.g. {row['sentence']}")
     return "\n".join(lines)
 
 
 def _run(args: argparse.Namespace) -> int:
-    flights = []
+    flights: list[Flown] = []
     for path in args.files:
         print(f"paper: reading {path.name}", file=sys.stderr, flush=True)
         flights += flown(path)

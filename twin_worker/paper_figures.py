@@ -27,11 +27,13 @@ def draw(folder: Path, first: str, done: "Sequence[Experiment]", names: Sequence
         names: of their columns
     """
     folder.mkdir(parents=True, exist_ok=True)
-    its = {mode: [one for one in done if one.mode == mode] for mode in MODES}
-    its = {mode: some for mode, some in its.items() if some}
+    its = {mode: some for mode in MODES if (some := [one for one in done if one.mode == mode])}
+    fits = {mode: np.array([one.fit for one in some]) for mode, some in its.items()}
+    before = {mode: [one.fit_seen for one in done if one.mode_seen == mode] for mode in MODES}
+    seen = {mode: np.array(some) for mode, some in before.items() if some}
     figures = {f"fig7_{first}_{mode}.png": _runs(_usual(some), names, first) for mode, some in its.items()}
-    figures[f"fig8_{first}.png"] = _boxes(its, names, f"{first} and refined, over unseen data")
-    figures[f"fig8_{first}_seen.png"] = _boxes(its, names, f"{first} and refined, over data identified on", seen=True)
+    figures[f"fig8_{first}.png"] = _boxes(fits, names, f"{first} and refined, over unseen data")
+    figures[f"fig8_{first}_seen.png"] = _boxes(seen, names, f"{first} and refined, over data identified on")
     for name, figure in figures.items():
         figure.savefig(folder / name, dpi=130)
     return [folder / name for name in figures]
@@ -61,13 +63,12 @@ def _runs(one: "Experiment", names: Sequence[str], first: str) -> Figure:
     return figure
 
 
-def _boxes(its: "dict[str, list[Experiment]]", names: Sequence[str], title: str, *, seen: bool = False) -> Figure:
-    """Draw the box plots of fit per state, a panel for every mode."""
+def _boxes(fits: dict[str, np.ndarray], names: Sequence[str], title: str) -> Figure:
+    """Draw the box plots of fit per state, a panel for every mode: fits (N, 2, 9) [%]."""
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     panels = figure.subplots(2, 2, sharey=True, squeeze=False).flat
     places = np.arange(len(names))
-    for ax, (mode, some) in zip(panels, its.items(), strict=False):
-        fit = np.array([one.fit_seen if seen else one.fit for one in some])
+    for ax, (mode, fit) in zip(panels, fits.items(), strict=False):
         for i, (_, colour, label) in enumerate(_STEPS):
             boxes = ax.boxplot(
                 fit[:, i], positions=places + 0.36 * (i - 0.5), widths=0.3, showfliers=False, patch_artist=True
@@ -79,7 +80,7 @@ def _boxes(its: "dict[str, list[Experiment]]", names: Sequence[str], title: str,
             ax.plot([], [], color=colour, lw=5, alpha=0.5, label=label)
         ax.axhline(0, color=MUTED, lw=0.6)
         ax.set_xticks(places, names)
-        _house(ax, f"{mode}, n {len(some)}")
+        _house(ax, f"{mode}, n {len(fit)}")
     for ax in list(panels):
         ax.set_visible(False)
     figure.axes[0].legend(frameon=False, fontsize=8)
