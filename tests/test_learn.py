@@ -94,15 +94,5 @@ def test_models_are_flown_now_and_then_not_every_hop(monkeypatch):
     assert len(twin.pool) == 2
 
 
-def test_one_anchor_a_stretch_holds_what_follows(monkeypatch):
-    twin = Twin(1)
-    for t in np.arange(0.0, 100.0, 5.0):
-        verified(twin, t, 5.0, monkeypatch)
-    ends = np.array([one.t1 for one in twin.anchors])
-    assert len(ends) >= 4 and (np.diff(ends) > 20.0).all()
-    verified(twin, 300.0, np.inf, monkeypatch)
-    assert twin.anchors[-1].t1 == ends[-1]  # what cannot fly the route holds nothing
-
-
 def test_without_a_route_there_is_nothing_to_fly():
     assert np.isnan(choosing.hindcast(Twin(1), WINDOW, 100, known(aircraft(0))))

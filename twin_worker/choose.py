@@ -5,7 +5,6 @@ import numpy as np
 
 from fleet.contract import Outcome, Verdict
 from fleet.window import Window
-from twin_worker.coupled import Coupled
 from twin_worker.memory import Believed, Twin
 from twin_worker.plant import Plant
 from twin_worker.predict import fly_ahead
@@ -54,8 +53,6 @@ def _join(twin: Twin, window: Window, start: int, plant: Plant, verdict: Verdict
         sentence = f"{verdict.sentence}; but on the route the twin leaves its envelope; trying again"
         return msgspec.structs.replace(verdict, outcome=Outcome.DIVERGED, sentence=sentence)
     twin.pool.append(Believed(plant, verdict, float(window.t[-1]), _NEW * miss))
-    if isinstance(plant, Coupled) and (not twin.anchors or plant.t1 - twin.anchors[-1].t1 > _FLIGHT_S):
-        twin.anchors.append(plant)
     return verdict
 
 

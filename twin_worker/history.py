@@ -16,7 +16,7 @@ class History:
     def __init__(self, keep_s: float = 160.0) -> None:
         self.keep_s = keep_s
         self.newest = -np.inf
-        self._chunks: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in COLUMNS}
+        self._chunks: dict[str, list[tuple[np.ndarray, np.ndarray, float]]] = {name: [] for name in COLUMNS}
 
     def add(self, sample: Sample) -> int:
         """Take one message; give how many of its kinds did not fit the contract."""
@@ -38,8 +38,9 @@ class History:
             if not timed.all():
                 bad, t, x = bad + 1, t[timed], x[timed]
             if len(t):
-                self._chunks[name].append((t, x))
-                self.newest = max(self.newest, float(t.max()))
+                newest = float(t.max())
+                self._chunks[name].append((t, x, newest))
+                self.newest = max(self.newest, newest)
         self._join()
         return bad
 
@@ -47,14 +48,15 @@ class History:
         """Join many small chunks to one, and forget what is too old."""
         for chunks in self._chunks.values():
             if len(chunks) > _CHUNKS:
-                t, x = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+                t, x = (np.concatenate([chunk[part] for chunk in chunks]) for part in (0, 1))
                 young = t >= self.newest - self.keep_s
+                newest = max(chunk[2] for chunk in chunks)
                 chunks.clear()
-                chunks.append((t[young], x[young]))
+                chunks.append((t[young], x[young], newest))
 
     def rows(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
         """Give times (n,) and values (n, k) of one kind from `since` on, rising in time, believable, once each."""
-        found = [chunk for chunk in self._chunks[name] if len(chunk[0]) and chunk[0].max() >= since]
+        found = [chunk for chunk in self._chunks[name] if len(chunk[0]) and chunk[2] >= since]
         if not found:
             return np.empty(0), np.empty((0, len(COLUMNS[name])))
         t = np.concatenate([chunk[0] for chunk in found])

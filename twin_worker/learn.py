@@ -16,7 +16,7 @@ from twin_worker.memory import Twin
 from twin_worker.plant import DYNAMICS, Plant
 from twin_worker.preprocess import DT
 from twin_worker.publish import model_message
-from twin_worker.verify import verify
+from twin_worker.verify import told, verify
 
 LEAST_S = 30.0  # shortest stretch worth identifying [s]
 SLOW = 6.0  # air-relative forward speed below which nothing flies on its wings [m/s]
@@ -49,6 +49,8 @@ def learn(twin: Twin) -> list[Message]:
     verdict = verify(plant, window, known, twin.omega, twin.plant if twin.method == DYNAMICS else None)
     verdict = msgspec.structs.replace(verdict, sentence=f"{twin.name}: {verdict.sentence}", tries=twin.tries)
     verdict = choose(twin, window, known, plant, verdict)
+    if verdict.outcome is Outcome.VERIFIED and isinstance(plant, coupled.Coupled):
+        twin.last = plant
     news = verdict.outcome is not twin.verdict.outcome or window.t[-1] - twin.told_t >= _TELL_S
     twin.verdict = verdict
     if verdict.outcome in (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST):
@@ -56,6 +58,7 @@ def learn(twin: Twin) -> list[Message]:
     if not news:
         return []
     twin.told_t = float(window.t[-1])
+    twin.verdict = told(verdict, plant, window, known)
     twin.model = model_message(twin, window)
     return [twin.model]
 
@@ -95,9 +98,8 @@ def _identify(twin: Twin, known: Window) -> Plant:
     twin.tries += 1
     known = known.part(int(len(known) * (1 - _SHARE[attempt])), len(known))
     if twin.method == DYNAMICS:
-        last = next((one for one in reversed(twin.anchors) if one.t1 <= known.t[0]), None)
         near = twin.near if attempt == 0 and twin.near and twin.near.t1 > known.t[0] else None
-        twin.near = coupled.identify(known, twin.wind.wind, twin.airframe, last, near)
+        twin.near = coupled.identify(known, twin.wind.wind, twin.airframe, twin.last, near)
         return twin.near
     before = twin.plant if isinstance(twin.plant, tuple) else (None, None)
     lon, lat = (

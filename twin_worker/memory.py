@@ -29,7 +29,6 @@ def _unheard() -> Verdict:
     return Verdict(outcome=Outcome.STARVED, sentence="no samples yet")
 
 
-_ANCHORS = 8  # believed models kept to hold the parameters of later stretches
 _MODES = 64  # changes of mode remembered
 _NEWS = 0.3  # weight of the newest flight in a model's miss [-]
 
@@ -82,7 +81,7 @@ class Twin:
     servos: ServoMap = field(default_factory=lambda: servo_map({}))
     plant: Plant | None = None  # the model in force
     near: Coupled | None = None  # newest coupled model, believed or not: the next search begins there
-    anchors: deque[Coupled] = field(default_factory=lambda: deque(maxlen=_ANCHORS))  # believed, one a stretch
+    last: Coupled | None = None  # newest coupled model believed: it holds the parameters of the next
     verdict: Verdict = field(default_factory=_unheard)
     pool: list[Believed] = field(default_factory=list)
     in_force: Verdict | None = None  # the verdict `plant` was believed on
@@ -185,8 +184,7 @@ def _hear_status(twin: Twin, status: Status) -> None:
         twin.grid.clear()
         twin.wind.t = twin.wind_t = twin.identify_t = twin.score_t = -np.inf  # the new time may lie before
         twin.flown_t = twin.told_t = -np.inf
-        twin.near = None
-        twin.anchors.clear()
+        twin.near = twin.last = None
         twin.data_t = twin.turned_t = -np.inf
         _event(twin, status.t)
     elif status.mode != before.mode:

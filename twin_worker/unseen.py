@@ -5,6 +5,7 @@ import numpy as np
 from fleet.physics.actuators import TAU, lagged
 from fleet.window import STATES, Window
 from twin_worker.coupled import Coupled, states
+from twin_worker.observer import Observer
 from twin_worker.output_error import LINE
 from twin_worker.plant import Plant
 from twin_worker.refine import free_run
@@ -38,6 +39,17 @@ class Unseen:
             starts = self._fresh(begins)
             return self._plant.fly_each(starts, begins, length, self._delta, self.dt)[self._start :]
         return self._linear_runs(begins, length)
+
+    def one_step(self) -> np.ndarray:
+        """Predict each row from those before it; nan where they are not measured, or by a fresh start, (n, 9)."""
+        if isinstance(self._plant, Coupled):
+            eye, begins = Observer(self._plant, self.dt), np.arange(self._start - 1, len(self._window) - 1)
+            out = eye.fly(eye.track(self._y, self._delta)[begins], begins, 2, self._delta)[:, 1]
+        else:
+            out = self.runs(2)
+            out[::2] = np.nan
+        broken = self._broken[self._start + 1 :] - self._broken[self._start - 1 : -2]
+        return np.where(broken[:, None] > 0, np.nan, out)
 
     def _fresh(self, begins: np.ndarray) -> np.ndarray:
         """Read the states at rows off a line through the rows up to each; off that row alone where they are broken."""

@@ -3,6 +3,8 @@
 fit = 100 (1 - ||y - y_hat|| / ||y - mean(y)||).  Source: Huang 2021, eq. 22.
 """
 
+import msgspec
+import numba as nb
 import numpy as np
 
 from fleet.contract import Outcome, Verdict
@@ -26,14 +28,28 @@ def hold(y: np.ndarray, ok: np.ndarray, length: int) -> np.ndarray:
     return np.where(ok[:, None] & ok[starts][:, None], y[starts], np.nan)
 
 
+@nb.njit(cache=True)
 def fit_percent(y: np.ndarray, y_hat: np.ndarray) -> np.ndarray:
     """Give the fit of each column over the rows both have, (n,) [%]; -100 where nothing is left or it diverged."""
-    good = np.isfinite(y_hat).all(axis=1)
+    rows, columns = y.shape
+    good = np.ones(rows, np.bool_)
+    for i in range(rows):
+        for j in range(columns):
+            good[i] &= np.isfinite(y_hat[i, j])
+    fit = np.full(columns, -100.0)
     if good.sum() < 2:
-        return np.full(y.shape[1], -100.0)
-    spread = np.linalg.norm(y[good] - y[good].mean(axis=0), axis=0)
-    nrmse = np.linalg.norm(y[good] - y_hat[good], axis=0) / np.maximum(spread, 1e-9)
-    return np.clip(100.0 * (1.0 - nrmse), -100.0, 100.0)
+        return fit
+    for j in range(columns):
+        mean, spread, error = 0.0, 0.0, 0.0
+        for i in range(rows):
+            mean += y[i, j] if good[i] else 0.0
+        mean /= good.sum()
+        for i in range(rows):
+            if good[i]:
+                spread += (y[i, j] - mean) ** 2
+                error += (y[i, j] - y_hat[i, j]) ** 2
+        fit[j] = min(max(100.0 * (1.0 - np.sqrt(error) / max(np.sqrt(spread), 1e-9)), -100.0), 100.0)
+    return fit
 
 
 def fits_at(unseen: Unseen, horizon_s: float) -> tuple[dict[str, float], dict[str, float]]:
@@ -78,13 +94,10 @@ def verify(plant: Plant, window: Window, start: int, omega: float = OMEGA, last:
     if not allowed:
         raise ValueError(f"verify: found {held.seconds:.1f} s held out, needs {HORIZONS_S[-1]:.0f} s; wait for more")
     unseen = Unseen(plant, window, start)
-    found = {h: fits_at(unseen, h) for h in TOLD_S if h <= allowed[0]}
     for horizon in allowed:
-        if horizon not in found:
-            found[horizon] = fits_at(unseen, horizon)
-        if not _missing(*found[horizon], omega):
+        fit, still = fits_at(unseen, horizon)
+        if not _missing(fit, still, omega):
             break
-    fit, still = found[horizon]
     outcome, said = _judge(fit, _missing(fit, still, omega), held)
     if last is not None:
         before = mean(fits_at(Unseen(last, window, start), horizon)[0])
@@ -94,17 +107,24 @@ def verify(plant: Plant, window: Window, start: int, omega: float = OMEGA, last:
             outcome, said = Outcome.DRIFTING, f"and {before:.0f} % by the model in force: aircraft or air have changed"
     if not finite(plant):
         outcome, said = Outcome.DIVERGED, "the model is not finite; trying again"
-    at = {name: value for h, (each, _) in found.items() for name, value in by_axis(each, h).items()}
     return Verdict(
         outcome=outcome,
         sentence=f"mean fit {mean(fit):.0f} % over {horizon:.0f} s of unseen data, {said}",
         fit=fit,
         fit_hold=still,
-        fit_at=at,
-        whiteness=_named(whiteness(unseen.y, unseen.runs(2))),
         horizon_s=horizon,
         threshold=omega,
     )
+
+
+def told(verdict: Verdict, plant: Plant, window: Window, start: int) -> Verdict:
+    """Add what is told of a model beside its verdict: the fit at other horizons, and how white its residuals are."""
+    unseen = Unseen(plant, window, start)
+    seconds = unseen.dt * (len(unseen.y) - 1)
+    fits = {h: fits_at(unseen, h)[0] for h in TOLD_S if h <= seconds + unseen.dt}
+    at = {name: value for h, fit in fits.items() for name, value in by_axis(fit, h).items()}
+    white = _named(whiteness(unseen.y, unseen.one_step()))
+    return msgspec.structs.replace(verdict, fit_at=at, whiteness=white)
 
 
 def _missing(fit: dict[str, float], still: dict[str, float], omega: float) -> str:
