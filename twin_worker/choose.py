@@ -9,9 +9,9 @@ from twin_worker.memory import Believed, Twin
 from twin_worker.plant import Plant
 from twin_worker.predict import fly_ahead
 
-FLY_S = 4.0  # between flights of the same models [s]
+FLY_S = 5.0  # between flights of the same models [s]
 _FLIGHT_S = 20.0  # of the newest data flown [s]
-_KEEP = 4  # verified models kept to choose from
+_KEEP = 3  # verified models kept to choose from
 _NEW = 1.2  # a new model's only flight so far counts as a miss this much larger [-]
 
 

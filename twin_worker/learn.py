@@ -27,7 +27,7 @@ _HELD_S = 8.2, 20.0, 40.2  # held out: least; most of `--method paper`; most [s]
 _HELD_SHARE = 0.3, 0.5  # of what there is, held out [-]
 _FREE_RUN_S = (2.0, 4.0, 2.0, 8.0)  # free-run length of the n-th try of `--method paper` [s]
 _SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the stretch the n-th try uses [-]
-_TELL_S = 4.0  # between models that say nothing new [s]
+_TELL_S = 5.0  # between models that say nothing new [s]
 
 
 def learn(twin: Twin) -> list[Message]:
@@ -51,7 +51,7 @@ def learn(twin: Twin) -> list[Message]:
     verdict = choose(twin, window, known, plant, verdict)
     if verdict.outcome is Outcome.VERIFIED and isinstance(plant, coupled.Coupled):
         twin.last = plant
-    news = verdict.outcome is not twin.verdict.outcome or window.t[-1] - twin.told_t >= _TELL_S
+    news = _changed(verdict, twin.verdict) or window.t[-1] - twin.told_t >= _TELL_S
     twin.verdict = verdict
     if verdict.outcome in (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST):
         twin.tries = 0
@@ -61,6 +61,12 @@ def learn(twin: Twin) -> list[Message]:
     twin.verdict = told(verdict, plant, window, known)
     twin.model = model_message(twin, window)
     return [twin.model]
+
+
+def _changed(now: Verdict, before: Verdict) -> bool:
+    """Tell whether belief changed; that a model is good and an earlier one better alternates and is no news."""
+    sound = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST)
+    return now.outcome is not before.outcome and not (now.outcome in sound and before.outcome in sound)
 
 
 def _stretch_s(twin: Twin) -> float:

@@ -44,8 +44,14 @@ class Observer:
             delta: inputs as they act, (n, 4)
         """
         out = np.empty((len(y), N_X + 6))
-        _track(y, delta, self.model.par, self.model.at, self.dt, self.left, out)
+        _track(y, delta, self.model.par, self.model.at, self.dt, self.left, out, np.empty_like(y))
         return out
+
+    def foretell(self, y: np.ndarray, delta: np.ndarray) -> np.ndarray:
+        """Predict every row from the rows before it, (n, 9); the first is itself. Arguments as for `track`."""
+        foretold = np.empty_like(y)
+        _track(y, delta, self.model.par, self.model.at, self.dt, self.left, np.empty((len(y), N_X + 6)), foretold)
+        return foretold
 
     def fly(self, tracked: np.ndarray, begins: np.ndarray, length: int, delta: np.ndarray) -> np.ndarray:
         """Run free from tracked rows, (m, 15), at `begins`, (m,), with fading gusts; give them, (m, length, 9)."""
@@ -63,9 +69,11 @@ def _track(
     dt: float,
     left: np.ndarray,
     out: np.ndarray,
+    foretold: np.ndarray,
 ) -> None:
     x, d, blown, work = y[0].copy(), np.zeros(6), par.copy(), np.empty((3, N_X))
     for k in range(len(y)):
+        foretold[k] = x
         for i in range(N_X):
             e = y[k, i] - x[i]
             x[i] += _ALPHA[i] * e

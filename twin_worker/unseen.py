@@ -43,8 +43,7 @@ class Unseen:
     def one_step(self) -> np.ndarray:
         """Predict each row from those before it; nan where they are not measured, or by a fresh start, (n, 9)."""
         if isinstance(self._plant, Coupled):
-            eye, begins = Observer(self._plant, self.dt), np.arange(self._start - 1, len(self._window) - 1)
-            out = eye.fly(eye.track(self._y, self._delta)[begins], begins, 2, self._delta)[:, 1]
+            out = Observer(self._plant, self.dt).foretell(self._y, self._delta)[self._start :]
         else:
             out = self.runs(2)
             out[::2] = np.nan
