@@ -135,7 +135,7 @@ def _advance_all(held: Held, messages: list[Message]) -> Iterator[Message]:
     for message in messages:
         yield from advance(held.twin, (message,))
     now = data_time(held)
-    if now > held.twin.history.newest:
+    if not messages and now > held.twin.history.newest:  # a worker that is late hears no silence
         yield from advance(held.twin, (), now)
 
 
