@@ -3,17 +3,20 @@
 import argparse
 import sys
 
+from fleet.airframes import GENERIC, load
 from fleet.bus import ROUTER, connect
 from fleet.cli import guarded, id_range, parser_for, stop_on_signal
 from fleet.contract import FleetState
 
 EXAMPLES = """
   twin_worker --uavs 0-49
+  twin_worker --uavs 0-9 --airframe my_aircraft.toml       copy fleet/airframes/small_fixed_wing.toml and fill it in
   twin_worker --uavs 50-99 --router tcp/192.168.1.10:7447
 """
 
 
 def _run(args: argparse.Namespace) -> int:
+    airframe = load(args.airframe)
     stop = stop_on_signal()
     with connect(args.router) as bus:
         bus.present(f"worker/{bus.writer:016x}/{args.uavs.start}-{args.uavs.stop - 1}")
@@ -21,7 +24,7 @@ def _run(args: argparse.Namespace) -> int:
         from twin_worker.warm import warm_up  # numba is slow to import: say what happens first
         from twin_worker.worker import Worker
 
-        worker = Worker(bus, args.uavs, omega=args.omega, method=args.method)
+        worker = Worker(bus, args.uavs, omega=args.omega, method=args.method, airframe=airframe)
         worker.listen()
         worker.sentence = "compiling the twin's physics, once"
         bus.publish(worker.state())
@@ -40,6 +43,9 @@ def main(argv: list[str] | None = None) -> int:
     methods = ("dynamics", "paper")
     parser.add_argument(
         "--method", choices=methods, default=methods[0], help="coupled model or two linear axes (dynamics)"
+    )
+    parser.add_argument(
+        "--airframe", default=GENERIC, metavar="NAME|FILE", help=f"what is known before flight, a TOML file ({GENERIC})"
     )
     parser.add_argument("--omega", type=float, default=0.0, help="least mean fit to verify, %% (0, as in the paper)")
     args = parser.parse_args(argv)

@@ -53,7 +53,7 @@ def learn(twin: Twin) -> list[Message]:
         twin.last = plant
     news = _changed(verdict, twin.verdict) or window.t[-1] - twin.told_t >= _TELL_S
     twin.verdict = verdict
-    if verdict.outcome in (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST):
+    if verdict.outcome in (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST, Outcome.NOT_IDENTIFIABLE):
         twin.tries = 0
     if not news:
         return []

@@ -18,7 +18,7 @@ TOLD_S = (40.0, 16.0, 4.0, 1.0)  # told, too; 1 s is no ground for belief: input
 OMEGA = 0.0  # least mean fit over the nine states [%]; the paper: "greater than 0 is acceptable"
 AXES = {"lon": ("u", "w", "q", "theta"), "lat": ("phi", "psi", "p", "r", "v")}
 _LOST = -99.0  # mean fit that only a diverging run has [%]
-_QUIET_PHI, _QUIET_Q = 0.04, 0.02  # less than this is steady flight [rad, rad/s]
+_QUIET = {"phi": 0.04, "theta": 0.04, "q": 0.05}  # less about their means is steady flight [rad, rad, rad/s]
 _NO_WORSE = 1.0  # points a new model may lie below the last: chance [%]
 
 
@@ -98,7 +98,7 @@ def verify(plant: Plant, window: Window, start: int, omega: float = OMEGA, last:
         fit, still = fits_at(unseen, horizon)
         if not _missing(fit, still, omega):
             break
-    outcome, said = _judge(fit, _missing(fit, still, omega), held)
+    outcome, said = _judge(fit, _missing(fit, still, omega), window.part(0, start))
     if last is not None:
         before = mean(fits_at(Unseen(last, window, start), horizon)[0])
         if outcome is Outcome.VERIFIED and mean(fit) < before - _NO_WORSE:
@@ -138,11 +138,16 @@ def _missing(fit: dict[str, float], still: dict[str, float], omega: float) -> st
     return ""
 
 
-def _judge(fit: dict[str, float], missing: str, held: Window) -> tuple[Outcome, str]:
+def _judge(fit: dict[str, float], missing: str, known: Window) -> tuple[Outcome, str]:
     if mean(fit) <= _LOST:
         return Outcome.DIVERGED, "the free run diverges; trying again"
+    moved = {name: float(known.columns((name,))[known.ok].std()) for name in _QUIET}
+    if all(moved[name] < least for name, least in _QUIET.items()):
+        by = ", ".join(f"{name} {np.degrees(value):.1f}" for name, value in moved.items())
+        return (
+            Outcome.NOT_IDENTIFIABLE,
+            f"not identifiable here: steady flight ({by} deg) excites nothing; wait for a turn",
+        )
     if not missing:
         return Outcome.VERIFIED, "above the threshold and better than holding still"
-    if held.columns(("phi",)).std() < _QUIET_PHI and held.columns(("q",)).std() < _QUIET_Q:
-        return Outcome.NOT_IDENTIFIABLE, f"{missing}; steady flight excites nothing, wait for a turn"
     return Outcome.BELOW_THRESHOLD, f"{missing}; trying another window"

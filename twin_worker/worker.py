@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from fleet.airframes import GENERIC, Airframe, load
 from fleet.bus import Bus
 from fleet.codec import Stamp
 from fleet.contract import Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, Status
@@ -38,10 +39,12 @@ class Held:
 class Worker:
     """Twins of the UAVs in one range of ids."""
 
-    def __init__(self, bus: Bus, uavs: range, *, omega: float, method: str = DYNAMICS) -> None:
+    def __init__(
+        self, bus: Bus, uavs: range, *, omega: float, method: str = DYNAMICS, airframe: Airframe | None = None
+    ) -> None:
         self.bus = bus
         self.uavs = uavs
-        self.omega, self.method = omega, method
+        self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
         self.sentence = ""
         self._held: dict[int, Held] = {}
         self._lock = threading.Lock()
@@ -65,7 +68,8 @@ class Worker:
             held = self._held.get(message.uav)
             if held is None:
                 epoch = int(time.time() * 1000)
-                held = self._held[message.uav] = Held(Twin(message.uav, omega=self.omega, method=self.method), epoch)
+                twin = Twin(message.uav, omega=self.omega, method=self.method, airframe=self.airframe)
+                held = self._held[message.uav] = Held(twin, epoch)
         if isinstance(message, Sample):
             held.arrived = time.monotonic()
         held.shed += len(held.inbox) == _INBOX
