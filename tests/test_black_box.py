@@ -5,7 +5,6 @@ import pytest
 from test_subspace import closed_loop, miss
 
 from twin_worker.black_box import fit_inputs, normal_equations, refine_black_box, squared_errors
-from twin_worker.disturbance import with_disturbance
 from twin_worker.linear import StateSpace
 from twin_worker.order import choose
 from twin_worker.projection import projection
@@ -201,29 +200,6 @@ def test_inputs_offset_and_start_are_solved_exactly():
     found = fit_inputs(StateSpace.of(truth.A, 0 * truth.B, truth.C), truth.run(u), u, pushed=True)
     assert np.allclose(found.B, truth.B, atol=1e-6)
     assert np.allclose(found.run(u), truth.run(u), atol=1e-4)  # of three pushes two outputs show two
-
-
-def test_a_disturbance_helps_one_step_and_leaves_the_long_run_alone():
-    truth, rng = known(2), np.random.default_rng(5)
-    u = rng.standard_normal((1500, 2))
-    clean, gust = truth.run(u), np.zeros((1500, 2))
-    for k in range(1499):
-        gust[k + 1] = 0.95 * gust[k] + 0.3 * rng.standard_normal(2)
-    y = clean + gust
-    model = refine_black_box(pbsid(y[:1000], u[:1000], 2), y[:1000], u[:1000])
-    gusty = with_disturbance(model, y[:1000], u[:1000])
-    assert gusty.order > model.order
-    assert np.allclose(gusty.run(u), model.run(u))
-    error = [np.linalg.norm((y - m.one_step(y, u))[1000:]) for m in (model, gusty)]
-    assert error[1] < 0.5 * error[0]
-
-
-def test_white_noise_needs_no_disturbance_states():
-    y, u = recorded(known(2), 1000, 0.3)
-    model = refine_black_box(pbsid(y, u, 2), y, u)
-    white = with_disturbance(model, y, u)
-    error = [np.linalg.norm(y - m.one_step(y, u)) for m in (model, white)]
-    assert error[1] == pytest.approx(error[0], rel=0.05)
 
 
 POOR = {

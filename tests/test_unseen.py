@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from coupled_flights import NOISE, SMALL, aircraft, broken, fly, known, window_of
@@ -11,7 +12,7 @@ from fleet.contract import Outcome
 from fleet.physics.wrench import NAMES, WIND
 from twin_worker.coupled import Coupled, states
 from twin_worker.unseen import Unseen
-from twin_worker.verify import AXES, fits_at, mean, verify
+from twin_worker.verify import AXES, fits_at, mean, told, verify
 from twin_worker.white import LAGS, whiteness
 
 START = 500
@@ -71,11 +72,16 @@ def test_wind_in_the_model_moves_the_ground_speed_it_predicts():
 
 @pytest.mark.parametrize(("seconds", "longest"), [(62.0, 40.0), (40.0, 16.0), (30.0, 8.0), (25.0, 4.0)])
 def test_the_truth_is_verified_at_the_longest_horizon_and_told_at_every(seconds, longest):
-    verdict = verify(known(aircraft(2)), fly(aircraft(2), seconds, seed=2), START)
+    plant, window = known(aircraft(2)), fly(aircraft(2), seconds, seed=2)
+    verdict = verify(plant, window, START)
     assert verdict.outcome is Outcome.VERIFIED and verdict.horizon_s == longest
-    told = {f"{axis}{h}" for axis in AXES for h in (40, 16, 4, 1) if h <= longest} | {f"{a}{longest:.0f}" for a in AXES}
-    assert set(verdict.fit_at) == told
-    assert all(verdict.fit_at[f"{a}{longest:.0f}"] == mean(verdict.fit, states) for a, states in AXES.items())
+    more = told(verdict, plant, window, START)
+    assert set(more.fit_at) == {f"{axis}{h}" for axis in AXES for h in (40, 16, 4, 1) if h <= longest}
+    for h in (40, 16, 4, 1):
+        fit = fits_at(Unseen(plant, window, START), h)[0]
+        assert h > longest or all(more.fit_at[f"{axis}{h}"] == mean(fit, states) for axis, states in AXES.items())
+    assert more.whiteness.keys() == verdict.fit.keys() and set(more.whiteness.values()) != {0.0}
+    assert msgspec.structs.replace(more, fit_at={}, whiteness={}) == verdict  # nothing else changes
 
 
 def test_a_worse_model_does_not_replace_the_last():
@@ -115,8 +121,9 @@ def test_a_diverging_model_is_named_so():
 def test_a_model_of_no_numbers_is_refused(name, value):
     plant = known(aircraft(0))
     plant.par[NAMES.index(name)] = value
-    verdict = verify(plant, fly(aircraft(0), 40.0), START)
-    assert verdict.outcome is Outcome.DIVERGED
+    window = fly(aircraft(0), 40.0)
+    verdict = told(verify(plant, window, START), plant, window, START)
+    assert verdict.outcome is Outcome.DIVERGED and verdict.fit_at and verdict.whiteness
     assert np.isfinite([*verdict.fit.values(), *verdict.fit_at.values(), *verdict.whiteness.values()]).all()
 
 
