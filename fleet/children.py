@@ -11,6 +11,20 @@ from contextlib import AbstractContextManager
 
 PARENT = "PARAUAV_PARENT"  # process id of the parent that started this process as its child
 _PATIENCE_S = 8.0  # between the request to stop and the end of patience [s]
+_ALONE_S = 10.0  # the same for a child that is all its parent waits for [s]
+
+
+def run_until(stop: threading.Event, module: str, *options: str) -> int:
+    """Run `python -m module options…` in the foreground until it ends or `stop` is set; give its exit code."""
+    child = subprocess.Popen([sys.executable, "-m", module, *options])
+    try:
+        while child.poll() is None and not stop.wait(0.2):
+            pass
+    finally:
+        if child.poll() is None:
+            child.terminate()
+    code = child.wait(_ALONE_S)
+    return code if code >= 0 else 128 - code
 
 
 class Children(AbstractContextManager):

@@ -2,13 +2,13 @@
 
 import argparse
 import contextlib
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
 
+from fleet.children import run_until
 from fleet.cli import id_range, stop_on_signal
 
 EXAMPLES = """
@@ -16,7 +16,6 @@ EXAMPLES = """
   fleet paper identify --uavs 0-1 --for 180 --first pbsid
   fleet paper identify flight.tlog.xz          on recordings instead of pretend flights
 """
-_PATIENCE_S = 10.0
 _LOSS = 0.01  # share of frames lost on the way [-]
 
 
@@ -85,17 +84,10 @@ def _fly(args: argparse.Namespace, path: Path, stop: Event) -> None:
 
 
 def _identify(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
-    command = [sys.executable, "-m", "twin_worker.paper", args.experiment, f"--first={args.first}"]
-    command += [f"--{name}={value}" for name, value in (("out", args.out), ("json", args.json)) if value]
-    child = subprocess.Popen([*command, *map(str, files)])
-    try:
-        while child.poll() is None and not stop.wait(0.2):
-            pass
-    finally:
-        if child.poll() is None:
-            child.terminate()
-    code = child.wait(_PATIENCE_S)
+    options = [f"--{name}={value}" for name, value in (("out", args.out), ("json", args.json)) if value]
+    command = [args.experiment, f"--first={args.first}", *options, *map(str, files)]
+    code = run_until(stop, "twin_worker.paper", *command)
     if stop.is_set():
         print("paper: stopped; what was not finished is not written", file=sys.stderr)
         return 0
-    return code if code >= 0 else 128 - code
+    return code

@@ -1,7 +1,6 @@
 """Play recordings into a running fleet, as if they were flown now."""
 
 import argparse
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -9,6 +8,7 @@ from urllib.parse import quote
 
 from fleet.bars import shown
 from fleet.bus import ROUTER
+from fleet.children import run_until
 from fleet.cli import stop_on_signal
 from fleet.telemetry.airing import MOST_ON_A_LINK, Airing, address
 from fleet.telemetry.ids import Ids
@@ -22,7 +22,6 @@ EXAMPLES = """
   fleet replay flight.tlog --copies 50                         fifty aircraft, 500 m apart
   fleet replay flight.tlog --copies 50 --to 127.0.0.1:14550    the same as MAVLink over UDP
 """
-_PATIENCE_S = 10.0
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,16 +42,7 @@ def run(args: argparse.Namespace) -> int:
         return _send(args)
     options = [f"--link={link(name, args)}" for name in args.file]
     options += ["--router", args.router, f"--offset={args.offset}", "--listen-only"]
-    stop = stop_on_signal()
-    child = subprocess.Popen([sys.executable, "-m", "gateway", *options])
-    try:
-        while child.poll() is None and not stop.wait(0.2):
-            pass
-    finally:
-        if child.poll() is None:
-            child.terminate()
-    code = child.wait(_PATIENCE_S)
-    return code if code >= 0 else 128 - code
+    return run_until(stop_on_signal(), "gateway", *options)
 
 
 def _send(args: argparse.Namespace) -> int:
