@@ -4,11 +4,13 @@ import copy
 import os
 import shutil
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 
 import flights
 import pytest
 
+from fleet.bus import open_router
 from fleet.contract import Message
 from twin_worker.twin import Twin
 
@@ -51,6 +53,15 @@ def unused_port() -> int:
 def free_port() -> int:
     """The same, as a fixture."""
     return unused_port()
+
+
+@pytest.fixture(scope="module")
+def router() -> Iterator[str]:
+    """Endpoint of a router on a free loopback port."""
+    where = f"tcp/127.0.0.1:{unused_port()}"
+    session = open_router(where)
+    yield where
+    session.close()
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -18,7 +18,7 @@ from conftest import ROOT, unused_port
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import Talker
 
-from fleet.bus import Bus, connect, open_router
+from fleet.bus import Bus, connect
 from fleet.commands.status import fleet_rows
 from fleet.contract import Account, FleetState, Mission, Model, Outcome, Params, Prediction, Sample, State, Status
 
@@ -68,14 +68,6 @@ def udp_port() -> int:
 def own_ports() -> tuple[list[str], str]:
     router = f"tcp/127.0.0.1:{unused_port()}"
     return ["--no-viewer", "--router", router, "--mavlink", f"127.0.0.1:{udp_port()}"], router
-
-
-@pytest.fixture(scope="module")
-def router() -> Iterator[str]:
-    where = f"tcp/127.0.0.1:{unused_port()}"
-    session = open_router(where)
-    yield where
-    session.close()
 
 
 # --- fleet up --------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import pytest
 from conftest import ROOT, unused_port
 from talker import ITEMS, T0, Aircraft, Talker
 
-from fleet.bus import MemoryBus, connect, open_router
+from fleet.bus import MemoryBus, connect
 from fleet.contract import Account, Mission, Params, Sample, Status
 from fleet.telemetry.recordings import replay_messages
 from gateway.link import Batch, Udp
@@ -175,14 +175,6 @@ def test_a_recording_keeps_its_pace(tmp_path):
 
 
 # ---- end to end
-
-
-@pytest.fixture(scope="module")
-def router():
-    where = f"tcp/127.0.0.1:{unused_port()}"
-    session = open_router(where)
-    yield where
-    session.close()
 
 
 def udp_port():

@@ -10,11 +10,11 @@ import time
 import msgspec
 import numpy as np
 import pytest
-from conftest import ROOT, unused_port
+from conftest import ROOT
 from examples import EXAMPLES, MESSAGES
 from pretend_feed import STAMP, PretendFleet, T
 
-from fleet.bus import MemoryBus, connect, open_router
+from fleet.bus import MemoryBus, connect
 from fleet.codec import Stamp, encode, encoding
 from fleet.commands import record
 from fleet.commands.record import Recorder
@@ -238,14 +238,6 @@ def test_an_endless_file_of_nothing_is_given_up(tmp_path):
 
 
 # --- the command -----------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def router():
-    where = f"tcp/127.0.0.1:{unused_port()}"
-    session = open_router(where)
-    yield where
-    session.close()
 
 
 def command(*arguments, router):
