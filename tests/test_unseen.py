@@ -67,6 +67,54 @@ def test_wind_in_the_model_moves_the_ground_speed_it_predicts():
     assert fits[0] > fits[1] + 10.0
 
 
+# --- one step ahead --------------------------------------------------------------------------------------------------
+
+
+def test_one_step_ahead_the_truth_misses_by_the_noise_and_little_more():
+    exact = Unseen(known(aircraft(1)), fly(aircraft(1), 40.0, noise=0.0), START)
+    assert np.abs(exact.one_step() - exact.y).max() < 1e-6
+    noisy = Unseen(known(aircraft(0)), fly(aircraft(0), 60.0), START)
+    missed = (noisy.one_step() - noisy.y).std(axis=0) / NOISE
+    assert (missed > 0.95).all()  # nobody foresees noise
+    assert (
+        np.median(missed) < 1.6 and (missed < 5.0).all()
+    )  # noise of what it starts from; a sideways one turns the nose
+    other = Unseen(changed(known(aircraft(0)), M_w=0.2, L_p=0.2, Z_w=0.2), fly(aircraft(0), 60.0), START)
+    worse = (other.one_step() - other.y).std(axis=0) / NOISE / missed
+    assert (worse > 0.98).all() and (worse[[2, 3, 4]] > [1.05, 2.0, 1.05]).all()
+
+
+@pytest.mark.parametrize("plant", [known(aircraft(0)), truth()])
+def test_a_step_ahead_sees_the_rows_before_it_and_none_after(plant):
+    window = fly(aircraft(0), 40.0)
+    before = Unseen(plant, window, START).one_step()
+    later = replace(window, x=window.x.copy(), v=window.v.copy())
+    later.x[START + 301 :], later.v[START + 301 :] = 0.0, 0.0
+    after = Unseen(plant, later, START).one_step()
+    same = (before == after) | (np.isnan(before) & np.isnan(after))
+    assert same[:302].all() and not same[303:306].all()
+
+
+@pytest.mark.parametrize("plant", [known(aircraft(0)), truth()])
+def test_rows_nobody_measured_are_not_predicted_nor_predicted_from(plant):
+    window = broken(fly(aircraft(0), 40.0), (30.0, 30.2))
+    one_step = Unseen(plant, window, START).one_step()
+    gone = np.flatnonzero(~window.ok) - START
+    assert len(gone) == 5 and np.isnan(one_step[gone[0] : gone[-1] + 2]).all()
+    measured = np.isfinite(one_step).all(axis=1)
+    assert measured.sum() == {True: len(one_step) - 6, False: 247}[isinstance(plant, Coupled)]
+    other = replace(window, x=np.where(window.ok[:, None], window.x, 7.0))
+    assert np.array_equal(Unseen(plant, other, START).one_step(), one_step, equal_nan=True)
+
+
+def test_a_linear_model_predicts_every_second_row_from_the_one_before():
+    window = fly(aircraft(0), 40.0)
+    unseen = Unseen(truth(), window, START)
+    one_step, n = unseen.one_step(), len(unseen.y) // 2 * 2
+    assert np.isnan(one_step[:n:2]).all()
+    assert np.array_equal(one_step[1:n:2], unseen.runs(2)[1:n:2])
+
+
 # --- verdicts --------------------------------------------------------------------------------------------------------
 
 

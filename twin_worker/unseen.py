@@ -41,14 +41,14 @@ class Unseen:
         return self._linear_runs(begins, length)
 
     def one_step(self) -> np.ndarray:
-        """Predict each row from those before it; nan where they are not measured, or by a fresh start, (n, 9)."""
+        """Predict each row from those before it, (n, 9); nan at and after unmeasured rows, and at fresh starts."""
         if isinstance(self._plant, Coupled):
-            out = Observer(self._plant, self.dt).foretell(self._y, self._delta)[self._start :]
+            y = np.where(self._window.ok[:, None], self._y, np.nan)  # where the filter begins anew
+            out = Observer(self._plant, self.dt).foretell(y, self._delta)[self._start :]
         else:
             out = self.runs(2)
             out[::2] = np.nan
-        broken = self._broken[self._start + 1 :] - self._broken[self._start - 1 : -2]
-        return np.where(broken[:, None] > 0, np.nan, out)
+        return np.where(self.ok[:, None], out, np.nan)
 
     def _fresh(self, begins: np.ndarray) -> np.ndarray:
         """Read the states at rows off a line through the rows up to each; off that row alone where they are broken."""
