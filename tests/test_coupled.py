@@ -10,7 +10,7 @@ from flights import DT
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
 from fleet.window import Window
 from twin_worker import coupled
-from twin_worker.coupled import Coupled, end_state, identify, states
+from twin_worker.coupled import Coupled, identify, states
 from twin_worker.unseen import Unseen
 from twin_worker.verify import fits_at, mean
 
@@ -217,12 +217,6 @@ def test_too_little_says_so(ok):
         window.ok[a:b] = True
     with pytest.raises(ValueError, match=r"^identify: found no 2 s of unbroken data, needs them; wait$"):
         identify(window, ASKED, SMALL)
-
-
-def test_the_last_states_are_read_off_a_line():
-    k = np.arange(20.0)[:, None]
-    assert np.allclose(end_state(3.0 - 0.5 * k * np.ones(9)), 3.0 - 0.5 * 20)
-    assert np.allclose(end_state(np.full((2, 9), 4.0)), 4.0)
 
 
 def test_states_are_over_the_ground():

@@ -11,7 +11,6 @@ from fleet.telemetry.dialects.dataflash import COLUMNS_OF, PARTS, TABLE, field_o
 
 DEG = np.pi / 180
 
-PLANE_2015 = ("CTUN", "Icccchhf", "TimeMS,NavRoll,Roll,NavPitch,Pitch,ThrOut,RdrOut,AccY")
 POSITION = (-353632610.0, 1491652300.0, 584120.0)
 CASES: tuple[tuple[str, tuple[Any, ...], str, str, tuple[float, ...]], ...] = (
     # name + letters + columns, what is logged, part, row of the table read from it

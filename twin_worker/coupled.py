@@ -15,12 +15,11 @@ from fleet.physics.dynamics import free_runs
 from fleet.physics.wrench import N_PAR, OFFSETS, WIND
 from fleet.window import Window
 from twin_worker.airframe_prior import prior
-from twin_worker.output_error import LINE, Found, Problem, search, segments_of
+from twin_worker.output_error import Found, Problem, search, segments_of
 
 DISCOUNT = 0.12  # information in a residual, one of every four samples: gusts colour them [-]
 COLD, WARM = 8, 1  # most steps of a first and of a repeated search
 _FORGET, _FORGET_OFFSETS, _FORGET_WIND = 0.7, 0.5, 0.7  # share of earlier information that is kept, per stretch [-]
-_LEAD = 25  # rows before a stretch that settle its lags
 
 
 @dataclass(frozen=True)
@@ -70,12 +69,6 @@ def states(window: Window) -> np.ndarray:
     y = window.x.copy()
     y[:, :3] = ned_to_body(y[:, 6], y[:, 7], y[:, 8], window.v)
     return y
-
-
-def end_state(y: np.ndarray) -> np.ndarray:
-    """Read the state just after the rows, off a straight line through the last of them, (9,)."""
-    n = min(LINE, len(y))
-    return np.linalg.pinv(np.column_stack([np.ones(n), np.arange(n) - n]))[0] @ y[-n:]
 
 
 def identify(

@@ -15,7 +15,6 @@ NO_WINGS = ("multirotor", "helicopter")
 QUADPLANE = "quadplane"
 WINGS = ("fixed_wing", QUADPLANE)
 _BACK_S = 130.0  # flight the twin's numbers come from [s]
-_SLOW = 6.0  # slower than this nothing flies on wings, whatever it is called [m/s]
 _VTOL = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
 _STEERED_S = 6.0  # a multirotor told to hold that still moves after so long is steered by hand [s]
 

@@ -7,7 +7,6 @@ from pymavlink.DFReader import FORMAT_TO_STRUCT
 
 MOST_PLACES = 3  # named for each kind of damage
 MOST_KINDS = 40
-_TEXT = "nNZ"
 _WHOLE = "bBhHiIqQM"
 
 
