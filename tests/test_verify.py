@@ -1,5 +1,6 @@
 """Verification: the fit of equation 22 by hand, what a model must beat, and every outcome."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -7,9 +8,10 @@ import pytest
 from flights import linear_flight, standstill, truth
 
 from fleet.contract import Outcome
+from fleet.window import STATES
 from twin_worker.identify import Axis
 from twin_worker.unseen import Unseen
-from twin_worker.verify import fit_percent, fits_at, hold, mean, verify
+from twin_worker.verify import _QUIET, fit_percent, fits_at, hold, mean, verify
 
 
 def blurred(share: float, seed: int = 0):
@@ -110,10 +112,29 @@ def test_no_better_than_holding_still_is_refused_however_low_the_threshold():
 
 
 def test_steady_flight_identifies_nothing():
-    held = linear_flight(20.0, lively=0.02, noise=0.1)
-    verdict = verify(standstill(truth()), held, 0)
+    window = linear_flight(40.0, lively=0.02, noise=0.1)
+    verdict = verify(standstill(truth()), window, 500)
     assert verdict.outcome is Outcome.NOT_IDENTIFIABLE
-    assert "steady flight" in verdict.sentence
+    assert re.search(r"steady flight \(phi \d\.\d deg, theta \d\.\d deg, q \d\.\d deg/s\) excites", verdict.sentence)
+    assert verify(truth(), window, 500).outcome is Outcome.NOT_IDENTIFIABLE  # however good it may look
+    lively = linear_flight(40.0)
+    window.x[:500] = lively.x[:500]  # what counts is the stretch it was learnt from
+    assert verify(standstill(truth()), window, 500).outcome is not Outcome.NOT_IDENTIFIABLE
+
+
+@pytest.mark.parametrize("name", ["phi", "theta", "q"])
+def test_any_motion_is_enough_to_learn_from(name):
+    window = linear_flight(40.0)
+    window.x[:500] = window.x[0]
+    for times, outcome in ((0.9, Outcome.NOT_IDENTIFIABLE), (1.1, Outcome.VERIFIED)):
+        window.x[:500, STATES.index(name)] = times * _QUIET[name] * np.resize([-1.0, 1.0], 500)
+        assert verify(truth(), window, 500).outcome is outcome
+
+
+def test_where_nothing_was_measured_before_nothing_is_said_of_it():
+    window = linear_flight(40.0)
+    window.ok[:500] = False
+    assert verify(truth(), window, 500).outcome is Outcome.VERIFIED
 
 
 def test_a_diverging_model_is_named_so():

@@ -18,7 +18,7 @@ TOLD_S = (40.0, 16.0, 4.0, 1.0)  # told, too; 1 s is no ground for belief: input
 OMEGA = 0.0  # least mean fit over the nine states [%]; the paper: "greater than 0 is acceptable"
 AXES = {"lon": ("u", "w", "q", "theta"), "lat": ("phi", "psi", "p", "r", "v")}
 _LOST = -99.0  # mean fit that only a diverging run has [%]
-_QUIET = {"phi": 0.04, "theta": 0.04, "q": 0.05}  # less about their means is steady flight [rad, rad, rad/s]
+_QUIET = {"phi": 0.04, "theta": 0.04, "q": 0.05}  # if all move less it is steady flight [rad, rad, rad/s]
 _NO_WORSE = 1.0  # points a new model may lie below the last: chance [%]
 
 
@@ -138,16 +138,20 @@ def _missing(fit: dict[str, float], still: dict[str, float], omega: float) -> st
     return ""
 
 
+def _steady(known: Window) -> str:
+    """Say how little moved where that was too little to identify by; nothing where no row was measured."""
+    rows = known.columns(tuple(_QUIET))[known.ok]
+    if not len(rows) or (rows.std(axis=0) >= list(_QUIET.values())).any():
+        return ""
+    phi, theta, q = np.degrees(rows.std(axis=0))
+    return f"steady flight (phi {phi:.1f} deg, theta {theta:.1f} deg, q {q:.1f} deg/s)"
+
+
 def _judge(fit: dict[str, float], missing: str, known: Window) -> tuple[Outcome, str]:
     if mean(fit) <= _LOST:
         return Outcome.DIVERGED, "the free run diverges; trying again"
-    moved = {name: float(known.columns((name,))[known.ok].std()) for name in _QUIET}
-    if all(moved[name] < least for name, least in _QUIET.items()):
-        by = ", ".join(f"{name} {np.degrees(value):.1f}" for name, value in moved.items())
-        return (
-            Outcome.NOT_IDENTIFIABLE,
-            f"not identifiable here: steady flight ({by} deg) excites nothing; wait for a turn",
-        )
+    if steady := _steady(known):
+        return Outcome.NOT_IDENTIFIABLE, f"not identifiable here: {steady} excites nothing; wait for a turn"
     if not missing:
         return Outcome.VERIFIED, "above the threshold and better than holding still"
     return Outcome.BELOW_THRESHOLD, f"{missing}; trying another window"
