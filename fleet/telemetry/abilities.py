@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.airframe import ServoMap, servo_map
+from fleet.contract import COLUMNS
 from fleet.mission import route
 from fleet.telemetry.survey import LONGEST_S, Survey, airborne, spells
 from fleet.telemetry.thinned import Span, inside, overlap, seconds
@@ -19,7 +20,7 @@ WINDOW_S = 140.0  # longest stretch one identification uses [s]
 UNBROKEN_S = 4.0  # shortest unbroken stretch a model is tested on [s]
 RECENT_S = 2.0  # what a turn-rate prediction starts from [s]
 ROUTE_S = 5.0  # on one route before it is predicted [s]
-QUIET_PHI, QUIET_Q = 0.04, 0.02  # less than this is steady flight [rad, rad/s]
+QUIET = {"phi": 0.04, "theta": 0.04, "q": 0.05}  # if all move less it is steady flight [rad, rad, rad/s]
 LEAST_VA, PAIRED_S = 3.0, 0.5  # airspeed, and age of the rows that go with a ground velocity [m/s, s]
 PAIRS = 50  # wind triangles before the estimate is guarded
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
@@ -156,10 +157,12 @@ def _verify(known: Survey, unidentified: str, spans: list[Span]) -> Ability:
         return Ability("verify", False, unidentified)
     t, x = known.rows["attitude"].rows()
     there = x[inside(t, spans)]
-    phi, q = float(there[:, 0].std()), float(there[:, 4].std())
-    found = f"bank varies by {np.degrees(phi):.1f} deg, pitch rate by {np.degrees(q):.1f} deg/s"
-    if phi < QUIET_PHI and q < QUIET_Q:
-        need = f"{np.degrees(QUIET_PHI):.1f} deg or {np.degrees(QUIET_Q):.1f} deg/s are needed"
+    columns = [name for name, _ in COLUMNS["attitude"]]
+    moved = {name: float(there[:, columns.index(name)].std()) for name in QUIET}
+    phi, theta, q = np.degrees(list(moved.values()))
+    found = f"bank varies by {phi:.1f} deg, pitch by {theta:.1f} deg, pitch rate by {q:.1f} deg/s"
+    if all(moved[name] < least for name, least in QUIET.items()):
+        need = "{:.1f} deg, {:.1f} deg or {:.1f} deg/s are needed".format(*np.degrees(list(QUIET.values())))
         return Ability("verify", False, f"steady flight shows nothing: {found}, {need}")
     return Ability("verify", True, found)
 
