@@ -18,7 +18,14 @@ from fleet import cli, commands
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 OFFERED = {"msgpack"}  # not imported: the wire format, for tools such as the README's
-PEERS = {"jax-sysid", "nfoursid", "pandas", "pysindy", "sippy-unipi"}  # of the bench, in an environment of their own
+PEERS = {
+    "jax",
+    "jax-sysid",
+    "nfoursid",
+    "pandas",
+    "pysindy",
+    "sippy-unipi",
+}  # of the bench, in an environment of their own
 TOOLS = {"ruff", "mypy", "pytest"}  # development dependencies that are run rather than imported
 
 
