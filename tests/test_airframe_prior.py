@@ -17,7 +17,7 @@ CALM = np.zeros(2)
 
 
 def named(V: float, span: float | None = None, airframe=CLASS) -> dict[str, float]:
-    par, _ = prior(airframe, np.array([V, 0.8]), TRIM, CALM, span)
+    par, _ = prior(replace(airframe, span=span), np.array([V, 0.8]), TRIM, CALM)
     return dict(zip(NAMES, par, strict=True))
 
 

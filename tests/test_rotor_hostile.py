@@ -6,9 +6,9 @@ import hover
 import msgspec
 import numpy as np
 import pytest
-from flights import item, predictions, published
+from flights import item, predictions, published, rows
 
-from fleet.contract import Mission, Params, Status
+from fleet.contract import Mission, Params, Sample, Status
 from twin_worker.offline import run
 from twin_worker.twin import Twin, advance
 
@@ -69,7 +69,8 @@ def test_hostile_missions(craft, items, autopilot):
 @pytest.mark.parametrize("seq", [0.0, -7.0, 65535.0, 1e4, NAN, INF])
 def test_items_in_force_that_are_none(craft, seq):
     craft.history._chunks["leg"].clear()
-    craft.history._chunks["leg"].append((np.array([craft.data_t - 1.0]), np.array([[seq]])))
+    leg = rows([craft.data_t - 1.0], [[seq]])
+    assert not craft.history.add(Sample(uav=7, t=craft.data_t, leg=leg))
     assert predictions(asked(craft))
 
 
