@@ -77,6 +77,7 @@ def test_recorded_flights_have_the_signs_of_the_house(recordings, kind):
     assert len({case.flight.name for case in cases}) == len(cases)
     for case in cases:
         check(case.flight, (1.0, 12.0))
+        assert case.flight.x[:, 0].min() > 6.0  # airborne from the first row to the last
     assert np.median([slopes(case.flight, 4, 1) for case in cases]) > 0.1  # one flight alone may hide its elevator
 
 

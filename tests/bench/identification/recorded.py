@@ -21,6 +21,7 @@ _SPAN = {"c172p": 10.9, "stack": 1.88, "thor": 1.27}  # [m]
 _GAP_S = 0.5  # longer ones are not measured [s]
 _SETTLE_S = 8.0  # of the simulator, before the first row [s]
 _LEAST_S = 90.0  # shorter stretches hold no window [s]
+_STANDS = 3.0  # slower it has not left its place [m/s]
 _LOW_M, _CLIMBED_S, _LANDING_S = 25.0, 12.0, 25.0  # take-off and landing are cut off
 _THOR_S = (222.0, 560.0)  # airborne
 _THOR_AUTO = 2  # mode in which the autopilot's commands are flown, else the pilot's
@@ -95,8 +96,9 @@ def _stretches(path: Path, k: int, name: str) -> Iterator[Flight]:
             params |= message.values
         elif isinstance(message, Status) and message.vehicle == "fixed_wing":
             modes.append((message.t, message.mode == "AUTO"))
-    t_p, place = history.rows("position")
-    high = t_p[place[:, 2] - place[0, 2] > 1e3 * _LOW_M]
+    (t_p, place), (t_v, v) = history.rows("position"), history.rows("velocity")
+    stands = t_p < t_v[np.linalg.norm(v, axis=1) > _STANDS][0]  # a row before the first fix has no height
+    high = t_p[place[:, 2] - np.median(place[stands, 2]) > 1e3 * _LOW_M]
     begun, ended = high[0] + _CLIMBED_S, high[-1] - _LANDING_S
     window = preprocess(
         history, Origin(*(int(i) for i in place[0])), servo_map(params), np.zeros(3), until=ended, seconds=ended - begun
