@@ -1,14 +1,13 @@
 """Recorded flights: JSBSim's c172p, the flight stack as the product reads it, a real one by the bench's own reader."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import scipy.io
 
 from fleet.airframe import servo_map
-from fleet.contract import Params, Sample, Status
+from fleet.contract import Params, Sample
 from fleet.frames import Origin, ned_to_body
 from fleet.telemetry.recordings import replay_messages
 from twin_worker.history import History
@@ -20,7 +19,6 @@ STACK = ("s01_nominal_calm", "s02_nominal_light_wind", "s03_nominal_modes")
 _SPAN = {"c172p": 10.9, "stack": 1.88, "thor": 1.27}  # [m]
 _GAP_S = 0.5  # longer ones are not measured [s]
 _SETTLE_S = 8.0  # of the simulator, before the first row [s]
-_LEAST_S = 90.0  # shorter stretches hold no window [s]
 _STANDS = 3.0  # slower it has not left its place [m/s]
 _LOW_M, _CLIMBED_S, _LANDING_S = 25.0, 12.0, 25.0  # take-off and landing are cut off
 _THOR_S = (222.0, 560.0)  # airborne
@@ -79,23 +77,17 @@ def _gaps(rows: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 
 def stack(folder: Path) -> list[Case]:
-    """Read the flights of the flight stack as the product sees them: the airborne stretches in AUTO."""
-    return [
-        Case(flight)
-        for k, name in enumerate(STACK)
-        for flight in _stretches(folder / "sitl" / f"{name}.tlog.xz", k, name)
-    ]
+    """Read the flights of the flight stack as the product sees them, in the air, whatever the mode."""
+    return [Case(_airborne(folder / "sitl" / f"{name}.tlog.xz", k)) for k, name in enumerate(STACK)]
 
 
-def _stretches(path: Path, k: int, name: str) -> Iterator[Flight]:
-    history, modes, params = History(keep_s=1e5), [], {}
+def _airborne(path: Path, k: int) -> Flight:
+    history, params = History(keep_s=1e5), {}
     for message in replay_messages(path):
         if isinstance(message, Sample):
             history.add(message)
         elif isinstance(message, Params):
             params |= message.values
-        elif isinstance(message, Status) and message.vehicle == "fixed_wing":
-            modes.append((message.t, message.mode == "AUTO"))
     (t_p, place), (t_v, v) = history.rows("position"), history.rows("velocity")
     stands = t_p < t_v[np.linalg.norm(v, axis=1) > _STANDS][0]  # a row before the first fix has no height
     high = t_p[place[:, 2] - np.median(place[stands, 2]) > 1e3 * _LOW_M]
@@ -103,17 +95,10 @@ def _stretches(path: Path, k: int, name: str) -> Iterator[Flight]:
     window = preprocess(
         history, Origin(*(int(i) for i in place[0])), servo_map(params), np.zeros(3), until=ended, seconds=ended - begun
     )
-    assert window is not None, f"{name}: found no rows of a needed kind"
+    assert window is not None, f"{path.name}: found no rows of a needed kind"
     t_air, air = history.rows("air")
     Va = true_airspeed(np.interp(window.t, t_air, air[:, 0]), 1e-3 * np.interp(window.t, t_p, place[:, 2]))
-    known, auto = np.array([t for t, _ in modes]), np.array([on for _, on in modes])
-    on = auto[np.clip(np.searchsorted(known, window.t, side="right") - 1, 0, len(auto) - 1)]
-    whole = Flight(name, k, DT, window.t - window.t[0], window.x, window.u, Va, window.ok, _SPAN["stack"])
-    edges = np.flatnonzero(np.diff(on, prepend=False, append=False))
-    for i, (start, stop) in enumerate(edges.reshape(-1, 2)):
-        if (stop - start) * DT > _LEAST_S:
-            part = whole.part(int(start), int(stop))
-            yield Flight(f"{name[:3]}-{i}", k, DT, part.t, part.x, part.u, part.Va, part.ok, part.b)
+    return Flight(path.name[:3], k, DT, window.t - window.t[0], window.x, window.u, Va, window.ok, _SPAN["stack"])
 
 
 # --- Thor ------------------------------------------------------------------------------------------------------------
