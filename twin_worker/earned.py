@@ -22,13 +22,14 @@ _PSI = STATES.index("psi")
 
 @dataclass
 class Earned:
-    """Normal equations of kappa and hold, for each knot and state."""
+    """Normal equations of kappa and hold, for each knot and state, and how far each state usually strays, squared."""
 
     H: np.ndarray = field(default_factory=lambda: np.zeros((len(KNOTS_S), 9, 2, 2)))
     g: np.ndarray = field(default_factory=lambda: np.zeros((len(KNOTS_S), 9, 2)))
+    usual: np.ndarray = field(default_factory=lambda: np.zeros((len(KNOTS_S), 9)))
 
     def learn(self, runs: np.ndarray, y: np.ndarray, m: np.ndarray, dt: float, weight: float = 1.0) -> None:
-        """Take runs and what was flown.
+        """Take runs and what was flown; no lesson weighs more than another, one of quiet flight less.
 
         Args:
             runs: free runs from fresh starts, (k, n, 9)
@@ -39,6 +40,7 @@ class Earned:
         """
         self.H *= _KEEP
         self.g *= _KEEP
+        self.usual *= _KEEP
         for knot, s in enumerate(KNOTS_S[1:], 1):
             at = slice(max(round(0.75 * s / dt), 1), round(s / dt) + 1)
             mean = _mean(m, y[:, 0])[:, None]
@@ -46,13 +48,15 @@ class Earned:
             good = np.isfinite(run) & np.isfinite(flown) & np.isfinite(held)
             z = np.where(good, np.stack([run, held]), 0.0)
             flown = np.where(good, flown, 0.0)
-            power = np.maximum(np.einsum("knj,knj->j", flown, flown), np.einsum("knj,knj->j", z[0], z[0])) + 1e-9
+            strayed, rows = np.einsum("knj,knj->j", flown, flown), good.sum(axis=(0, 1))
+            self.usual[knot] = np.maximum(self.usual[knot], strayed / np.maximum(rows, 1))
+            power = np.maximum(rows * self.usual[knot], np.einsum("knj,knj->j", z[0], z[0])) + 1e-9
             self.H[knot] += weight * np.einsum("aknj,bknj->jab", z, z) / power[:, None, None]
             self.g[knot] += weight * np.einsum("aknj,knj->ja", z, flown) / power[:, None]
 
     def copy(self) -> "Earned":
         """Give one that may learn apart."""
-        return Earned(self.H.copy(), self.g.copy())
+        return Earned(self.H.copy(), self.g.copy(), self.usual.copy())
 
     def shares(self) -> np.ndarray:
         """Give kappa and hold at each knot, (knots, 9, 2), each within 0..1, as is their sum."""
