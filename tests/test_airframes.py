@@ -72,6 +72,8 @@ def test_a_derivative_by_hand():
     pressure = 0.5 * 1.225 * 30.0**2 * 0.55
     assert d["M_de"] == pytest.approx(pressure * 0.18994 / 1.135 * -0.5 * -0.4)
     assert d["M_q"] == pytest.approx(pressure * 0.18994 / 1.135 * -3.6 * 0.18994 / 60.0)
+    drag = pressure * 0.0437 + 0.0230 * (13.5 * 9.80665) ** 2 / pressure
+    assert d["X_u"] == pytest.approx(-4.5 * drag / 13.5 / 30.0, rel=1e-3)
     gamma = 0.8244 * 1.759 - 0.1204**2
     assert d["L_p"] == pytest.approx(pressure * 2.8956**2 / 60.0 * (1.759 * -0.26 + 0.1204 * 0.022) / gamma)
     assert d["N_r"] == pytest.approx(pressure * 2.8956**2 / 60.0 * (0.1204 * 0.14 + 0.8244 * -0.35) / gamma)

@@ -13,7 +13,7 @@ from fleet.frames import G
 from fleet.physics.wrench import NAMES, OFFSETS
 
 _DOUBT = {  # beyond a share of the derivative itself, times the airframe's own `doubt`
-    "X": {"0": 2.0, "u": 0.3, "w": 0.3, "de": 1.2, "dt": 1.0, "ww": 0.05},
+    "X": {"0": 2.0, "u": 0.2, "w": 0.3, "de": 1.2, "dt": 1.0, "ww": 0.05},
     "Z": {"0": 3.0, "u": 0.3, "w": 0.3, "q": 0.3, "de": 1.0},
     "M": {"0": 3.0, "u": 0.05, "w": 0.01, "q": 0.1, "de": 0.1, "dt": 1.0},
     "Y": {"v": 0.05, "p": 0.3, "r": 0.3, "da": 0.4, "dr": 0.4, "0": 0.5},

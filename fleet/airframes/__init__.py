@@ -12,6 +12,7 @@ from fleet.frames import G
 
 RHO = 1.225  # air at sea level [kg/m3]
 GENERIC = "small_fixed_wing"
+_FADE = 2.5  # thrust a fixed-pitch propeller loses as it flies faster, -(V / T) dT/dV at 0.7 of its zero-thrust J [-]
 _HERE = Path(__file__).parent
 _NUMBERS = ("mass", "J_x", "J_y", "J_z", "J_xz", "S", "b", "c", "speed", "thrust", "doubt")
 _POSITIVE = ("mass", "J_x", "J_y", "J_z", "S", "b", "c", "speed", "doubt")
@@ -89,7 +90,7 @@ def derivatives(of: Airframe, V: float) -> dict[str, float]:
     """Give the dimensional derivatives at airspeed V in level flight, by their names in `fleet.physics.wrench`.
 
     Specific force [m/s2] and angular acceleration [rad/s2] per m/s, rad/s and full command; offsets are left out.
-    Body axes at a small angle of attack: lift along -z, drag along -x.
+    Body axes at a small angle of attack: lift along -z, drag and what speed takes from thrust along -x.
     """
     a, k, t = of.value, of.coefficient, of.throw
     pressure = 0.5 * RHO * V * V * a["S"]
@@ -98,7 +99,7 @@ def derivatives(of: Airframe, V: float) -> dict[str, float]:
     force, span, chord = pressure / a["mass"], a["b"] / (2 * V), a["c"] / (2 * V)
     pitch = pressure * a["c"] / a["J_y"]
     out = {
-        "X_u": -2 * force * drag / V,
+        "X_u": -(2 + _FADE) * force * drag / V,  # thrust is drag in level flight
         "X_w": force * (lift - 2 * k["C_D_k"] * lift * k["C_L_alpha"]) / V,
         "X_de": 0.0,
         "X_dt": a["thrust"],
