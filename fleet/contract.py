@@ -257,6 +257,10 @@ class Model(Message, frozen=True, kw_only=True):
     longitudinal: Linear | None = None
     lateral: Linear | None = None
     derivatives: Annotated[Derivatives | None, Meta(description="of the coupled model; null for method paper")] = None
+    earned: Annotated[
+        dict[str, float],
+        Meta(description="share of a 10 s free run's departure from the mean that unseen flight bore out, 0..1"),
+    ] = {}
     window_t0: Annotated[float, Meta(description="first instant of the identification window [s since 1970]")] = 0.0
     window_s: Annotated[float, Meta(description="length of the identification window [s]")] = 0.0
     interpolated: Annotated[float, Meta(description="share of the window that was interpolated, 0..1")] = 0.0

@@ -122,6 +122,7 @@ MESSAGES = (
         longitudinal=_linear(("u", "w", "q", "theta"), ("delta_e", "delta_t")),
         lateral=_linear(("phi", "psi", "p", "r", "v"), ("delta_a", "delta_r")),
         derivatives=DERIVATIVES,
+        earned={"u": 0.75, "psi": 1.0},
         window_t0=T - 20.0,
         window_s=20.0,
         interpolated=0.05,

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
-from coupled_flights import aircraft, known
-from flights import T0, linear_flight
+from coupled_flights import aircraft, fly, known
+from flights import T0, linear_flight, truth
 
 from fleet.contract import Outcome, Verdict
+from fleet.window import STATES
 from twin_worker import choose as choosing
 from twin_worker.memory import Believed, Twin
+from twin_worker.unseen import Unseen
 
 VERDICT = Verdict(outcome=Outcome.VERIFIED, sentence="mean fit 30 %")
 WINDOW = linear_flight(20.0)
@@ -96,3 +98,14 @@ def test_models_are_flown_now_and_then_not_every_hop(monkeypatch):
 
 def test_without_a_route_there_is_nothing_to_fly():
     assert np.isnan(choosing.hindcast(Twin(1), WINDOW, 100, known(aircraft(0))))
+
+
+def test_what_runs_have_earned_is_learnt_on_flight_and_published():
+    """A model that is the aircraft earns belief; what two linear axes earn is not said."""
+    flight = fly(aircraft(0), 80.0, seed=4)
+    lesson = Unseen(known(aircraft(0), T0, T0 + 40.0), flight, 1000).lesson(20.0, 5.0)
+    assert lesson is not None and lesson[0].shape == lesson[1].shape
+    twin = Twin(1)
+    twin.earned.learn(*lesson, flight.dt)
+    assert set(twin.earned.at(10.0)) == set(STATES) and min(twin.earned.at(10.0).values()) > 0.6
+    assert Unseen(truth(), WINDOW, 100).lesson(20.0, 5.0) is None

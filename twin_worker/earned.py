@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fleet.window import STATES
+from twin_worker.observer import Observer
 
 KNOTS_S = np.array([0.0, 1.0, 4.0, 10.0, 20.0, 40.0])  # look-ahead of kappa and hold [s]
 _WEIGHT = 0.3  # lessons that the look-ahead before counts as
@@ -69,6 +70,11 @@ class Earned:
             out[knot] = k / np.maximum(k.sum(axis=-1, keepdims=True), 1.0)
         return out
 
+    def at(self, ahead_s: float) -> dict[str, float]:
+        """Give kappa of every state at a look-ahead."""
+        kappa = self.shares()[..., 0]
+        return {name: float(np.interp(ahead_s, KNOTS_S, kappa[:, j])) for j, name in enumerate(STATES)}
+
     def forecast(self, run: np.ndarray, y0: np.ndarray, m: np.ndarray, ahead: np.ndarray) -> np.ndarray:
         """Temper free runs.
 
@@ -83,6 +89,26 @@ class Earned:
         mean = _mean(m, y0)
         tempered = mean[..., None, :] + kappa * (run - mean[..., None, :]) + hold * (y0 - mean)[..., None, :]
         return np.where(np.isfinite(tempered), tempered, mean[..., None, :])
+
+
+def runs_and_flown(
+    eye: Observer, y: np.ndarray, delta: np.ndarray, begins: np.ndarray, seconds: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give free runs from rows of a flight, and what was flown meanwhile, nan where it is not known, (k, n, 9) each.
+
+    Args:
+        eye: filter of the model
+        y: measured states, u v w over the ground, nan where nobody measured, (n, 9)
+        delta: inputs as they act, (n, 4)
+        begins: rows the runs begin at, (k,)
+        seconds: length of a run [s]
+    """
+    length = min(round(seconds / eye.dt) + 1, len(y))
+    runs = eye.fly(eye.track(y, delta)[begins], begins, length, delta)
+    rows = begins[:, None] + np.arange(length)
+    flown = y[np.minimum(rows, len(y) - 1)]
+    flown[rows >= len(y)] = np.nan
+    return runs, flown
 
 
 def _mean(m: np.ndarray, y0: np.ndarray) -> np.ndarray:

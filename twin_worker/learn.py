@@ -16,6 +16,7 @@ from twin_worker.memory import Twin
 from twin_worker.plant import DYNAMICS, Plant
 from twin_worker.preprocess import DT
 from twin_worker.publish import model_message
+from twin_worker.unseen import Unseen
 from twin_worker.verify import told, verify
 
 LEAST_S = 30.0  # shortest stretch worth identifying [s]
@@ -27,6 +28,7 @@ _HELD_S = 8.2, 20.0, 40.2  # held out: least; most of `--method paper`; most [s]
 _HELD_SHARE = 0.3, 0.5  # of what there is, held out [-]
 _FREE_RUN_S = (2.0, 4.0, 2.0, 8.0)  # free-run length of the n-th try of `--method paper` [s]
 _SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the stretch the n-th try uses [-]
+_RUN_S, _RUN_EVERY_S = 20.0, 5.0  # free runs that show what they are worth: how long, how often [s]
 _TELL_S = 5.0  # between models that say nothing new [s]
 
 
@@ -59,6 +61,9 @@ def learn(twin: Twin) -> list[Message]:
         return []
     twin.told_t = float(window.t[-1])
     twin.verdict = told(verdict, plant, window, known)
+    lesson = Unseen(plant, window, known).lesson(_RUN_S, _RUN_EVERY_S)
+    if lesson is not None:
+        twin.earned.learn(*lesson, window.dt)
     twin.model = model_message(twin, window)
     return [twin.model]
 

@@ -12,6 +12,7 @@ from fleet.contract import Message, Mission, Model, Outcome, Params, Prediction,
 from fleet.frames import Origin
 from fleet.window import Window
 from twin_worker.coupled import Coupled
+from twin_worker.earned import Earned
 from twin_worker.greybox import Grey
 from twin_worker.history import History
 from twin_worker.horizon import Record
@@ -82,6 +83,7 @@ class Twin:
     plant: Plant | None = None  # the model in force
     near: Coupled | None = None  # newest coupled model, believed or not: the next search begins there
     last: Coupled | None = None  # newest coupled model believed: it holds the parameters of the next
+    earned: Earned = field(default_factory=Earned)
     verdict: Verdict = field(default_factory=_unheard)
     pool: list[Believed] = field(default_factory=list)
     in_force: Verdict | None = None  # the verdict `plant` was believed on

@@ -10,6 +10,7 @@ from twin_worker.coupled import Coupled
 from twin_worker.linearise import linearise
 from twin_worker.memory import Twin
 
+EARNED_S = 10.0  # look-ahead the published shares are for [s]
 _TOLD = 0.5  # share of a parameter's prior variance that data must remove to have told it [-]
 
 
@@ -30,6 +31,7 @@ def model_message(twin: Twin, window: Window) -> Model:
         longitudinal=axes[0],
         lateral=axes[1],
         derivatives=derivatives,
+        earned=twin.earned.at(EARNED_S) if derivatives else {},
         window_t0=float(window.t[0]),
         window_s=window.seconds,
         interpolated=float(window.filled.mean()),

@@ -5,6 +5,7 @@ import numpy as np
 from fleet.physics.actuators import TAU, lagged
 from fleet.window import STATES, Window
 from twin_worker.coupled import Coupled, states
+from twin_worker.earned import runs_and_flown
 from twin_worker.observer import Observer
 from twin_worker.output_error import LINE
 from twin_worker.plant import Plant
@@ -49,6 +50,20 @@ class Unseen:
             out = self.runs(2)
             out[::2] = np.nan
         return np.where(self.ok[:, None], out, np.nan)
+
+    def lesson(self, seconds: float, every: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Give a coupled model's free runs, what was flown meanwhile, and the mean before; None for two linear axes.
+
+        Args:
+            seconds, every: length of a run, and time between their starts [s]
+        """
+        if not isinstance(self._plant, Coupled):
+            return None
+        y = np.where(self._window.ok[:, None], self._y, np.nan)
+        begins = np.arange(self._start, len(y) - round(1.0 / self.dt), round(every / self.dt))
+        before = self._y[: self._start][self._window.ok[: self._start]]
+        runs, flown = runs_and_flown(Observer(self._plant, self.dt), y, self._delta, begins, seconds)
+        return runs, flown, before.mean(axis=0)
 
     def _fresh(self, begins: np.ndarray) -> np.ndarray:
         """Read the states at rows off a line through the rows up to each; off that row alone where they are broken."""

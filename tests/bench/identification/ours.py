@@ -13,7 +13,7 @@ from fleet.frames import body_to_ned, ned_to_body
 from fleet.physics.actuators import TAU, lagged
 from fleet.window import Window
 from twin_worker.coupled import identify
-from twin_worker.earned import Earned
+from twin_worker.earned import Earned, runs_and_flown
 from twin_worker.observer import Observer
 from twin_worker.wind import WindFilter
 
@@ -54,13 +54,10 @@ class Seen:
 
     def look_back(self, flight: Flight, weight: float, earned: Earned | None = None) -> None:
         """Learn from a stretch what the runs are worth."""
-        length = min(round(_AHEAD_S / flight.dt) + 1, len(flight))
         begins = np.arange(_SETTLE, len(flight) - round(1 / flight.dt), round(_EVERY_S / flight.dt))
-        runs = self.runs(flight.x, flight.u, begins, length)
-        rows = begins[:, None] + np.arange(length)
-        y = np.where(flight.ok[:, None], flight.x, np.nan)[np.minimum(rows, len(flight) - 1)]
-        y[rows >= len(flight)] = np.nan
-        (earned or self.earned).learn(runs, y, self.mean, flight.dt, weight)
+        y, delta = np.where(flight.ok[:, None], flight.x, np.nan), lagged(flight.u, flight.dt, TAU)
+        runs, flown = runs_and_flown(self.eye, y, delta, begins, _AHEAD_S)
+        (earned or self.earned).learn(runs, flown, self.mean, flight.dt, weight)
 
 
 class Ours:
