@@ -20,7 +20,7 @@ def choose(monkeypatch):
     """Let a twin with models `name: miss so far` choose, when each model's next flight misses by `misses[name]`."""
 
     def call(misses, *, pool=(), new=None, verdict=VERDICT):
-        monkeypatch.setattr(choosing, "hindcast", lambda twin, window, start, plant: misses[plant])
+        monkeypatch.setattr(choosing, "hindcast", lambda begin, window, start, plant: misses[plant])
         twin = Twin(1, pool=[Believed(name, VERDICT, float(t), miss) for t, (name, miss) in enumerate(pool)])
         return twin, choosing.choose(twin, WINDOW, 400, new, verdict)
 
@@ -97,7 +97,7 @@ def test_models_are_flown_now_and_then_not_every_hop(monkeypatch):
 
 
 def test_without_a_route_there_is_nothing_to_fly():
-    assert np.isnan(choosing.hindcast(Twin(1), WINDOW, 100, known(aircraft(0))))
+    assert np.isnan(choosing.hindcast(None, WINDOW, 100, known(aircraft(0))))
 
 
 def test_what_runs_have_earned_is_learnt_on_flight_and_published():

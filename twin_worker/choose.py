@@ -7,9 +7,9 @@ from fleet.contract import Outcome, Verdict
 from fleet.window import Window
 from twin_worker.memory import Believed, Twin
 from twin_worker.plant import Plant
-from twin_worker.predict import fly_ahead
+from twin_worker.predict import Flown, Start, fly_from, set_out
 
-FLY_S = 5.0  # between flights of the same models [s]
+FLY_S = 6.0  # between flights of the same models [s]
 _FLIGHT_S = 20.0  # of the newest data flown [s]
 _KEEP = 3  # verified models kept to choose from
 _NEW = 1.2  # a new model's only flight so far counts as a miss this much larger [-]
@@ -31,10 +31,11 @@ def choose(twin: Twin, window: Window, known: int, plant: Plant, verdict: Verdic
         return verdict
     twin.flown_t = float(window.t[-1])
     start = max(known, len(window) - 1 - int(_FLIGHT_S / window.dt))
+    begin = set_out(twin.situation(window.part(0, start + 1))) if not twin.why_no_route() else None
     for one in twin.pool:
-        one.flown(hindcast(twin, window, start, one.plant))
+        one.flown(hindcast(begin, window, start, one.plant))
     if verdict.outcome is Outcome.VERIFIED:
-        verdict = _join(twin, window, start, plant, verdict)
+        verdict = _join(twin, window, plant, verdict, hindcast(begin, window, start, plant))
     twin.pool = sorted((one for one in twin.pool if not np.isinf(one.miss)), key=Believed.rank)[:_KEEP]
     if not twin.pool:
         return verdict
@@ -46,9 +47,8 @@ def choose(twin: Twin, window: Window, known: int, plant: Plant, verdict: Verdic
     return verdict
 
 
-def _join(twin: Twin, window: Window, start: int, plant: Plant, verdict: Verdict) -> Verdict:
+def _join(twin: Twin, window: Window, plant: Plant, verdict: Verdict, miss: float) -> Verdict:
     """Take a verified model into the pool, unless it cannot fly the route."""
-    miss = hindcast(twin, window, start, plant)
     if np.isinf(miss):
         sentence = f"{verdict.sentence}; but on the route the twin leaves its envelope; trying again"
         return msgspec.structs.replace(verdict, outcome=Outcome.DIVERGED, sentence=sentence)
@@ -56,13 +56,13 @@ def _join(twin: Twin, window: Window, start: int, plant: Plant, verdict: Verdict
     return verdict
 
 
-def hindcast(twin: Twin, window: Window, start: int, plant: Plant) -> float:
-    """Give the mean miss of a flight from row `start` to the end [m]; inf: it diverges, nan: no route."""
-    if twin.why_no_route():
+def hindcast(begin: Start | Flown | None, window: Window, start: int, plant: Plant) -> float:
+    """Give the mean miss of a flight from row `start` to the end [m]; inf: it diverges, nan: no route to fly."""
+    if not isinstance(begin, Start):
         return np.nan
     ahead = np.arange(0.0, int((len(window) - 1 - start) * window.dt) + 1.0)
-    flown = fly_ahead(twin.situation(window.part(0, start + 1)), plant, ahead)
+    flown = fly_from(begin, plant, ahead)
     if flown.path is None:
-        return np.inf if flown.diverged else np.nan
+        return np.inf
     rows = start + np.rint(ahead / window.dt).astype(int)
     return float(np.linalg.norm(flown.path - window.p[rows], axis=1).mean())

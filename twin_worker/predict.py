@@ -41,6 +41,25 @@ class Flown:
 
 
 @dataclass(frozen=True)
+class Start:
+    """Where flights ahead start, whatever model flies them.
+
+    Attributes:
+        good: what was flown on the present route
+        control: synchronised state, parameters and legs of the controller twin
+        state: state, commands and inputs in force, and air, as `fleet.simulate` takes them
+        seq: mission item in force
+        sentence: what limits the flights, or empty
+    """
+
+    good: Window
+    control: tuple[np.ndarray, np.ndarray, np.ndarray]
+    state: tuple[np.ndarray, np.ndarray, np.ndarray]
+    seq: int
+    sentence: str
+
+
+@dataclass(frozen=True)
 class Onboard:
     """What is known of the autopilot: its route and its parameters."""
 
@@ -86,6 +105,12 @@ def fly_ahead(now: Situation, plant: Plant, ahead: np.ndarray) -> Flown:
         plant: coupled model, or longitudinal and lateral one
         ahead: wanted look-ahead times from there, rising, (k,) [s]
     """
+    start = set_out(now)
+    return start if isinstance(start, Flown) else fly_from(start, plant, ahead)
+
+
+def set_out(now: Situation) -> Start | Flown:
+    """Synchronise the controller twin on what was flown; give where any model starts, or why none can."""
     good = _on_this_route(now.window, now.onboard.since)
     if len(good) < 5.0 / good.dt:
         return Flown(None, -1, f"{good.seconds:.0f} s on this route, 5 s are needed; wait")
@@ -103,15 +128,22 @@ def fly_ahead(now: Situation, plant: Plant, ahead: np.ndarray) -> Flown:
     kind = int(way.legs[int(ctl[arduplane.LEG]), KIND])
     if kind in _REFUSED:
         return Flown(None, int(seq[-1]), f"{_REFUSED[kind]} is not modelled: no route-aware prediction")
-    out = np.empty((int(ahead[-1] / good.dt) + 2, N_STATE))
-    done = simulate(ctl, par, way.legs, settled(plant, good), *_start(now, good), good.dt, out)
-    if done <= ahead[-1] / good.dt:
-        return Flown(None, int(seq[-1]), f"the twin leaves its envelope {done * good.dt:.0f} s ahead", True)
-    path = np.column_stack([np.interp(ahead, good.dt * np.arange(done), column) for column in out[:done, :3].T])
     said = list(way.sentences)
     if absent:
         said.append(f"{len(absent)} autopilot parameters not received, defaults assumed ({', '.join(absent[:3])} …)")
-    return Flown(path, int(seq[-1]), " ".join(said))
+    return Start(good, (ctl, par, way.legs), _start(now, good), int(seq[-1]), " ".join(said))
+
+
+def fly_from(start: Start, plant: Plant, ahead: np.ndarray) -> Flown:
+    """Fly one model from there; arguments as for `fly_ahead`."""
+    ctl, par, legs = start.control
+    dt = start.good.dt
+    out = np.empty((int(ahead[-1] / dt) + 2, N_STATE))
+    done = simulate(ctl.copy(), par, legs, settled(plant, start.good), *start.state, dt, out)
+    if done <= ahead[-1] / dt:
+        return Flown(None, start.seq, f"the twin leaves its envelope {done * dt:.0f} s ahead", True)
+    path = np.column_stack([np.interp(ahead, dt * np.arange(done), column) for column in out[:done, :3].T])
+    return Flown(path, start.seq, start.sentence)
 
 
 def _on_this_route(window: Window, since: float) -> Window:
