@@ -24,6 +24,7 @@ T0 = 1_700_000_000.0
 DT = 0.04
 HERE = Origin(470_000_000, 80_000_000, 500_000)
 HZ = {"attitude": 25.0, "servo": 20.0, "velocity": 10.0, "position": 10.0, "air": 10.0, "command": 5.0, "leg": 1.0}
+ROUTE = ("dynamics", "hybrid", "both")  # methods that fly a route with an identified model
 SPEED = 22.0  # trim of the linear flights [m/s]
 Laid = dict[str, tuple[np.ndarray, np.ndarray]]
 

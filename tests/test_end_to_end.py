@@ -180,7 +180,12 @@ def test_a_flight_of_another_autopilot_is_predicted_on_its_own_mission(router: s
         bus.subscribe(Model, lambda message, _: models.append(message))
         link = f"replay:{flight}?speed=30"
         with process("gateway", "--link", link, f"--offset={uav}", "--router", router) as gateway:
-            wait(lambda: any(p.state is State.PREDICTING and p.method == "dynamics" for p in predicted), gateway)
+            wait(
+                lambda: any(
+                    p.state is State.PREDICTING and p.method in ("dynamics", "hybrid", "both") for p in predicted
+                ),
+                gateway,
+            )
             ((mission, _),), ((params, _),) = bus.ask(Mission), bus.ask(Params)
     good = next(p for p in predicted if p.state is State.PREDICTING)
     assert mission.complete and len(mission.items) == 17

@@ -21,7 +21,7 @@ ROOMS = (  # inside fleet a room imports only from rooms above it, and from itse
     ("physics",),
     ("effects",),
     ("autopilots",),
-    ("simulate",),
+    ("simulate", "hybrid"),
     ("telemetry",),
     ("sheet", "page", "bars"),
     ("pretend",),
@@ -43,7 +43,7 @@ APART = (  # who, and what it must never import
     ("gateway", ("twin_worker", "viewer")),
     ("twin_worker", ("gateway", "viewer", "fleet.pretend")),
     ("viewer", ("gateway", "twin_worker", "fleet.pretend")),
-    ("fleet.pretend", ("fleet.physics", "fleet.effects", "fleet.simulate")),  # never our own physics
+    ("fleet.pretend", ("fleet.physics", "fleet.effects", "fleet.simulate", "fleet.hybrid")),  # never our own physics
     ("fleet.effects", ("fleet.pretend",)),  # one code must never both conceal and find
     ("fleet.simulate", ("fleet.pretend",)),
     ("twin_worker.diagnose", ("fleet.pretend",)),

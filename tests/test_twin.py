@@ -16,6 +16,7 @@ from fleet.contract import (
     State,
     Status,
 )
+from tests.flights import ROUTE
 from twin_worker.offline import run
 from twin_worker.twin import Twin, advance, fleet_row
 
@@ -48,7 +49,7 @@ def test_before_a_model_it_flies_the_route_by_lags_and_says_why(flown):
 
 def test_in_auto_it_predicts_on_the_route(flown):
     late = [p for p in predictions(flown[1]) if p.t > f.T0 + FLOWN_S - 15.0]
-    on_route = [p for p in late if p.method == "dynamics"]
+    on_route = [p for p in late if p.method in ROUTE]
     assert len(on_route) >= 0.8 * len(late) > 5
     assert all(p.state is State.PREDICTING and p.seq >= 1 and "L1" in p.law for p in on_route)
     assert all(0 <= p.horizon_s <= 60 for p in late)
@@ -64,7 +65,7 @@ def test_the_prediction_comes_true_for_a_few_seconds(flown):
     where = to_ned(twin.origin, *position.T)
     miss = []
     for p in predictions(results):
-        if p.method == "dynamics" and p.t + 8.0 < t[-1]:
+        if p.method in ROUTE and p.t + 8.0 < t[-1]:
             flew = [np.interp(p.t + 8.0, t, c) for c in where.T]
             miss.append(np.linalg.norm(p.path.numpy()[8] - flew))
     assert len(miss) > 5 and np.median(miss) < 40.0  # of some 190 m
@@ -169,4 +170,4 @@ def test_what_has_no_wings_is_not_given_any(heard):
 def test_an_autopilot_flown_by_a_law_that_is_not_its_own_is_said(twin):
     end = twin.history.newest
     (made,) = predictions(advance(twin, [status(twin, autopilot="px4")], end + 1.0))
-    assert made.method == "dynamics" and "px4 is flown by ArduPlane's law" in made.sentence
+    assert made.method in ROUTE and "px4 is flown by ArduPlane's law" in made.sentence

@@ -40,9 +40,12 @@ def main(argv: list[str] | None = None) -> int:
     parser = parser_for("twin_worker", "Identify, verify and predict each UAV of a range.", EXAMPLES)
     parser.add_argument("--uavs", type=id_range, default=range(50), metavar="LO-HI", help="ids to hold (0-49)")
     parser.add_argument("--router", default=ROUTER, help=f"Zenoh router ({ROUTER})")
-    methods = ("dynamics", "paper")
+    methods = ("auto", "dynamics", "hybrid", "paper")
     parser.add_argument(
-        "--method", choices=methods, default=methods[0], help="coupled model or two linear axes (dynamics)"
+        "--method",
+        choices=methods,
+        default=methods[0],
+        help="how to fly ahead: the best of coupled model and hybrid (auto), one of them, or two linear axes (paper)",
     )
     parser.add_argument(
         "--airframe", default=GENERIC, metavar="NAME|FILE", help=f"what is known before flight, a TOML file ({GENERIC})"

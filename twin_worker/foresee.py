@@ -5,15 +5,12 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from fleet.autopilots import arduplane
 from fleet.contract import Array, Message, Prediction, State
-from fleet.window import Window
+from twin_worker.fly_route import fly_route
 from twin_worker.horizon import AHEAD, QUANTILE, Made
 from twin_worker.imm import STEP, imm
 from twin_worker.kinds import Flight, fly_kind, hangs, nothing, seen
 from twin_worker.memory import Twin
-from twin_worker.plant import method
-from twin_worker.predict import fly_ahead
 from twin_worker.track import STEP as TRACK_STEP
 from twin_worker.track import Track
 
@@ -49,13 +46,14 @@ def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
     window = twin.window(_LOOK_BACK_S)
     whole = window is not None and bool(window.ok[-1])
     why = twin.verdict.sentence
-    if twin.plant is not None and not hangs(twin):
+    if (twin.plant is not None or twin.hybrid is not None) and not hangs(twin):
         first = nothing(twin.why_no_route() or "telemetry is broken: the model has nothing to start from")
         if window is not None and whole and not twin.why_no_route():
-            first = _dynamics(twin, window, ahead)
+            first = fly_route(twin, window, ahead)
         if _good(first):
             twin.state = _state(twin, State.PREDICTING)
-            return first, float(window.t[-1])  # type: ignore[union-attr]
+            sentence = " ".join(filter(None, (_strange_law(twin), first.sentence)))
+            return replace(first, sentence=sentence), float(window.t[-1])  # type: ignore[union-attr]
         why = first.sentence
     second = fly_kind(twin, flown, ahead)
     if _good(second):
@@ -70,16 +68,6 @@ def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
 
 def _good(flight: Flight) -> bool:
     return flight.path is not None and bool(np.isfinite(flight.path).all())
-
-
-def _dynamics(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
-    """Fly the identified model and the controller twin on the route, or say why not."""
-    assert twin.plant is not None
-    flown = fly_ahead(twin.situation(window), twin.plant, ahead)
-    if flown.path is None:
-        return nothing(flown.sentence, flown.seq)
-    sentence = " ".join(filter(None, (_strange_law(twin), flown.sentence)))
-    return Flight(flown.path, method(twin.plant), arduplane.LAW, flown.seq, sentence)
 
 
 def _strange_law(twin: Twin) -> str:

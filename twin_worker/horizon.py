@@ -18,14 +18,14 @@ LIMIT = 0.10  # relative error at which trust ends [-]
 QUANTILE = 0.9
 _FLOOR_S = 2.0  # least path length, as seconds of ground speed [s]
 _PRIOR = {  # expected spread of along, cross, vertical: base [m], growth [m/s^power], power
-    "dynamics": (np.array([1.0, 0.8, 0.6]), np.array([0.4, 0.15, 0.15]), 1.2),
+    **{m: (np.array([1.0, 0.8, 0.6]), np.array([0.4, 0.15, 0.15]), 1.2) for m in ("dynamics", "hybrid", "both")},
     "paper": (np.array([1.0, 0.8, 0.6]), np.array([0.5, 0.2, 0.2]), 1.3),
     "copter": (np.array([1.0, 0.8, 0.6]), np.array([0.3, 0.1, 0.1]), 1.1),
     "greybox": (np.array([1.5, 1.0, 1.0]), np.array([0.5, 0.3, 0.2]), 1.3),
     "imm": (np.array([2.0, 2.0, 1.0]), np.array([1.6, 1.6, 0.5]), 1.4),
 }
 _PRIOR_PASSAGES = {  # stand in for past times to 10 %; drawn from 541 (copter 190, greybox 260) predictions [s]
-    "dynamics": (8.0, 30.0, 60.0),
+    **dict.fromkeys(("dynamics", "hybrid", "both"), (8.0, 30.0, 60.0)),
     "paper": (8.0, 30.0, 60.0),
     "copter": (1.0, 30.0, 60.0),
     "greybox": (8.0, 60.0, 60.0),

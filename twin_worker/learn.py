@@ -8,12 +8,13 @@ from fleet.frames import G
 from fleet.window import Window
 from twin_worker import coupled
 from twin_worker.choose import choose
+from twin_worker.hybrid.renew import renew
 from twin_worker.identify import AXES, identify_axis
-from twin_worker.kinds import NO_WINGS, QUADPLANE, compare_with_flight
+from twin_worker.kinds import NO_WINGS, QUADPLANE, WINGS, compare_with_flight
 from twin_worker.lacking import lacking
 from twin_worker.lift import SETTLE_S, lifted
 from twin_worker.memory import Twin
-from twin_worker.plant import DYNAMICS, Plant
+from twin_worker.plant import PAPER, Plant
 from twin_worker.preprocess import DT
 from twin_worker.publish import model_message
 from twin_worker.unseen import Unseen
@@ -35,6 +36,8 @@ _TELL_S = 5.0  # between models that say nothing new [s]
 def learn(twin: Twin) -> list[Message]:
     """Identify and verify once; give the model with its verdict where it is news, nothing while data are starved."""
     compare_with_flight(twin)
+    if twin.vehicle in WINGS and twin.method != PAPER:
+        renew(twin)
     window = _on_wings(twin, twin.window(_stretch_s(twin) + _held_most(twin)))
     why_not = _why_not(twin, window)
     if window is None or why_not is not None:
@@ -42,13 +45,13 @@ def learn(twin: Twin) -> list[Message]:
             twin.verdict, twin.state = why_not, State.WAITING
         return []
     twin.state = State.IDENTIFYING if twin.plant is None else twin.state
-    known = len(window) - int(np.clip(_HELD_SHARE[twin.method == DYNAMICS] * len(window), *_held_limits(twin)))
+    known = len(window) - int(np.clip(_HELD_SHARE[twin.method != PAPER] * len(window), *_held_limits(twin)))
     try:
         plant = _identify(twin, window.part(0, known))
     except (ValueError, np.linalg.LinAlgError) as error:
         twin.verdict = Verdict(outcome=Outcome.STARVED, sentence=f"{twin.name}: {error}", tries=twin.tries)
         return []
-    verdict = verify(plant, window, known, twin.omega, twin.plant if twin.method == DYNAMICS else None)
+    verdict = verify(plant, window, known, twin.omega, twin.plant if twin.method != PAPER else None)
     verdict = msgspec.structs.replace(verdict, sentence=f"{twin.name}: {verdict.sentence}", tries=twin.tries)
     verdict = choose(twin, window, known, plant, verdict)
     if verdict.outcome is Outcome.VERIFIED and isinstance(plant, coupled.Coupled):
@@ -75,14 +78,14 @@ def _changed(now: Verdict, before: Verdict) -> bool:
 
 
 def _stretch_s(twin: Twin) -> float:
-    if twin.method != DYNAMICS:
+    if twin.method == PAPER:
         return _PAPER_S
     speed = float(twin.near.at[0]) if twin.near else 0.0
     return float(np.clip(_LENGTH * speed / G, *_STRETCH_S))
 
 
 def _held_most(twin: Twin) -> float:
-    return _HELD_S[1 + (twin.method == DYNAMICS)]
+    return _HELD_S[1 + (twin.method != PAPER)]
 
 
 def _held_limits(twin: Twin) -> tuple[float, float]:
@@ -108,7 +111,7 @@ def _identify(twin: Twin, known: Window) -> Plant:
     attempt = twin.tries % len(_SHARE)
     twin.tries += 1
     known = known.part(int(len(known) * (1 - _SHARE[attempt])), len(known))
-    if twin.method == DYNAMICS:
+    if twin.method != PAPER:
         near = twin.near if attempt == 0 and twin.near and twin.near.t1 > known.t[0] else None
         twin.near = coupled.identify(known, twin.wind.wind, twin.airframe, twin.last, near)
         return twin.near

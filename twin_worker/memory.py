@@ -11,18 +11,21 @@ from fleet.autopilots import arduplane
 from fleet.contract import Message, Mission, Model, Outcome, Params, Prediction, Sample, State, Status, Verdict
 from fleet.frames import Origin
 from fleet.window import Window
+from twin_worker.contest import Contest
 from twin_worker.coupled import Coupled
 from twin_worker.earned import Earned
 from twin_worker.greybox import Grey
 from twin_worker.history import History
 from twin_worker.horizon import Record
-from twin_worker.plant import DYNAMICS, Plant
+from twin_worker.hybrid.fit import Hybrid
+from twin_worker.plant import Plant
 from twin_worker.predict import Onboard, Situation
 from twin_worker.preprocess import Grid
 from twin_worker.rotor import Rotor
 from twin_worker.verify import OMEGA
 from twin_worker.wind import WindFilter
 
+AUTO = "auto"  # every way of flying ahead, the best of them used
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 
 
@@ -66,7 +69,7 @@ class Twin:
 
     uav: int
     omega: float = OMEGA
-    method: str = DYNAMICS
+    method: str = AUTO
     airframe: Airframe = field(default_factory=lambda: load(GENERIC))
     history: History = field(default_factory=History)
     grid: Grid = field(default_factory=Grid)
@@ -83,6 +86,11 @@ class Twin:
     plant: Plant | None = None  # the model in force
     near: Coupled | None = None  # newest coupled model, believed or not: the next search begins there
     last: Coupled | None = None  # newest coupled model believed: it holds the parameters of the next
+    hybrid: Hybrid | None = None  # identified and believed
+    near_hybrid: Hybrid | None = None  # identified last, believed or not
+    strays: float = float("nan")  # how far it strays over 20 s held out, over the way [-]
+    contest: Contest = field(default_factory=Contest)
+    spread: np.ndarray | None = None  # of the newest ensemble, along, cross, vertical, (k, 3) [m]
     earned: Earned = field(default_factory=Earned)
     verdict: Verdict = field(default_factory=_unheard)
     pool: list[Believed] = field(default_factory=list)
@@ -100,6 +108,9 @@ class Twin:
     score_t: float = -np.inf
     flown_t: float = -np.inf  # models last flown in closed loop
     told_t: float = -np.inf  # model last published
+    hybrid_t: float = -np.inf  # hybrid last identified
+    checked_t: float = -np.inf  # hybrid last flown over what was held out
+    spread_t: float = -np.inf  # ensemble last flown
     lost: bool = False
     bad: int = 0
 
@@ -185,7 +196,7 @@ def _hear_status(twin: Twin, status: Status) -> None:
         twin.history.clear()
         twin.grid.clear()
         twin.wind.t = twin.wind_t = twin.identify_t = twin.score_t = -np.inf  # the new time may lie before
-        twin.flown_t = twin.told_t = -np.inf
+        twin.flown_t = twin.told_t = twin.hybrid_t = twin.checked_t = -np.inf
         twin.near = twin.last = None
         twin.data_t = twin.turned_t = -np.inf
         _event(twin, status.t)
@@ -196,5 +207,6 @@ def _hear_status(twin: Twin, status: Status) -> None:
 def _event(twin: Twin, t: float) -> None:
     """Invalidate the running prediction: mode, mission, parameters or clock changed."""
     twin.since = t
-    twin.predict_t = -np.inf
+    twin.predict_t = twin.spread_t = -np.inf
     twin.record.forget()
+    twin.contest.forget()

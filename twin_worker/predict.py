@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.autopilots import arduplane
+from fleet.autopilots.arduplane.params import VA_CRUISE
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
 from fleet.mission import KIND, LAND, TAKEOFF, route
@@ -16,6 +17,7 @@ from fleet.simulate import N_STATE, simulate
 from fleet.window import Window
 from twin_worker.history import History
 from twin_worker.plant import Plant, acting, settled
+from twin_worker.speed import aimed_at, as_told
 from twin_worker.wind import WindFilter
 
 SHADOW_S = 60.0  # telemetry the controller twin is synchronised on [s]
@@ -123,15 +125,17 @@ def set_out(now: Situation) -> Start | Flown:
     way = route(now.onboard.items, seq=int(seq[0]), origin=now.origin, params=now.onboard.params)
     if not len(way.legs):
         return Flown(None, int(seq[-1]), " ".join(way.sentences) or "the mission has no legs to fly")
+    told = aimed_at(now.history, float(good.t[-1]))
+    legs = as_told(way.legs, float(seq[-1]), float(par[VA_CRUISE]), told)
     start = way.start if np.isfinite(way.start).all() else good.p[0]
-    ctl, _ = arduplane.shadow(par, way.legs, start, *_telemetry(good, at, now.history), seq)  # type: ignore[call-arg]
-    kind = int(way.legs[int(ctl[arduplane.LEG]), KIND])
+    ctl, _ = arduplane.shadow(par, legs, start, *_telemetry(good, at, now.history), seq)  # type: ignore[call-arg]
+    kind = int(legs[int(ctl[arduplane.LEG]), KIND])
     if kind in _REFUSED:
         return Flown(None, int(seq[-1]), f"{_REFUSED[kind]} is not modelled: no route-aware prediction")
     said = list(way.sentences)
     if absent:
         said.append(f"{len(absent)} autopilot parameters not received, defaults assumed ({', '.join(absent[:3])} …)")
-    return Start(good, (ctl, par, way.legs), _start(now, good), int(seq[-1]), " ".join(said))
+    return Start(good, (ctl, par, legs), _start(now, good), int(seq[-1]), " ".join(said))
 
 
 def fly_from(start: Start, plant: Plant, ahead: np.ndarray) -> Flown:

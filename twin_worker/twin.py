@@ -110,6 +110,10 @@ def _blow(twin: Twin) -> None:
 
 
 def _score(twin: Twin) -> None:
+    if twin.contest.waiting and twin.history.newest >= twin.contest.waiting[0][0] + AHEAD[-1]:
+        assert twin.origin is not None
+        t, position = twin.history.rows("position")
+        twin.contest.answer(t, to_ned(twin.origin, *position.T))
     if not twin.record.waiting or twin.history.newest < twin.record.waiting[0].t + AHEAD[-1]:
         return
     assert twin.origin is not None

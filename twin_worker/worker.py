@@ -15,7 +15,7 @@ from fleet.airframes import GENERIC, Airframe, load
 from fleet.bus import Bus
 from fleet.codec import Stamp
 from fleet.contract import Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, Status
-from twin_worker.plant import DYNAMICS
+from twin_worker.memory import AUTO
 from twin_worker.twin import Twin, advance, fleet_row
 
 _log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ class Worker:
     """Twins of the UAVs in one range of ids."""
 
     def __init__(
-        self, bus: Bus, uavs: range, *, omega: float, method: str = DYNAMICS, airframe: Airframe | None = None
+        self, bus: Bus, uavs: range, *, omega: float, method: str = AUTO, airframe: Airframe | None = None
     ) -> None:
         self.bus = bus
         self.uavs = uavs

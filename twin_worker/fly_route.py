@@ -1,0 +1,84 @@
+"""The route flown ahead by every way the aircraft has, and the one that is used."""
+
+import numpy as np
+
+from fleet.autopilots import arduplane
+from fleet.window import Window
+from twin_worker.horizon import AHEAD
+from twin_worker.hybrid import ensemble
+from twin_worker.hybrid.fly import fly_hybrid
+from twin_worker.kinds import Flight, nothing
+from twin_worker.memory import Twin
+from twin_worker.plant import method
+from twin_worker.predict import Flown, Situation, Start, fly_from, set_out
+
+HYBRID, BOTH = "hybrid", "both"
+_NEAR_S = 60.0  # the identified dynamics are flown as far; beyond, the hybrid goes on from there [s]
+_SPREAD_S = 10.0  # between ensembles [s]
+
+
+def fly_route(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
+    """Fly the route ahead, or say why not.
+
+    Args:
+        twin: whose contest, hybrid, plant and spread are used; contest and spread are renewed
+        window: newest telemetry
+        ahead: wanted look-ahead times from its end, rising, (k,) [s]
+    """
+    now = twin.situation(window)
+    start = set_out(now)
+    if isinstance(start, Flown):
+        return nothing(start.sentence, start.seq)
+    t = float(window.t[-1])
+    due = twin.contest.due(t)
+    paths, why = _paths(twin, (now, start), ahead, due)
+    if not paths:
+        return nothing(why or "no model was believed yet", start.seq)
+    if due and len(paths) > 1 and not twin.lost:
+        twin.contest.keep(t, float(np.linalg.norm(start.good.v[-1])), ahead, paths)
+    _spread(twin, (now, start))
+    chosen = twin.contest.best(tuple(paths))
+    sentence = " ".join(filter(None, (twin.contest.said(chosen), start.sentence)))
+    return Flight(paths[chosen], chosen, arduplane.LAW, start.seq, sentence)
+
+
+def _paths(
+    twin: Twin, begin: tuple[Situation, Start], ahead: np.ndarray, due: bool
+) -> tuple[dict[str, np.ndarray], str]:
+    """Give the path of each method that flies, NED (k, 3) [m], and why another does not."""
+    paths: dict[str, np.ndarray] = {}
+    why = ""
+    if twin.hybrid is not None and twin.method in (HYBRID, "auto"):
+        flown = fly_hybrid(*begin, twin.hybrid, ahead)
+        paths, why = _kept(paths, HYBRID, flown), flown.sentence
+    wanted = not paths or due or twin.contest.best((BOTH, HYBRID, "dynamics")) != HYBRID
+    if twin.plant is not None and twin.method != HYBRID and wanted:
+        near = ahead[: np.searchsorted(ahead, max(_NEAR_S, ahead[0]), side="right")] if paths else ahead
+        flown = fly_from(begin[1], twin.plant, near)
+        why = why if paths else flown.sentence
+        if flown.path is not None and np.isfinite(flown.path).all():
+            path = _lengthened(flown.path, paths[HYBRID]) if paths else flown.path
+            paths = {**paths, method(twin.plant): path}
+    if len(paths) > 1:
+        paths[BOTH] = 0.5 * (paths[HYBRID] + paths[method(twin.plant)])  # type: ignore[arg-type]
+    return paths, why
+
+
+def _kept(paths: dict[str, np.ndarray], name: str, flown: Flown) -> dict[str, np.ndarray]:
+    good = flown.path is not None and bool(np.isfinite(flown.path).all())
+    return {**paths, name: flown.path} if good else paths  # type: ignore[dict-item]
+
+
+def _lengthened(path: np.ndarray, further: np.ndarray) -> np.ndarray:
+    """Go on from the end of `path`, (m, 3), as `further`, (k, 3), does."""
+    end = len(path)
+    return np.vstack([path, further[end:] + (path[-1] - further[end - 1])])
+
+
+def _spread(twin: Twin, begin: tuple[Situation, Start]) -> None:
+    """Fly the ensemble where it is due."""
+    t = float(begin[1].good.t[-1])
+    if twin.hybrid is None or twin.spread_t <= t < twin.spread_t + _SPREAD_S:
+        return
+    rng = np.random.default_rng((twin.uav, int(t)))
+    twin.spread, twin.spread_t = ensemble.spread(*begin, twin.hybrid, AHEAD, rng), t

@@ -1,0 +1,44 @@
+"""The airspeed that the autopilot says it aims at, where the route alone does not tell.
+
+A mission that jumps back keeps the speed that was commanded last; which one that was is not on the wire, but how far
+the flown airspeed is from the wanted one is (NAV_CONTROLLER_OUTPUT).
+"""
+
+import numpy as np
+
+from fleet.mission import SEQ, VA_C
+from twin_worker.history import History
+
+_OVER_S = 3.0  # seconds whose median counts [s]
+_LEAST = 3  # reports within them
+_APART = 0.5  # a smaller difference is rounding and noise [m/s]
+
+
+def aimed_at(history: History, t: float) -> float:
+    """Give the airspeed aimed at just before `t`, as reported; nan where it is not [m/s]."""
+    t_c, command = history.rows("command", t - _OVER_S)
+    t_air, air = history.rows("air", t - _OVER_S - 2.0)
+    if len(t_c) < _LEAST or len(t_air) < _LEAST or air[:, 0].max() < 3.0:
+        return float("nan")
+    wanted = command[:, 4] + np.interp(t_c, t_air, air[:, 0])
+    return float(np.median(wanted[t_c <= t])) if (t_c <= t).any() else float("nan")
+
+
+def as_told(legs: np.ndarray, seq: float, cruise: float, told: float) -> np.ndarray:
+    """Give the legs with the speed that is aimed at on the one in force, and on its neighbours of the same speed.
+
+    Args:
+        legs: route, (n, 9)
+        seq: mission item in force
+        cruise: speed of legs that name none [m/s]
+        told: airspeed aimed at; nan changes nothing [m/s]
+    """
+    found = np.flatnonzero(legs[:, SEQ] == seq)
+    speeds = np.where(legs[:, VA_C] > 0, legs[:, VA_C], cruise)
+    if not len(found) or not abs(told - speeds[found[0]]) > _APART:
+        return legs
+    other = np.flatnonzero(speeds != speeds[found[0]])
+    before, after = other[other < found[0]], other[other > found[0]]
+    changed = legs.copy()
+    changed[before[-1] + 1 if len(before) else 0 : after[0] if len(after) else len(legs), VA_C] = told
+    return changed
