@@ -14,7 +14,7 @@ from math import cos, exp, nan, sin, sqrt, tan
 
 import numpy as np
 
-from fleet.autopilots.arduplane import guide
+from fleet.autopilots.laws import guide
 from fleet.frames import G, wrap
 from fleet.physics.kernel import inlined, kernel
 

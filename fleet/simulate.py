@@ -5,7 +5,7 @@ from math import cos, exp, sin, sqrt
 import numba as nb
 import numpy as np
 
-from fleet.autopilots.arduplane import guide, stabilise
+from fleet.autopilots.laws import guide, stabilise
 from fleet.frames import wrap
 from fleet.physics.actuators import TAU
 from fleet.physics.dynamics import N_X, step
@@ -71,7 +71,7 @@ def simulate(
 
     Args:
         ctl: controller state, changed in place, (N_CTL,)
-        par: controller parameters
+        par: controller parameters; its last slot tells the law, see `fleet.autopilots.laws`
         legs: route, (n, 9), see `fleet.mission`
         plant: as `linear_plant` or `coupled_plant` make it
         state: start, (12,): p NED [m], u v w air-relative FRD [m/s], p q r [rad/s], phi theta psi [rad]

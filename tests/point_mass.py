@@ -1,4 +1,4 @@
-"""A point mass with lags that the ArduPlane law flies in tests."""
+"""A point mass with lags that the control laws fly in tests."""
 
 from math import cos, pi, sin, tan
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from fleet import mission as m
 from fleet.autopilots import arduplane as ap
+from fleet.autopilots import laws
 from fleet.frames import G
 
 HERE = np.full(3, np.nan)
@@ -57,7 +58,9 @@ class Plane:
 
 
 def begin(legs, plane, par=PAR, start=HERE):
-    return ap.init(par, legs, 0, np.array(start, float), plane.p, plane.v, plane.euler, plane.Va, TRIM_ALPHA, TRIM_THR)
+    return laws.init(
+        par, legs, 0, np.array(start, float), plane.p, plane.v, plane.euler, plane.Va, TRIM_ALPHA, TRIM_THR
+    )
 
 
 def fly(legs, plane, seconds, par=PAR, *, start=HERE, dt=0.1, sensor=True, ctl=None):
@@ -67,7 +70,7 @@ def fly(legs, plane, seconds, par=PAR, *, start=HERE, dt=0.1, sensor=True, ctl=N
     for k in range(round(seconds / dt)):
         p, v, euler, Va = plane.p.copy(), plane.v, plane.euler, plane.Va
         seq = legs[int(ctl[ap.LEG]), m.SEQ]
-        out = ap.guide(ctl, par, legs, p, v, euler, Va if sensor else np.nan, np.nan, dt)
+        out = laws.guide(ctl, par, legs, p, v, euler, Va if sensor else np.nan, np.nan, dt)
         rows.append([k * dt, *p, *v, *euler, Va, *out, seq])
         for _ in range(4):
             plane.step(*out, dt / 4)

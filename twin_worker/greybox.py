@@ -12,6 +12,7 @@ import numpy as np
 from fleet.autopilots import arduplane
 from fleet.autopilots import greybox as law
 from fleet.autopilots.arduplane import params as P
+from fleet.autopilots.shadow import shadow
 from fleet.contract import Item
 from fleet.frames import G, Origin
 from fleet.mission import KIND, TAKEOFF, VA_C, route
@@ -126,7 +127,7 @@ def _synchronised(seen: Track, seq: np.ndarray, way: tuple[np.ndarray, ...], w: 
     euler = np.column_stack([_banks(seen, air), 0.0 * psi, psi])
     triple, quad = np.full((n, 3), np.nan), np.full((n, 4), np.nan)
     rows = (seen.t - seen.t[0], seen.p, seen.v, euler, triple, nil, nil, nil, quad, seq)
-    ctl, _ = arduplane.shadow(*way, *(np.ascontiguousarray(row) for row in rows))  # type: ignore[call-arg]
+    ctl, _ = shadow(*way, *(np.ascontiguousarray(row) for row in rows))  # type: ignore[call-arg]
     return ctl
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from fleet.autopilots import arduplane
 from fleet.autopilots.arduplane.params import VA_CRUISE
+from fleet.autopilots.shadow import shadow
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
 from fleet.mission import KIND, LAND, TAKEOFF, route
@@ -128,7 +129,7 @@ def set_out(now: Situation) -> Start | Flown:
     told = aimed_at(now.history, float(good.t[-1]))
     legs = as_told(way.legs, float(seq[-1]), float(par[VA_CRUISE]), told)
     start = way.start if np.isfinite(way.start).all() else good.p[0]
-    ctl, _ = arduplane.shadow(par, legs, start, *_telemetry(good, at, now.history), seq)  # type: ignore[call-arg]
+    ctl, _ = shadow(par, legs, start, *_telemetry(good, at, now.history), seq)  # type: ignore[call-arg]
     kind = int(legs[int(ctl[arduplane.LEG]), KIND])
     if kind in _REFUSED:
         return Flown(None, int(seq[-1]), f"{_REFUSED[kind]} is not modelled: no route-aware prediction")

@@ -4,6 +4,7 @@ import numpy as np
 
 from fleet.airframes import GENERIC, load
 from fleet.autopilots import arduplane, copter, greybox
+from fleet.autopilots.shadow import shadow
 from fleet.contract import Item
 from fleet.frames import Origin
 from fleet.mission import route
@@ -29,7 +30,7 @@ def warm_up() -> None:
     euler, rates = np.ascontiguousarray(window.x[:, 6:]), np.ascontiguousarray(window.x[:, 3:6])
     heard = [np.full(n, _SPEED), np.zeros(n), np.zeros(n), window.u, np.ones(n, np.int64)]
     rows = [window.t - window.t[0], window.p, window.v, euler, rates, *heard]
-    ctl, _ = arduplane.shadow(par, legs, window.p[0], *rows)  # type: ignore
+    ctl, _ = shadow(par, legs, window.p[0], *rows)  # type: ignore
     state = np.concatenate([window.p[-1], window.x[-1]])
     paper = linear_plant(*(part for axis in axes for part in (axis.physical(), axis.means)))
     coupled = coupled_plant(identify(window, np.zeros(2), load(GENERIC)).par, np.array([_SPEED, 0.0]))

@@ -8,11 +8,11 @@
     ctl = init(par, legs, k, start, p, v, euler, Va, theta_c, delta_t)
     phi_c, theta_c, delta_t = guide(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
     delta_a, delta_e, delta_r = stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
-    ctl, rms_phi_c = shadow(par, legs, start, t, p, v, euler, rates, Va, phi_c, theta_c, delta, seq)
 
 All but `parameters` are compiled and change `ctl` in place; ctl[LEG] is the index of the current leg. Airspeeds are
-equivalent, as the sensor reports them; true airspeed is made inside. Not modelled: terrain following, flaps, reverse
-thrust, the yaw damper (off by default) and the gain reduction of oscillating loops.
+equivalent, as the sensor reports them; true airspeed is made inside. `fleet.autopilots.shadow` synchronises it with
+telemetry. Not modelled: terrain following, flaps, reverse thrust, the yaw damper (off by default) and the gain
+reduction of oscillating loops.
 
 Source: Park, Deyst & How (2004) for L1; Lambregts (1983) for TECS; ArduPlane 4.x for the law as flown.
 """
@@ -21,7 +21,6 @@ from fleet.autopilots.arduplane.attitude import stabilise
 from fleet.autopilots.arduplane.guide import guide, init
 from fleet.autopilots.arduplane.legs import set_leg
 from fleet.autopilots.arduplane.params import DEFAULTS, N_PAR, NAMES, eas2tas, parameters
-from fleet.autopilots.arduplane.shadow import shadow
 from fleet.autopilots.arduplane.state import LEG, N_CTL
 
 LAW = "arduplane: L1 + TECS"
@@ -38,6 +37,5 @@ __all__ = [
     "init",
     "parameters",
     "set_leg",
-    "shadow",
     "stabilise",
 ]

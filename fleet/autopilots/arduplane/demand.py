@@ -33,6 +33,19 @@ def update_speed(
         Va_dot: forward acceleration; nan: taken from the change of `v` [m/s2]
         dt: step [s]
     """
+    sense(ctl, v, euler, Va_dot, dt)
+    ctl[S.ACCEL_LP] += dt / (dt + par[P.TIME_CONST]) * (ctl[S.ACCEL] - ctl[S.ACCEL_LP])
+    filter_speed(ctl, Va * par[P.EAS2TAS], par[P.VA_CRUISE] * par[P.EAS2TAS], dt)
+
+
+@kernel
+def sense(ctl: np.ndarray, v: np.ndarray, euler: np.ndarray, Va_dot: float, dt: float) -> None:
+    """Keep the forward acceleration in ctl[S.ACCEL]; without one, from the change of the ground velocity.
+
+    Args:
+        ctl: controller state
+        v, euler, Va_dot, dt: as for `update_speed`
+    """
     if np.isfinite(Va_dot):
         ctl[S.ACCEL] = Va_dot
     elif ctl[S.SEEN] > 0.0 and dt > 0.0:
@@ -43,11 +56,15 @@ def update_speed(
     for j in range(3):
         ctl[S.V_N + j] = v[j]
     ctl[S.SEEN] = 1.0
-    ctl[S.ACCEL_LP] += dt / (dt + par[P.TIME_CONST]) * (ctl[S.ACCEL] - ctl[S.ACCEL_LP])
-    if not np.isfinite(Va):
-        ctl[S.V_HAT], ctl[S.V_DOT_HAT] = par[P.VA_CRUISE] * par[P.EAS2TAS], 0.0
+
+
+@kernel
+def filter_speed(ctl: np.ndarray, tas: float, otherwise: float, dt: float) -> None:
+    """Filter a true airspeed [m/s] with the acceleration sensed; nan: `otherwise` is assumed."""
+    if not np.isfinite(tas):
+        ctl[S.V_HAT], ctl[S.V_DOT_HAT] = otherwise, 0.0
         return
-    error = Va * par[P.EAS2TAS] - ctl[S.V_HAT]
+    error = tas - ctl[S.V_HAT]
     ctl[S.V_DOT_HAT] += error * _W * _W * dt
     ctl[S.V_HAT] += (ctl[S.V_DOT_HAT] + ctl[S.ACCEL] + error * _W * sqrt(2.0)) * dt
     if ctl[S.V_HAT] < SLOWEST:

@@ -6,7 +6,9 @@ from fleet.autopilots.arduplane import demand, l1, tecs
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.arduplane import state as S
+from fleet.autopilots.arduplane.attitude import FULL
 from fleet.autopilots.arduplane.state import kernel
+from fleet.frames import G
 from fleet.mission import VA_C
 
 
@@ -33,10 +35,12 @@ def init(
         p, v: position and ground velocity, NED, (3,) [m, m/s]
         euler: phi, theta, psi (3,) [rad]
         Va: equivalent airspeed; nan: no sensor [m/s]
-        theta_c, delta_t: pitch command and throttle in force [rad, 0..1]
+        theta_c, delta_t: pitch command and throttle in force, nan unknown [rad, 0..1]
     Returns:
         ctl (S.N_CTL,)
     """
+    theta_c = theta_c if np.isfinite(theta_c) else euler[1]
+    delta_t = delta_t if np.isfinite(delta_t) else 0.5 * (par[P.THR_MIN] + par[P.THR_MAX])
     ctl = np.zeros(S.N_CTL)
     known = np.isfinite(start[0]) and np.isfinite(start[1]) and np.isfinite(start[2])
     leg_rules.set_leg(ctl, par, legs, k, start if known else p)
@@ -103,3 +107,28 @@ def guide(
     if over and int(ctl[S.LEG]) + 1 < legs.shape[0]:
         leg_rules.begin(ctl, par, legs, int(ctl[S.LEG]) + 1, p)
     return phi_c, theta_c, delta_t
+
+
+@kernel
+def settle(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray) -> None:
+    """Take the commanded speed as long in force: what a controller found in flight demands, more likely than not."""
+    ctl[S.V_DEM] = speed(ctl, par, legs) * par[P.EAS2TAS]
+
+
+@kernel
+def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) -> None:
+    """Shift the integrators by what the outputs missed, and put the slewed outputs where the reported ones are.
+
+    Args:
+        ctl, par: controller state, parameters
+        miss: reported minus replayed theta_c, delta_t, delta_a, delta_e, delta_r; 0 unknown, (5,)
+        told: reported phi_c, theta_c, delta_t and airspeed at the end, nan where missing, (4,)
+    """
+    room = 0.5 * (par[P.THR_MAX] - par[P.THR_MIN])
+    ctl[S.I_SEB] += miss[0] * ctl[S.V_HAT] * G
+    ctl[S.THETA] = told[1] if np.isfinite(told[1]) else ctl[S.THETA] + miss[0]
+    ctl[S.I_THR] = min(max(ctl[S.I_THR] + miss[1], -room), room)
+    if np.isfinite(told[2]):
+        ctl[S.THR] = told[2] - ctl[S.I_THR]
+    ctl[S.I_A] += miss[2] * FULL
+    ctl[S.I_E] += miss[3] * FULL

@@ -164,7 +164,7 @@ def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.nda
     if i + 1 >= legs.shape[0] or int(leg[KIND]) == LOITER_UNLIMITED or ctl[S.ON] == 0.0:
         return False
     if ctl[S.READY] < 0.0:
-        if not _ready(ctl, leg, p):
+        if not ready(ctl, leg, p):
             return False
         ctl[S.READY] = max(ctl[S.ANGLE], 0.0)
     out_n, out_e = legs[i + 1, P_N] - p[0], legs[i + 1, P_E] - p[1]
@@ -176,7 +176,8 @@ def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.nda
 
 
 @kernel
-def _ready(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> bool:
+def ready(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> bool:
+    """Tell whether turns, time or height of a circle are flown; p: NED, (3,) [m]."""
     kind = int(leg[KIND])
     if kind == LOITER_TURNS:
         return ctl[S.ANGLE] >= 2 * pi * leg[TURNS]

@@ -112,7 +112,7 @@ def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np
     given = {**_old_gains(values), **{k: float(v) for k, v in values.items()}}
     par, absent = np.empty(N_PAR), []
     for i, row in enumerate(TABLE):
-        value = _find(row, given)
+        value = find(row, given)
         if value is None:
             absent.append(row.name)
         par[i] = (row.default if value is None else value) * row.factor
@@ -128,7 +128,8 @@ def eas2tas(altitude_m: float) -> float:
     return float((1 - 2.25577e-5 * h) ** (-4.25588 / 2))
 
 
-def _find(row: Row, given: Mapping[str, float]) -> float | None:
+def find(row: Row, given: Mapping[str, float]) -> float | None:
+    """Give the value of a row under its present or an older name; None where it is missing, not finite or absurd."""
     for name, unit in ((row.name, 1.0), *row.older):
         value = given.get(name)
         if value is not None and isfinite(value) and row.low <= value * unit <= row.high:

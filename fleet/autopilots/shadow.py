@@ -9,12 +9,10 @@ from math import nan, sqrt
 import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
-from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.arduplane import state as S
-from fleet.autopilots.arduplane.attitude import FULL, stabilise
-from fleet.autopilots.arduplane.guide import fly, init, speed
 from fleet.autopilots.arduplane.state import kernel
-from fleet.frames import G, wrap
+from fleet.autopilots.laws import begin, engage, fly, shift, stabilise
+from fleet.frames import wrap
 from fleet.mission import SEQ
 
 _MEAN_OVER = 5.0  # outputs are matched over the last seconds [s]
@@ -56,7 +54,7 @@ def shadow(
     """Synchronise the controller with telemetry at about 10 Hz; rows with nan are passed over.
 
     Args:
-        par: parameters (N_PAR,)
+        par: parameters of any law, see `laws`
         legs: route from the item in force at t[0], (m, 9)
         start: point before the first leg, NED, (3,) [m]; nan: where the aircraft is
         t: time (n,) [s]
@@ -72,13 +70,13 @@ def shadow(
     """
     n = t.shape[0]
     ctl = np.zeros(S.N_CTL)
-    miss = np.full((n, 5), nan)  # reported minus replayed: theta_c, delta_t, delta_a, delta_e, phi_c
+    miss = np.full((n, 6), nan)  # reported minus replayed: theta_c, delta_t, delta_a, delta_e, delta_r, phi_c
     last = -1
     for k in range(n):
         if not _usable(p[k], v[k], euler[k]):
             continue
         if last < 0:
-            ctl = _begin(par, legs, start, p[k], v[k], euler[k], Va[k], theta_c[k], delta[k, 3])
+            ctl = engage(par, legs, start, p[k], v[k], euler[k], Va[k], theta_c[k], delta[k, 3])
             last = k
         dt = min(max(t[k] - t[last], 0.0), _LONGEST)
         last = k
@@ -86,15 +84,16 @@ def shadow(
         if not dt > 0.0:
             continue
         phi_k, theta_k, thr_k, _ = fly(ctl, par, legs, p[k], v[k], euler[k], Va[k], nan, dt)
-        miss[k, 0], miss[k, 1], miss[k, 4] = theta_c[k] - theta_k, delta[k, 3] - thr_k, wrap(phi_c[k] - phi_k)
+        miss[k, 0], miss[k, 1], miss[k, 5] = theta_c[k] - theta_k, delta[k, 3] - thr_k, wrap(phi_c[k] - phi_k)
         if np.all(np.isfinite(rates[k])):
             roll = phi_c[k] if np.isfinite(phi_c[k]) else phi_k
             pitch = theta_c[k] if np.isfinite(theta_c[k]) else theta_k
-            delta_a, delta_e, _ = stabilise(ctl, par, roll, pitch, euler[k], rates[k], Va[k], dt)
-            miss[k, 2], miss[k, 3] = delta[k, 0] - delta_a, delta[k, 1] - delta_e
+            delta_a, delta_e, delta_r = stabilise(ctl, par, roll, pitch, euler[k], rates[k], Va[k], dt)
+            miss[k, 2], miss[k, 3], miss[k, 4] = delta[k, 0] - delta_a, delta[k, 1] - delta_e, delta[k, 2] - delta_r
     if last >= 0:
-        _shift(ctl, par, miss[t >= t[n - 1] - _MEAN_OVER], theta_c[n - 1], delta[n - 1, 3])
-    return ctl, sqrt(_mean(miss[:, 4] ** 2, nan))
+        told = np.array([phi_c[n - 1], theta_c[n - 1], delta[n - 1, 3], Va[n - 1]])
+        shift(ctl, par, _usual(miss[t >= t[n - 1] - _MEAN_OVER]), told)
+    return ctl, sqrt(_mean(miss[:, 5] ** 2, nan))
 
 
 @kernel
@@ -112,22 +111,12 @@ def _median(values: np.ndarray, otherwise: float) -> float:
 
 
 @kernel
-def _begin(
-    par: np.ndarray,
-    legs: np.ndarray,
-    start: np.ndarray,
-    p: np.ndarray,
-    v: np.ndarray,
-    euler: np.ndarray,
-    Va: float,
-    theta_c: float,
-    delta_t: float,
-) -> np.ndarray:
-    theta = theta_c if np.isfinite(theta_c) else euler[1]
-    thr = delta_t if np.isfinite(delta_t) else 0.5 * (par[P.THR_MIN] + par[P.THR_MAX])
-    ctl = init(par, legs, 0, start, p, v, euler, Va, theta, thr)
-    ctl[S.V_DEM] = speed(ctl, par, legs) * par[P.EAS2TAS]  # long in force, more likely than not
-    return ctl
+def _usual(miss: np.ndarray) -> np.ndarray:
+    """Give the usual miss of pitch, throttle and surfaces; 0 where none is known, (5,)."""
+    out = np.empty(5)
+    for j in range(5):
+        out[j] = _mean(miss[:, j], 0.0) if j < 2 else _median(miss[:, j], 0.0)
+    return out
 
 
 @kernel
@@ -138,18 +127,4 @@ def _force(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, seq: float, p: np
         return
     j = _find(ctl, legs, seq)
     if j >= 0 and j != int(ctl[S.LEG]):
-        leg_rules.begin(ctl, par, legs, j, p)
-
-
-@kernel
-def _shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, theta_c: float, delta_t: float) -> None:
-    """Shift the integrators by what the outputs missed, and put the slewed outputs where the reported ones are."""
-    room = 0.5 * (par[P.THR_MAX] - par[P.THR_MIN])
-    d_theta = _mean(miss[:, 0], 0.0)
-    ctl[S.I_SEB] += d_theta * ctl[S.V_HAT] * G
-    ctl[S.THETA] = theta_c if np.isfinite(theta_c) else ctl[S.THETA] + d_theta
-    ctl[S.I_THR] = min(max(ctl[S.I_THR] + _mean(miss[:, 1], 0.0), -room), room)
-    if np.isfinite(delta_t):
-        ctl[S.THR] = delta_t - ctl[S.I_THR]
-    ctl[S.I_A] += _median(miss[:, 2], 0.0) * FULL
-    ctl[S.I_E] += _median(miss[:, 3], 0.0) * FULL
+        begin(ctl, par, legs, j, p)

@@ -1,0 +1,200 @@
+"""One door to every control law: the last slot of `par` says whose it is.
+
+    par, absent = parameters(law, values, altitude_m)         law: a name in LAWS
+    ctl = init(par, legs, k, start, p, v, euler, Va, theta_c, delta_t)
+    phi_c, theta_c, delta_t = guide(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    delta_a, delta_e, delta_r = stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
+
+All but `parameters` are compiled, change `ctl` in place and take what ArduPlane's take. The shadow run is in `shadow`.
+A newcomer adds a folder or file with `parameters, init, begin, fly, stabilise, shift, LAW` and a line in each function.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+
+from fleet.autopilots import arduplane, px4_fixedwing, textbook
+from fleet.autopilots.arduplane import legs as leg_rules
+from fleet.autopilots.arduplane.guide import fly as fly_arduplane
+from fleet.autopilots.arduplane.guide import settle
+from fleet.autopilots.arduplane.guide import shift as shift_arduplane
+from fleet.autopilots.arduplane.state import LEG, kernel
+from fleet.autopilots.slots import ARDUPLANE, LAW, PX4, TEXTBOOK, W_E, W_N, padded
+
+inlined = nb.njit(cache=True, error_model="numpy", inline="always")
+
+
+class Law(NamedTuple):
+    """One law: what it is called in sentences, its mark in `par`, its parameters by name."""
+
+    sentence: str
+    mark: float
+    parameters: Callable[[Mapping[str, float], float], tuple[np.ndarray, tuple[str, ...]]]
+    names: tuple[str, ...]
+
+
+LAWS = {
+    "arduplane": Law(arduplane.LAW, ARDUPLANE, arduplane.parameters, arduplane.NAMES),
+    "px4": Law(px4_fixedwing.LAW, PX4, px4_fixedwing.parameters, px4_fixedwing.NAMES),
+    "textbook": Law(textbook.LAW, TEXTBOOK, textbook.parameters, textbook.NAMES),
+}
+
+
+def parameters(law: str, values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Turn autopilot parameters into the vector of one law, in calm air.
+
+    Args:
+        law: name in `LAWS`
+        values: parameters as the autopilot names and scales them
+        altitude_m: height above mean sea level [m]
+    Returns:
+        par: (N_PAR,)
+        absent: names that were missing, not finite or absurd; their defaults are in `par`
+    """
+    par, absent = LAWS[law].parameters(values, altitude_m)
+    return (padded(par, ARDUPLANE) if law == "arduplane" else par), absent
+
+
+def blown(par: np.ndarray, w_n: float, w_e: float) -> np.ndarray:
+    """Give a copy of `par` that believes in a wind, NED, where it blows to [m/s]."""
+    par = par.copy()
+    par[W_N], par[W_E] = w_n, w_e
+    return par
+
+
+@inlined
+def mark(par: np.ndarray) -> float:
+    """Give the mark of the law; what ends in anything else than a mark is ArduPlane's."""
+    return par[par.shape[0] + LAW]
+
+
+@kernel
+def init(
+    par: np.ndarray,
+    legs: np.ndarray,
+    k: int,
+    start: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    euler: np.ndarray,
+    Va: float,
+    theta_c: float,
+    delta_t: float,
+) -> np.ndarray:
+    """Begin on leg `k`, without a bump from the pitch and throttle in force; arguments as for ArduPlane's `init`."""
+    law = mark(par)
+    if law == PX4:
+        return px4_fixedwing.init(par, legs, k, start, p, v, euler, Va, theta_c, delta_t)
+    if law == TEXTBOOK:
+        return textbook.init(par, legs, k, start, p, v, euler, Va, theta_c, delta_t)
+    return arduplane.init(par, legs, k, start, p, v, euler, Va, theta_c, delta_t)
+
+
+@kernel
+def engage(
+    par: np.ndarray,
+    legs: np.ndarray,
+    start: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    euler: np.ndarray,
+    Va: float,
+    theta_c: float,
+    delta_t: float,
+) -> np.ndarray:
+    """Begin on the first leg as a controller that has been flying it for long; arguments as for `init`."""
+    ctl = init(par, legs, 0, start, p, v, euler, Va, theta_c, delta_t)
+    if mark(par) >= ARDUPLANE:
+        settle(ctl, par, legs)
+    return ctl
+
+
+@kernel
+def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndarray) -> None:
+    """Go on to leg `k` from the aircraft's position `p`, NED (3,) [m]."""
+    law = mark(par)
+    if law == PX4:
+        px4_fixedwing.begin(ctl, par, legs, k, p)
+    elif law == TEXTBOOK:
+        textbook.begin(ctl, par, legs, k, p)
+    else:
+        leg_rules.begin(ctl, par, legs, k, p)
+
+
+@kernel
+def fly(
+    ctl: np.ndarray,
+    par: np.ndarray,
+    legs: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    euler: np.ndarray,
+    Va: float,
+    Va_dot: float,
+    dt: float,
+) -> tuple[float, float, float, bool]:
+    """Fly the current leg for one step without leaving it; as `guide`, and whether the leg is over."""
+    law = mark(par)
+    if law == PX4:
+        return px4_fixedwing.fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    if law == TEXTBOOK:
+        return textbook.fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    return fly_arduplane(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+
+
+@inlined
+def guide(
+    ctl: np.ndarray,
+    par: np.ndarray,
+    legs: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    euler: np.ndarray,
+    Va: float,
+    Va_dot: float,
+    dt: float,
+) -> tuple[float, float, float]:
+    """Fly the route for one step; goes on to the next leg by itself, holds the last. Made for 10 Hz.
+
+    Arguments and answer as for ArduPlane's `guide`.
+    """
+    if mark(par) >= ARDUPLANE:
+        return arduplane.guide(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    phi_c, theta_c, delta_t, over = fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    if over and int(ctl[LEG]) + 1 < legs.shape[0]:
+        begin(ctl, par, legs, int(ctl[LEG]) + 1, p)
+    return phi_c, theta_c, delta_t
+
+
+@inlined
+def stabilise(
+    ctl: np.ndarray,
+    par: np.ndarray,
+    phi_c: float,
+    theta_c: float,
+    euler: np.ndarray,
+    rates: np.ndarray,
+    Va: float,
+    dt: float,
+) -> tuple[float, float, float]:
+    """Give the surfaces for a commanded attitude. Made for 50 Hz; arguments as for ArduPlane's `stabilise`."""
+    law = mark(par)
+    if law >= ARDUPLANE:
+        return arduplane.stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
+    if law == PX4:
+        return px4_fixedwing.stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
+    return textbook.stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
+
+
+@kernel
+def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) -> None:
+    """Shift the integrators by what the outputs missed; arguments as for ArduPlane's `shift`."""
+    law = mark(par)
+    if law == PX4:
+        px4_fixedwing.shift(ctl, par, miss, told)
+    elif law == TEXTBOOK:
+        textbook.shift(ctl, par, miss, told)
+    else:
+        shift_arduplane(ctl, par, miss, told)

@@ -1,0 +1,26 @@
+"""PX4's fixed-wing control law, from its equations: NPFG guides, TECS shares energy, rate loops hold attitude.
+
+    route --path--> line or circle --npfg--> phi_c ----------------+
+      +--path--> height and speed --tecs--> theta_c, delta_t --------+--attitude--> delta_a, delta_e, delta_r
+          every 0.1 s                                                    every 0.02 s
+
+    par, absent = parameters(values, altitude_m)              autopilot parameters -> one vector, SI
+    ctl = init(par, legs, k, start, p, v, euler, Va, theta_c, delta_t)
+    phi_c, theta_c, delta_t, over = fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    delta_a, delta_e, delta_r = stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
+
+`fleet.autopilots.laws` makes `guide` and the shadow run of them. NPFG flies by the wind that the autopilot believes
+in: par[W_N], par[W_E] of `fleet.autopilots.slots`. Not modelled: terrain following, flaps, landing, the upper bound of
+the period in wind on circles, throttle compensation for airspeed and air density.
+
+Source: see `npfg`, `tecs`; PX4 1.13 to 1.16 for the law as flown.
+"""
+
+from fleet.autopilots.px4_fixedwing.attitude import stabilise
+from fleet.autopilots.px4_fixedwing.guide import fly, init, shift
+from fleet.autopilots.px4_fixedwing.params import DEFAULTS, NAMES, parameters
+from fleet.autopilots.px4_fixedwing.path import begin
+
+LAW = "px4: NPFG + TECS"
+
+__all__ = ["DEFAULTS", "LAW", "NAMES", "begin", "fly", "init", "parameters", "shift", "stabilise"]

@@ -1,0 +1,90 @@
+"""The whole guidance step of PX4: route, NPFG and TECS together, and how a shadow run ends."""
+
+from math import hypot
+
+import numpy as np
+
+from fleet.autopilots.arduplane import demand
+from fleet.autopilots.arduplane import legs as leg_rules
+from fleet.autopilots.arduplane import state as S
+from fleet.autopilots.arduplane.state import kernel
+from fleet.autopilots.px4_fixedwing import npfg, path, tecs
+from fleet.autopilots.px4_fixedwing import params as P
+from fleet.autopilots.px4_fixedwing import state as X
+from fleet.autopilots.px4_fixedwing.attitude import scaler
+from fleet.mission import VA_C
+
+
+@kernel
+def init(
+    par: np.ndarray,
+    legs: np.ndarray,
+    k: int,
+    start: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    euler: np.ndarray,
+    Va: float,
+    theta_c: float,
+    delta_t: float,
+) -> np.ndarray:
+    """Begin on leg `k`, without a bump; arguments as for ArduPlane's `init`."""
+    theta_c = theta_c if np.isfinite(theta_c) else euler[1]
+    delta_t = delta_t if np.isfinite(delta_t) else par[P.THR_TRIM]
+    ctl = np.zeros(S.N_CTL)
+    known = np.isfinite(start[0]) and np.isfinite(start[1]) and np.isfinite(start[2])
+    leg_rules.set_leg(ctl, par, legs, k, start if known else p)
+    ctl[S.LINE] = 1.0 if known else 0.0
+    ctl[X.PHI] = min(max(euler[0], -par[P.ROLL_LIMIT]), par[P.ROLL_LIMIT])
+    tecs.reset(ctl, par, -p[2], -v[2], Va, theta_c - par[P.PITCH_OFFSET], delta_t)
+    return ctl
+
+
+@kernel
+def speed(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray) -> float:
+    """Give the airspeed commanded on the current leg, equivalent [m/s]."""
+    i = leg_rules.current(ctl, legs)
+    return legs[i, VA_C] if i >= 0 and legs[i, VA_C] > 0.0 else par[P.VA_CRUISE]
+
+
+@kernel
+def fly(
+    ctl: np.ndarray,
+    par: np.ndarray,
+    legs: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    euler: np.ndarray,
+    Va: float,
+    Va_dot: float,
+    dt: float,
+) -> tuple[float, float, float, bool]:
+    """Fly the current leg for one step without leaving it; as ArduPlane's `guide`, and whether the leg is over."""
+    dt = max(dt, 1e-3)
+    demand.sense(ctl, v, euler, Va_dot, dt)
+    demand.filter_speed(ctl, Va * par[P.EAS2TAS], par[P.VA_CRUISE] * par[P.EAS2TAS], dt)
+    a_lat, over = path.steer(ctl, par, legs, p, v, euler[2], ctl[S.V_HAT], dt)
+    ctl[X.PHI] = npfg.to_roll(par, a_lat, ctl[X.PHI], dt)
+    h_sp = path.height_demand(ctl, par, legs, p, hypot(v[0], v[1]))
+    va_c, blind = speed(ctl, par, legs), not np.isfinite(Va)
+    theta_c, delta_t = tecs.update(ctl, par, h_sp, va_c, -p[2], -v[2], euler[0], blind, dt)
+    return ctl[X.PHI], theta_c + par[P.PITCH_OFFSET], delta_t, over
+
+
+@kernel
+def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) -> None:
+    """Shift the integrators by what the outputs missed, and put the slewed outputs where the reported ones are.
+
+    Arguments as for ArduPlane's `shift`.
+    """
+    ctl[X.I_THETA] += miss[0]
+    ctl[S.THETA] = told[1] - par[P.PITCH_OFFSET] if np.isfinite(told[1]) else ctl[S.THETA] + miss[0]
+    ctl[S.I_THR] += miss[1]
+    if np.isfinite(told[2]):
+        ctl[S.THR] = told[2]
+    if np.isfinite(told[0]):
+        ctl[X.PHI] = told[0]
+    s = scaler(par, told[3]) ** 2
+    ctl[S.I_A] += miss[2] / s
+    ctl[S.I_E] += miss[3] / s
+    ctl[X.I_R] += miss[4] / s

@@ -1,0 +1,105 @@
+"""NPFG: which way to fly through the air so that the ground track comes back to a path and stays on it.
+
+    e_b = v_g tau      la = pi/2 (min(|e|/e_b, 1) - 1)^2      bearing = cos(la) towards the path + sin(la) along it
+    air course from the wind triangle      a_lat = p V sin(d_chi) + curvature feed-forward, p = 4 pi zeta / T
+
+`e` is how far right of the path the aircraft is. Right is positive.
+Source: Stastny & Siegwart, "On Flying Backwards" (2019), and Stastny, "Low-Altitude Control and Local Re-Planning
+Strategies for Small Fixed-Wing UAVs" (2020), as flown by PX4 (NPFG).
+"""
+
+from math import atan, cos, hypot, pi, sin, sqrt
+
+import numpy as np
+
+from fleet.autopilots.arduplane.l1 import angle_to, clip
+from fleet.autopilots.arduplane.state import kernel
+from fleet.autopilots.px4_fixedwing import params as P
+from fleet.autopilots.slots import W_E, W_N
+from fleet.frames import G
+
+_TIGHTEST = 0.1  # of a circle's radius: the feed-forward knows no smaller one [-]
+_FARTHEST = 500.0  # longest switch distance [m]
+_SLOWEST = 3.0  # least airspeed reckoned with [m/s]
+
+
+@kernel
+def period(par: np.ndarray) -> float:
+    """Give the period in force: as set, but no faster than the roll loop can follow [s]."""
+    least = pi * par[P.NPFG_TC] / par[P.DAMPING] * par[P.PERIOD_SF]
+    return max(par[P.PERIOD], least) if par[P.LB_PERIOD] > 0.0 else par[P.PERIOD]
+
+
+@kernel
+def error_bound(par: np.ndarray, speed: float) -> float:
+    """Give the distance from which the path is flown at squarely, for a ground speed [m]."""
+    tau = period(par) * par[P.DAMPING]
+    return speed * tau if speed > 1.0 else 0.5 * tau * (speed * speed + 1.0)
+
+
+@kernel
+def switch_distance(par: np.ndarray, speed: float) -> float:
+    """Give the distance at which a waypoint is left for the next [m]."""
+    return max(min(par[P.SWITCH] * error_bound(par, speed), _FARTHEST), par[P.ACC_RAD])
+
+
+@kernel
+def _air_course(par: np.ndarray, b_n: float, b_e: float, V: float) -> tuple[float, float, bool]:
+    """Give the air velocity that makes good the bearing b in the wind; into the wind where none does."""
+    across = par[W_N] * b_e - par[W_E] * b_n
+    if abs(across) < V:
+        ahead = sqrt(V * V - across * across)
+        if ahead + par[W_N] * b_n + par[W_E] * b_e > 0.0:
+            return ahead * b_n - across * b_e, ahead * b_e + across * b_n, True
+    return -par[W_N], -par[W_E], False
+
+
+@kernel
+def _turn_with(par: np.ndarray, t_n: float, t_e: float, v: np.ndarray, V: float, e: float, kappa: float) -> float:
+    """Give the lateral acceleration through the air that the path's own curvature `kappa` [1/m] asks for [m/s2]."""
+    w_t, w_c = par[W_N] * t_n + par[W_E] * t_e, par[W_N] * t_e - par[W_E] * t_n
+    ratio = 1.0 + w_t / sqrt(max(V * V - w_c * w_c, 1.0))
+    along = max(v[0] * t_n + v[1] * t_e, 0.0)
+    return V * ratio * along * kappa / max(1.0 - kappa * e, _TIGHTEST)
+
+
+@kernel
+def follow(
+    par: np.ndarray, t_n: float, t_e: float, e: float, kappa: float, v: np.ndarray, psi: float, V: float
+) -> float:
+    """Follow a path.
+
+    Args:
+        par: parameters, the wind believed in among them
+        t_n, t_e: unit vector along the path at its nearest point
+        e: distance right of it [m]
+        kappa: its curvature, positive to the right [1/m]
+        v: ground velocity, NED, (3,) [m/s]
+        psi: heading, where there is no air velocity [rad]
+        V: true airspeed [m/s]
+    Returns:
+        lateral acceleration, right positive [m/s2]
+    """
+    V = max(V, _SLOWEST)
+    near = min(abs(e) / error_bound(par, hypot(v[0], v[1])), 1.0)
+    look = 0.5 * pi * (near - 1.0) ** 2
+    back = -1.0 if e > 0.0 else 1.0  # towards the path: right is (-t_e, t_n)
+    b_n, b_e = cos(look) * back * -t_e + sin(look) * t_n, cos(look) * back * t_n + sin(look) * t_e
+    c_n, c_e, feasible = _air_course(par, b_n, b_e, V)
+    a_n, a_e = v[0] - par[W_N], v[1] - par[W_E]
+    if hypot(a_n, a_e) < 1.0:
+        a_n, a_e = cos(psi), sin(psi)
+    off = angle_to(a_n, a_e, c_n, c_e)
+    gain = 4.0 * pi * par[P.DAMPING] / period(par) * V
+    a_lat = gain * (sin(off) if abs(off) < 0.5 * pi else (1.0 if off > 0.0 else -1.0))
+    if kappa != 0.0 and feasible:
+        a_lat += sin(look) ** 2 * _turn_with(par, t_n, t_e, v, V, e, kappa)
+    return a_lat
+
+
+@kernel
+def to_roll(par: np.ndarray, a_lat: float, before: float, dt: float) -> float:
+    """Turn lateral acceleration [m/s2] into bank, limited, and slewed from the bank demanded before [rad]."""
+    phi = clip(atan(a_lat / G), -par[P.ROLL_LIMIT], par[P.ROLL_LIMIT])
+    step = par[P.ROLL_SLEW] * dt
+    return clip(phi, before - step, before + step) if step > 0.0 else phi

@@ -1,0 +1,113 @@
+"""PX4's parameters for fixed wings -> one vector in SI for the compiled controller.
+
+Source: PX4 parameter reference 1.13 to 1.16 (names, defaults, units); older names from its release notes.
+"""
+
+from collections.abc import Mapping
+from math import radians
+
+import numpy as np
+
+from fleet.autopilots.arduplane.params import Row, eas2tas, find
+from fleet.autopilots.slots import PX4, padded
+
+_DEG = radians(1.0)
+
+TABLE = (
+    Row("NPFG_PERIOD", 10, 1, 1, 100),
+    Row("NPFG_DAMPING", 0.7071, 1, 0.1, 1),
+    Row("NPFG_ROLL_TC", 0.5, 1, 0.05, 2),
+    Row("NPFG_SW_DST_MLT", 0.32, 1, 0.1, 1),
+    Row("NPFG_PERIOD_SF", 1.5, 1, 1, 3),
+    Row("NPFG_LB_PERIOD", 1, 1, 0, 1),
+    Row("FW_R_LIM", 50, _DEG, 10, 80),
+    Row("FW_PN_R_SLEW_MAX", 90, _DEG, 0, 1000, (("FW_L1_R_SLEW_MAX", 1),)),
+    Row("NAV_ACC_RAD", 10, 1, 0.05, 1e4),
+    Row("NAV_LOITER_RAD", 80, 1, -1e4, 1e4),
+    Row("NAV_FW_ALT_RAD", 10, 1, 0.05, 1e4),
+    Row("FW_T_CLMB_MAX", 5, 1, 0.5, 100),
+    Row("FW_T_SINK_MIN", 2, 1, 0.1, 100),
+    Row("FW_T_SINK_MAX", 5, 1, 0.5, 100),
+    Row("FW_T_CLMB_R_SP", 3, 1, 0.1, 100),
+    Row("FW_T_SINK_R_SP", 2, 1, 0.1, 100),
+    Row("FW_T_ALT_TC", 5, 1, 0.5, 100),
+    Row("FW_T_TAS_TC", 5, 1, 0.5, 100),
+    Row("FW_T_HRATE_FF", 0.3, 1, 0, 1),
+    Row("FW_T_PTCH_DAMP", 0.1, 1, 0, 10),
+    Row("FW_T_THR_DAMPING", 0.05, 1, 0, 10, (("FW_T_THR_DAMP", 1),)),
+    Row("FW_T_I_GAIN_PIT", 0.1, 1, 0, 10, (("FW_T_INTEG_GAIN", 1),)),
+    Row("FW_T_THR_INTEG", 0.02, 1, 0, 10, (("FW_T_I_GAIN_THR", 1), ("FW_T_INTEG_GAIN", 1))),
+    Row("FW_T_SPDWEIGHT", 1, 1, 0, 2),
+    Row("FW_T_VERT_ACC", 7, 1, 0.1, 100),
+    Row("FW_T_RLL2THR", 15, 1, 0, 1000),
+    Row("FW_T_STE_R_TC", 0.4, 1, 0, 10),
+    Row("FW_T_SEB_R_FF", 1, 1, 0, 10),
+    Row("FW_THR_TRIM", 0.6, 1, 0, 1, (("FW_THR_CRUISE", 1),)),
+    Row("FW_THR_MIN", 0, 1, 0, 1),
+    Row("FW_THR_MAX", 1, 1, 0.01, 1),
+    Row("FW_THR_SLEW_MAX", 0, 1, 0, 100),
+    Row("FW_AIRSPD_TRIM", 15, 1, 1, 300),
+    Row("FW_AIRSPD_MIN", 10, 1, 1, 300),
+    Row("FW_AIRSPD_MAX", 20, 1, 1, 300),
+    Row("FW_P_LIM_MAX", 30, _DEG, 1, 90),
+    Row("FW_P_LIM_MIN", -30, _DEG, -90, -1),
+    Row("FW_PSP_OFF", 0, _DEG, -90, 90),
+    Row("FW_R_TC", 0.4, 1, 0.05, 10),
+    Row("FW_P_TC", 0.4, 1, 0.05, 10),
+    Row("FW_R_RMAX", 70, _DEG, 0, 1000),
+    Row("FW_P_RMAX_POS", 60, _DEG, 0, 1000),
+    Row("FW_P_RMAX_NEG", 60, _DEG, 0, 1000),
+    Row("FW_Y_RMAX", 50, _DEG, 0, 1000),
+    Row("FW_ARSP_SCALE_EN", 1, 1, 0, 1),
+    Row("FW_RR_FF", 0.5, 1, 0, 100),
+    Row("FW_RR_P", 0.05, 1, 0, 100),
+    Row("FW_RR_I", 0.1, 1, 0, 100),
+    Row("FW_RR_IMAX", 0.2, 1, 0, 1),
+    Row("FW_PR_FF", 0.5, 1, 0, 100),
+    Row("FW_PR_P", 0.08, 1, 0, 100),
+    Row("FW_PR_I", 0.1, 1, 0, 100),
+    Row("FW_PR_IMAX", 0.4, 1, 0, 1),
+    Row("FW_YR_FF", 0.3, 1, 0, 100),
+    Row("FW_YR_P", 0.05, 1, 0, 100),
+    Row("FW_YR_I", 0.1, 1, 0, 100),
+    Row("FW_YR_IMAX", 0.2, 1, 0, 1),
+)
+
+# Where each of them lies in `par`; the order is the table's.
+(
+    PERIOD, DAMPING, NPFG_TC, SWITCH, PERIOD_SF, LB_PERIOD, ROLL_LIMIT, ROLL_SLEW, ACC_RAD, LOITER_RAD, ALT_RAD,
+    CLIMB_MAX, SINK_MIN, SINK_MAX, CLIMB, SINK, ALT_TC, TAS_TC, H_RATE_FF, PITCH_DAMP, THR_DAMP, I_PITCH, I_THROTTLE,
+    SPEED_WEIGHT, VERT_ACC, ROLL_TO_THR, STE_TC, SEB_FF, THR_TRIM, THR_MIN, THR_MAX, THR_SLEW,
+    VA_CRUISE, VA_MIN, VA_MAX, PITCH_HIGH, PITCH_LOW, PITCH_OFFSET,
+    ROLL_TC, PITCH_TC, ROLL_RMAX, PITCH_UP, PITCH_DOWN, YAW_RMAX, SCALED,
+    ROLL_FF, ROLL_P, ROLL_I, ROLL_IMAX, PITCH_FF, PITCH_P, PITCH_I, PITCH_IMAX, YAW_FF, YAW_P, YAW_I, YAW_IMAX,
+) = range(len(TABLE))  # fmt: skip
+EAS2TAS = len(TABLE)  # true over equivalent airspeed [-]
+
+NAMES = tuple(row.name for row in TABLE)
+DEFAULTS: dict[str, float] = {row.name: float(row.default) for row in TABLE}
+_TOGETHER = (  # lower, upper, and what falls back with them where they contradict each other
+    (VA_MIN, VA_MAX, VA_CRUISE),
+    (THR_MIN, THR_MAX, THR_TRIM),
+)
+
+
+def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Turn autopilot parameters into the vector the kernels read.
+
+    Args:
+        values: parameters as the autopilot names and scales them, current or older names
+        altitude_m: height above mean sea level, for true airspeed [m]
+    Returns:
+        par: SI and rad, throttles 0..1, calm air, (N_PAR,)
+        absent: names that were missing, not finite or absurd; their defaults are in `par`
+    """
+    given = {name: float(value) for name, value in values.items()}
+    found = [find(row, given) for row in TABLE]
+    absent = [row.name for row, value in zip(TABLE, found, strict=True) if value is None]
+    own = np.array([(row.default if v is None else v) * row.factor for row, v in zip(TABLE, found, strict=True)])
+    for group in _TOGETHER:
+        if not own[group[0]] < own[group[1]]:
+            own[list(group)] = [TABLE[i].default * TABLE[i].factor for i in group]
+            absent += [TABLE[i].name for i in group]
+    return padded(np.append(own, eas2tas(altitude_m)), PX4), tuple(dict.fromkeys(absent))

@@ -1,0 +1,172 @@
+"""Which path is flown, when its leg is over, and how high to be on it.
+
+A waypoint is reached within the switch distance and the height accepted; what was missed is flown to again.
+Source: PX4 navigator (mission items) and its fixed-wing mode manager (lines, circles, first-order altitude hold).
+"""
+
+from math import atan2, hypot, pi
+
+import numpy as np
+
+from fleet.autopilots.arduplane import legs as leg_rules
+from fleet.autopilots.arduplane import state as S
+from fleet.autopilots.arduplane.l1 import angle_to, clip
+from fleet.autopilots.arduplane.state import kernel
+from fleet.autopilots.px4_fixedwing import npfg
+from fleet.autopilots.px4_fixedwing import params as P
+from fleet.autopilots.px4_fixedwing import state as X
+from fleet.frames import wrap
+from fleet.mission import ACCEPT, KIND, LAND, LOITER_UNLIMITED, P_D, P_E, P_N, RADIUS, TAKEOFF, WAYPOINT
+
+_EXIT = pi / 15  # leave a circle within 12 deg of the way out, where that is asked for [rad]
+_ON = 1.2  # of the switch distance: so near to a circle its time runs [-]
+
+
+@kernel
+def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndarray) -> None:
+    """Go on to leg `k`; its line begins at the point of the leg before, else at the aircraft `p`, NED (3,) [m]."""
+    i = leg_rules.current(ctl, legs)
+    onward = i >= 0 and k == i + 1 and int(legs[i, KIND]) != TAKEOFF
+    leg_rules.set_leg(ctl, par, legs, k, legs[i, P_N : P_D + 1] if onward else p)
+    ctl[S.LINE] = 1.0 if onward else 0.0
+
+
+@kernel
+def _to_point(n: float, e: float, p: np.ndarray) -> tuple[float, float, float]:
+    """Give the straight way to a point: direction, no error."""
+    d_n, d_e = n - p[0], e - p[1]
+    far = max(hypot(d_n, d_e), 0.1)
+    return d_n / far, d_e / far, 0.0
+
+
+@kernel
+def _line(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, reach: float) -> tuple[float, float, float]:
+    """Give direction and error of the line; before its begin the way there, past its end the way back."""
+    a_n, a_e = ctl[S.PREV_N], ctl[S.PREV_E]
+    along, length = leg_rules.along_line(ctl, leg, p)
+    if length < 1.0 or along > length:
+        return _to_point(leg[P_N], leg[P_E], p)
+    if along < 0.0 and hypot(p[0] - a_n, p[1] - a_e) > reach:
+        return _to_point(a_n, a_e, p)
+    t_n, t_e = (leg[P_N] - a_n) / length, (leg[P_E] - a_e) / length
+    return t_n, t_e, t_n * (p[1] - a_e) - t_e * (p[0] - a_n)
+
+
+@kernel
+def _circle(leg: np.ndarray, p: np.ndarray, radius: float) -> tuple[float, float, float, float]:
+    """Give direction, error and curvature of a circle at its nearest point; radius positive clockwise [m]."""
+    out_n, out_e = p[0] - leg[P_N], p[1] - leg[P_E]
+    r = hypot(out_n, out_e)
+    if r < 0.1:
+        out_n, out_e, r = 1.0, 0.0, 1.0
+    d = 1.0 if radius > 0.0 else -1.0
+    return -out_e / r * d, out_n / r * d, (abs(radius) - r) * d, 1.0 / radius
+
+
+@kernel
+def steer(
+    ctl: np.ndarray,
+    par: np.ndarray,
+    legs: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    psi: float,
+    V: float,
+    dt: float,
+) -> tuple[float, bool]:
+    """Guide along the current leg without leaving it.
+
+    Args:
+        ctl, par, legs: controller state, parameters, route
+        p, v: position and ground velocity, NED, (3,) [m, m/s]
+        psi: heading [rad]
+        V: true airspeed [m/s]
+        dt: step [s]
+    Returns:
+        lateral acceleration, right positive [m/s2]; whether the leg is over
+    """
+    i = leg_rules.current(ctl, legs)
+    if i < 0:
+        return 0.0, False
+    leg, kind = legs[i], int(legs[i, KIND])
+    if kind == TAKEOFF:
+        return 0.0, p[2] <= leg[P_D]
+    reach = npfg.switch_distance(par, hypot(v[0], v[1]))
+    radius = leg[RADIUS] if leg[RADIUS] != 0.0 and kind not in (WAYPOINT, LAND) else par[P.LOITER_RAD]
+    radius = radius if abs(radius) > 1.0 else 1.0
+    if kind in (WAYPOINT, LAND):
+        return _along_line(par, ctl, leg, p, v, psi, V, reach, radius)
+    _count(ctl, par, leg, p, radius, reach, dt)
+    t_n, t_e, e, kappa = _circle(leg, p, radius)
+    return npfg.follow(par, t_n, t_e, e, kappa, v, psi, V), _circled(ctl, legs, i, p, v)
+
+
+@kernel
+def _along_line(
+    par: np.ndarray, ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, v: np.ndarray, psi: float, V: float,
+    reach: float, radius: float,
+) -> tuple[float, bool]:  # fmt: skip
+    """Follow the line to a waypoint; circle there while the height is still far off."""
+    to_go, off = hypot(leg[P_N] - p[0], leg[P_E] - p[1]), abs(p[2] - leg[P_D])
+    waypoint = int(leg[KIND]) == WAYPOINT
+    if waypoint and to_go < 2.0 * abs(radius) and off > 2.0 * par[P.ALT_RAD] and (to_go < reach or ctl[S.AROUND] > 0):
+        ctl[S.AROUND] = 1.0
+    elif off < par[P.ALT_RAD]:
+        ctl[S.AROUND] = 0.0
+    if ctl[S.AROUND] > 0.0:
+        t_n, t_e, e, kappa = _circle(leg, p, radius)
+        return npfg.follow(par, t_n, t_e, e, kappa, v, psi, V), False
+    t_n, t_e, e = _line(ctl, leg, p, reach)
+    over = waypoint and to_go <= max(reach, leg[ACCEPT]) and off <= par[P.ALT_RAD]
+    return npfg.follow(par, t_n, t_e, e, 0.0, v, psi, V), over
+
+
+@kernel
+def _count(
+    ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, radius: float, reach: float, dt: float
+) -> None:
+    """Add up the angle and the time flown since the circle was reached, at its height."""
+    out_n, out_e = leg[P_N] - p[0], leg[P_E] - p[1]
+    bearing = atan2(out_e, out_n)
+    if ctl[S.ON] > 0.0:
+        ctl[S.ANGLE] += wrap(bearing - ctl[S.BEARING]) * (1.0 if radius > 0.0 else -1.0)
+        ctl[S.TIMER] += dt
+    elif abs(hypot(out_n, out_e) - abs(radius)) < _ON * reach and abs(p[2] - leg[P_D]) < par[P.ALT_RAD]:
+        ctl[S.ON] = 1.0
+    ctl[S.BEARING] = bearing
+
+
+@kernel
+def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.ndarray) -> bool:
+    """Tell whether a circle is flown: its time or height is over, and it heads the way out where that is asked for."""
+    leg = legs[i]
+    if i + 1 >= legs.shape[0] or int(leg[KIND]) == LOITER_UNLIMITED or ctl[S.ON] == 0.0:
+        return False
+    if not leg_rules.ready(ctl, leg, p):
+        return False
+    out_n, out_e = legs[i + 1, P_N] - p[0], legs[i + 1, P_E] - p[1]
+    inside = hypot(legs[i + 1, P_N] - leg[P_N], legs[i + 1, P_E] - leg[P_E]) < abs(leg[RADIUS])
+    return leg[ACCEPT] == 0.0 or inside or abs(angle_to(v[0], v[1], out_n, out_e)) <= _EXIT
+
+
+@kernel
+def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, speed: float) -> float:
+    """Give the height to be at, up positive [m]: linear in the way left to the switch distance, else at once.
+
+    Args:
+        ctl, par, legs: controller state, parameters, route
+        p: position, NED, (3,) [m]
+        speed: over ground [m/s]
+    """
+    i = leg_rules.current(ctl, legs)
+    if i < 0:
+        return -ctl[S.PREV_D]
+    leg = legs[i]
+    to_go = hypot(leg[P_N] - p[0], leg[P_E] - p[1])
+    ctl[X.NEAREST] = to_go if ctl[X.NEAREST] < 0.0 else min(to_go, ctl[X.NEAREST])
+    near = max(npfg.switch_distance(par, speed), abs(leg[RADIUS]))
+    length = hypot(leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E])
+    if ctl[S.LINE] == 0.0 or length <= near or ctl[S.ON] + ctl[S.AROUND] > 0.0 or int(leg[KIND]) == TAKEOFF:
+        return -leg[P_D]
+    left = clip((ctl[X.NEAREST] - near) / (length - near), 0.0, 1.0)
+    return -leg[P_D] + (leg[P_D] - ctl[S.PREV_D]) * left

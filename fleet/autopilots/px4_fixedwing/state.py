@@ -1,0 +1,13 @@
+"""The flat memory of PX4's controller: slots of `ctl` by name.
+
+The leg, the airspeed filter and the throttle and pitch in force lie where ArduPlane's controller has them
+(`arduplane.state`), so that both share the code for them. The slots below mean something else here.
+"""
+
+NEAREST = 10  # least distance to the waypoint so far, -1 before [m]
+PHI = 12  # roll demand, slew-limited [rad]
+H_REF, H_DOT_REF = 25, 26  # height reference, up positive [m], and its rate [m/s]
+STE_DOT = 31  # filtered total energy rate [m2/s3]
+I_THETA = 33  # pitch integrator [rad]
+I_R = 45  # yaw rate integrator, 1 = full throw
+S_R, S_A, S_E = 46, 49, 50  # last surfaces before the limit, 1 = full throw

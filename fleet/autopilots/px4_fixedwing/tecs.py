@@ -1,0 +1,139 @@
+"""TECS as PX4 has it: throttle holds the rate of total energy, pitch the rate at which height and speed share it.
+
+    h_dot_c = (h_ref - h) / ALT_TC + HRATE_FF h_dot_ref        V_dot_c = (V_c - V) / TAS_TC
+    STE_dot = g h_dot + V V_dot (throttle)        SEB_dot = w_p g h_dot - w_k V V_dot (pitch)
+
+Inside, speeds are true airspeeds and heights are up.
+Source: Lambregts, "Total Energy Based Flight Control System" (1983); PX4 TECS.
+"""
+
+from math import cos, sqrt
+
+import numpy as np
+
+from fleet.autopilots.arduplane import state as S
+from fleet.autopilots.arduplane.demand import SLOWEST
+from fleet.autopilots.arduplane.l1 import clip
+from fleet.autopilots.arduplane.state import kernel
+from fleet.autopilots.px4_fixedwing import params as P
+from fleet.autopilots.px4_fixedwing import state as X
+from fleet.frames import G
+
+_MARGIN = 0.15  # of cruise: below the least speed by this much, underspeed begins; by twice, it is complete [-]
+
+
+@kernel
+def _reference(ctl: np.ndarray, par: np.ndarray, h_sp: float, dt: float) -> None:
+    """Move the height reference: its rate changes by VERT_ACC at most, and it comes to rest on the set point."""
+    off = h_sp - ctl[X.H_REF]
+    fastest = min(sqrt(2.0 * par[P.VERT_ACC] * abs(off)), abs(off) / dt)
+    wanted = min(fastest, par[P.CLIMB]) if off > 0.0 else -min(fastest, par[P.SINK])
+    step = par[P.VERT_ACC] * dt
+    ctl[X.H_DOT_REF] += clip(wanted - ctl[X.H_DOT_REF], -step, step)
+    ctl[X.H_REF] += ctl[X.H_DOT_REF] * dt
+
+
+@kernel
+def _underspeed(ctl: np.ndarray, par: np.ndarray, blind: bool) -> float:
+    """Give how far underspeed is, 0..1."""
+    if blind:
+        return 0.0
+    margin = _MARGIN * par[P.VA_CRUISE] * par[P.EAS2TAS]
+    begins = max(par[P.VA_MIN] * par[P.EAS2TAS] - margin, margin)
+    return clip((begins - ctl[S.V_HAT]) / margin, 0.0, 1.0)
+
+
+@kernel
+def _pitch(ctl: np.ndarray, par: np.ndarray, h_dot: float, wanted: tuple[float, float], w_k: float, dt: float) -> float:
+    """Close the loop on the energy balance; give the pitch demand [rad]."""
+    V, w_p = ctl[S.V_HAT], min(2.0 - w_k, 1.0)
+    w_k = min(w_k, 1.0)
+    balance_c = G * wanted[0] * w_p - V * wanted[1] * w_k
+    error = balance_c - (G * h_dot * w_p - V * ctl[S.ACCEL] * w_k)
+    step = error * par[P.I_PITCH] / (V * G) * dt
+    low, high = par[P.PITCH_LOW], par[P.PITCH_HIGH]
+    if ctl[S.THETA] >= high:
+        step = min(step, 0.0)
+    elif ctl[S.THETA] <= low:
+        step = max(step, 0.0)
+    ctl[X.I_THETA] = clip(ctl[X.I_THETA] + step, low, high)
+    theta = (par[P.SEB_FF] * balance_c + par[P.PITCH_DAMP] * error) / (V * G) + ctl[X.I_THETA]
+    most = par[P.VERT_ACC] / V * dt
+    ctl[S.THETA] = clip(clip(theta, low, high), ctl[S.THETA] - most, ctl[S.THETA] + most)
+    return ctl[S.THETA]
+
+
+@kernel
+def trim_throttle(par: np.ndarray, ste_dot: float) -> float:
+    """Give the throttle that a total energy rate [m2/s3] is known to take: linear between idle, trim and full."""
+    if ste_dot >= 0.0:
+        return par[P.THR_TRIM] + ste_dot / (par[P.CLIMB_MAX] * G) * (par[P.THR_MAX] - par[P.THR_TRIM])
+    return par[P.THR_TRIM] - ste_dot / (par[P.SINK_MIN] * G) * (par[P.THR_MIN] - par[P.THR_TRIM])
+
+
+@kernel
+def _throttle(
+    ctl: np.ndarray, par: np.ndarray, h_dot: float, wanted: tuple[float, float], phi: float, blind: bool, dt: float
+) -> float:
+    """Close the loop on the total energy rate; give the throttle 0..1."""
+    V, idle, full = ctl[S.V_HAT], -par[P.SINK_MIN] * G, par[P.CLIMB_MAX] * G
+    rate = G * h_dot + V * (0.0 if blind else ctl[S.ACCEL])
+    ctl[X.STE_DOT] += dt / (dt + par[P.STE_TC]) * (rate - ctl[X.STE_DOT])
+    load = par[P.ROLL_TO_THR] * (1.0 / max(cos(phi), 0.2) - 1.0)
+    rate_c = clip(G * wanted[0] + V * wanted[1] + load, idle, full)
+    error = (rate_c - ctl[X.STE_DOT]) / (full - idle)
+    step = error * par[P.I_THROTTLE] * dt
+    if ctl[S.THR] >= par[P.THR_MAX]:
+        step = min(step, 0.0)
+    elif ctl[S.THR] <= par[P.THR_MIN]:
+        step = max(step, 0.0)
+    ctl[S.I_THR] = clip(ctl[S.I_THR] + step, -par[P.THR_MAX], par[P.THR_MAX])
+    thr = trim_throttle(par, rate_c) + error * par[P.THR_DAMP] + ctl[S.I_THR]
+    slow = _underspeed(ctl, par, blind)
+    thr = slow * par[P.THR_MAX] + (1.0 - slow) * thr
+    most = par[P.THR_SLEW] * dt
+    if most > 0.0:
+        thr = clip(thr, ctl[S.THR] - most, ctl[S.THR] + most)
+    ctl[S.THR] = clip(thr, par[P.THR_MIN], par[P.THR_MAX])
+    return ctl[S.THR]
+
+
+@kernel
+def update(
+    ctl: np.ndarray,
+    par: np.ndarray,
+    h_sp: float,
+    va_c: float,
+    h: float,
+    h_dot: float,
+    phi: float,
+    blind: bool,
+    dt: float,
+) -> tuple[float, float]:
+    """Give pitch and throttle for a height and a speed; arguments as for ArduPlane's `tecs.update`.
+
+    Call `demand.sense` and `demand.filter_speed` first.
+    """
+    _reference(ctl, par, h_sp, dt)
+    h_dot_c = (ctl[X.H_REF] - h) / par[P.ALT_TC] + par[P.H_RATE_FF] * ctl[X.H_DOT_REF]
+    h_dot_c = clip(h_dot_c, -par[P.SINK_MAX], par[P.CLIMB_MAX])
+    V, v_dot_c = ctl[S.V_HAT], 0.0
+    if not blind:
+        V_c = clip(va_c, par[P.VA_MIN], par[P.VA_MAX]) * par[P.EAS2TAS]
+        v_dot_c = clip((V_c - V) / par[P.TAS_TC], -0.5 * par[P.SINK_MIN] * G / V, 0.5 * par[P.CLIMB_MAX] * G / V)
+    slow = _underspeed(ctl, par, blind)
+    w_k = 0.0 if blind else 2.0 * slow + (1.0 - slow) * par[P.SPEED_WEIGHT]
+    wanted = (h_dot_c, v_dot_c)
+    return _pitch(ctl, par, h_dot, wanted, w_k, dt), _throttle(ctl, par, h_dot, wanted, phi, blind, dt)
+
+
+@kernel
+def reset(ctl: np.ndarray, par: np.ndarray, h: float, h_dot: float, Va: float, theta_c: float, delta_t: float) -> None:
+    """Begin without a bump: climbing on at `h_dot` [m/s] at airspeed `Va` [m/s] takes `theta_c` [rad] and `delta_t`."""
+    V = max((Va if np.isfinite(Va) else par[P.VA_CRUISE]) * par[P.EAS2TAS], SLOWEST)
+    ctl[S.V_HAT] = V
+    ctl[X.H_REF], ctl[X.H_DOT_REF], ctl[X.STE_DOT] = h, clip(h_dot, -par[P.SINK], par[P.CLIMB]), G * h_dot
+    ctl[S.THETA], ctl[S.THR] = theta_c, delta_t
+    ctl[X.I_THETA] = clip(theta_c - par[P.SEB_FF] * clip(h_dot / V, -1.0, 1.0), par[P.PITCH_LOW], par[P.PITCH_HIGH])
+    rate = clip(G * h_dot, -par[P.SINK_MIN] * G, par[P.CLIMB_MAX] * G)
+    ctl[S.I_THR] = clip(delta_t - trim_throttle(par, rate), -par[P.THR_MAX], par[P.THR_MAX])

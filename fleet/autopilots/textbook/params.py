@@ -1,0 +1,57 @@
+"""The numbers of the textbook's autopilot, by the names of the book -> one vector for the compiled controller.
+
+The defaults are ours, for a small aircraft.
+"""
+
+from collections.abc import Mapping
+from math import pi
+
+import numpy as np
+
+from fleet.autopilots.arduplane.params import Row, eas2tas, find
+from fleet.autopilots.slots import TEXTBOOK, padded
+
+TABLE = (
+    Row("chi_inf", pi / 3, 1, 0.1, pi / 2),
+    Row("k_path", 0.025, 1, 1e-4, 1),
+    Row("k_orbit", 4.0, 1, 0.1, 100),
+    Row("R_fillet", 75.0, 1, 1, 1e5),
+    Row("R_orbit", 80.0, 1, -1e5, 1e5),
+    Row("omega_chi", 0.6, 1, 0.01, 10),
+    Row("zeta_chi", 1.0, 1, 0.1, 5),
+    Row("k_i_chi", 0.0, 1, 0, 10),
+    Row("phi_max", pi / 4, 1, 0.05, 1.4),
+    Row("k_p_h", 0.012, 1, 0, 1),
+    Row("k_i_h", 0.001, 1, 0, 1),
+    Row("theta_max", 0.35, 1, 0.05, 1.2),
+    Row("climb_max", 4.0, 1, 0.1, 100),
+    Row("sink_max", 3.0, 1, 0.1, 100),
+    Row("Va_c", 15.0, 1, 1, 300),
+    Row("k_p_V", 0.05, 1, 0, 10),
+    Row("k_i_V", 0.01, 1, 0, 10),
+    Row("k_ff_h", 0.08, 1, 0, 10),
+    Row("k_ff_n", 0.05, 1, 0, 10),
+    Row("delta_t_trim", 0.5, 1, 0, 1),
+    Row("k_p_phi", 1.0, 1, 0, 100),
+    Row("k_d_phi", 0.1, 1, 0, 100),
+    Row("k_p_theta", 1.0, 1, 0, 100),
+    Row("k_d_theta", 0.2, 1, 0, 100),
+    Row("k_i_theta", 0.2, 1, 0, 100),
+)
+(
+    CHI_INF, K_PATH, K_ORBIT, FILLET, ORBIT, OMEGA, ZETA, K_I_CHI, PHI_MAX, K_P_H, K_I_H, THETA_MAX, CLIMB, SINK,
+    CRUISE, K_P_V, K_I_V, K_FF_H, K_FF_N, THR_TRIM, K_P_PHI, K_D_PHI, K_P_THETA, K_D_THETA, K_I_THETA,
+) = range(len(TABLE))  # fmt: skip
+EAS2TAS = len(TABLE)
+
+NAMES = tuple(row.name for row in TABLE)
+DEFAULTS: dict[str, float] = {row.name: float(row.default) for row in TABLE}
+
+
+def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Turn parameters into the vector the kernels read; arguments and answer as for PX4's `parameters`."""
+    given = {name: float(value) for name, value in values.items()}
+    found = [find(row, given) for row in TABLE]
+    own = [row.default if value is None else value for row, value in zip(TABLE, found, strict=True)]
+    absent = tuple(row.name for row, value in zip(TABLE, found, strict=True) if value is None)
+    return padded(np.array([*own, eas2tas(altitude_m)], float), TEXTBOOK), absent

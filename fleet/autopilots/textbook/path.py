@@ -1,0 +1,137 @@
+"""Which course to fly: the vector field of a line, of an orbit, of a fillet between two lines.
+
+Source: Beard & McLain, "Small Unmanned Aircraft" (2012), sections 10.1, 10.2 and 11.1.
+"""
+
+from math import atan, atan2, cos, hypot, pi, sin, tan
+
+import numpy as np
+
+from fleet.autopilots.arduplane import legs as leg_rules
+from fleet.autopilots.arduplane import state as S
+from fleet.autopilots.arduplane.l1 import clip
+from fleet.autopilots.arduplane.state import kernel
+from fleet.autopilots.textbook import params as P
+from fleet.autopilots.textbook import state as X
+from fleet.frames import G, wrap
+from fleet.mission import KIND, LAND, LOITER_UNLIMITED, P_D, P_E, P_N, RADIUS, TAKEOFF, WAYPOINT
+
+_ON = 1.3  # of its radius: so near to an orbit its time runs [-]
+_SHARPEST = 2.6  # turn that a fillet is reckoned for [rad]
+
+
+@kernel
+def _turn(ctl: np.ndarray, leg: np.ndarray, after: np.ndarray) -> tuple[float, float, float, float, float]:
+    """Give the direction of this line and of the next, and the turn between them, right positive [rad]."""
+    here = atan2(leg[P_E] - ctl[S.PREV_E], leg[P_N] - ctl[S.PREV_N])
+    there = atan2(after[P_E] - leg[P_E], after[P_N] - leg[P_N])
+    return cos(here), sin(here), cos(there), sin(there), wrap(there - here)
+
+
+@kernel
+def _cut(par: np.ndarray, turn: float) -> float:
+    """Give how far from the corner the fillet touches the lines [m]."""
+    return par[P.FILLET] * tan(min(abs(turn), _SHARPEST) / 2)
+
+
+@kernel
+def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndarray) -> None:
+    """Go on to leg `k` over a fillet, or from the aircraft `p`, NED (3,) [m], where two lines do not meet."""
+    i = leg_rules.current(ctl, legs)
+    onward = i >= 0 and k == i + 1 and k < legs.shape[0] and int(legs[i, KIND]) == WAYPOINT
+    if not onward:
+        leg_rules.set_leg(ctl, par, legs, k, p)
+        ctl[X.SIDE] = 0.0
+        return
+    q_n, q_e, _, _, turn = _turn(ctl, legs[i], legs[k])
+    side, cut = (1.0 if turn > 0.0 else -1.0), _cut(par, turn)
+    ctl[X.C_N] = legs[i, P_N] - cut * q_n - side * par[P.FILLET] * q_e
+    ctl[X.C_E] = legs[i, P_E] - cut * q_e + side * par[P.FILLET] * q_n
+    leg_rules.set_leg(ctl, par, legs, k, legs[i, P_N : P_D + 1])
+    ctl[S.LINE], ctl[X.SIDE] = 1.0, side if abs(turn) > 0.02 and int(legs[k, KIND]) in (WAYPOINT, LAND) else 0.0
+
+
+@kernel
+def _to_line(ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, chi: float) -> float:
+    """Give the course to a line. Source: Beard & McLain eq. 10.8."""
+    q_n, q_e = leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]
+    if hypot(q_n, q_e) < 1.0:
+        q_n, q_e = leg[P_N] - p[0], leg[P_E] - p[1]
+    chi_q = chi + wrap(atan2(q_e, q_n) - chi)
+    e = (q_n * (p[1] - ctl[S.PREV_E]) - q_e * (p[0] - ctl[S.PREV_N])) / max(hypot(q_n, q_e), 0.1)
+    return chi_q - par[P.CHI_INF] * 2 / pi * atan(par[P.K_PATH] * e)
+
+
+@kernel
+def _to_orbit(par: np.ndarray, n: float, e: float, radius: float, p: np.ndarray, v: np.ndarray) -> tuple[float, float]:
+    """Give course and bank on an orbit round (n, e), radius positive clockwise [m]. Source: eq. 10.13."""
+    d, wide = 1.0 if radius > 0.0 else -1.0, max(abs(radius), 1.0)
+    out_n, out_e = p[0] - n, p[1] - e
+    chi = atan2(out_e, out_n) + d * (pi / 2 + atan(par[P.K_ORBIT] * (hypot(out_n, out_e) - wide) / wide))
+    near = abs(hypot(out_n, out_e) - wide) < 0.3 * wide
+    return chi, d * atan((v[0] ** 2 + v[1] ** 2) / (G * wide)) if near else 0.0
+
+
+@kernel
+def course(
+    ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray, chi: float, dt: float
+) -> tuple[float, float, bool]:
+    """Give course and bank of the path, and whether the leg is over.
+
+    Args:
+        ctl, par, legs: controller state, parameters, route
+        p, v: position and ground velocity, NED, (3,) [m, m/s]
+        chi: course flown [rad]
+        dt: step [s]
+    """
+    i = leg_rules.current(ctl, legs)
+    if i < 0 or int(legs[i, KIND]) == TAKEOFF:
+        return chi, 0.0, i >= 0 and p[2] <= legs[i, P_D]
+    leg, more = legs[i], i + 1 < legs.shape[0]
+    if int(leg[KIND]) not in (WAYPOINT, LAND):
+        radius = leg[RADIUS] if leg[RADIUS] != 0.0 else par[P.ORBIT]
+        course, bank = _to_orbit(par, leg[P_N], leg[P_E], radius, p, v)
+        return course, bank, _orbited(ctl, leg, p, radius, dt) and more
+    along, length = leg_rules.along_line(ctl, leg, p)
+    if ctl[X.SIDE] != 0.0:
+        course, bank = _to_orbit(par, ctl[X.C_N], ctl[X.C_E], ctl[X.SIDE] * par[P.FILLET], p, v)
+        q_n, q_e = (leg[P_N] - ctl[S.PREV_N]) / max(length, 0.1), (leg[P_E] - ctl[S.PREV_E]) / max(length, 0.1)
+        past = (ctl[X.C_N] - ctl[S.PREV_N]) * q_n + (ctl[X.C_E] - ctl[S.PREV_E]) * q_e
+        if along < past and along < length:
+            return course, bank, False
+        ctl[X.SIDE] = 0.0
+    cut = 0.0
+    if more and int(leg[KIND]) == WAYPOINT and int(legs[i + 1, KIND]) in (WAYPOINT, LAND):
+        cut = min(_cut(par, _turn(ctl, leg, legs[i + 1])[4]), 0.5 * length)
+    return _to_line(ctl, par, leg, p, chi), 0.0, int(leg[KIND]) == WAYPOINT and along > length - cut
+
+
+@kernel
+def _orbited(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, radius: float, dt: float) -> bool:
+    """Add up what is flown of an orbit; tell whether it is enough."""
+    n, e = leg[P_N] - p[0], leg[P_E] - p[1]
+    bearing = atan2(e, n)
+    if ctl[S.ON] > 0.0:
+        ctl[S.ANGLE] += wrap(bearing - ctl[S.BEARING]) * (1.0 if radius > 0.0 else -1.0)
+        ctl[S.TIMER] += dt
+    elif hypot(n, e) < _ON * abs(radius):
+        ctl[S.ON] = 1.0
+    ctl[S.BEARING] = bearing
+    return ctl[S.ON] > 0.0 and int(leg[KIND]) != LOITER_UNLIMITED and leg_rules.ready(ctl, leg, p)
+
+
+@kernel
+def height_demand(ctl: np.ndarray, legs: np.ndarray, p: np.ndarray) -> float:
+    """Give the height to be at, up positive: linear along a line that begins at a waypoint, at once elsewhere [m].
+
+    Args:
+        ctl, legs: controller state, route
+        p: position, NED, (3,) [m]
+    """
+    i = leg_rules.current(ctl, legs)
+    if i < 0:
+        return -ctl[S.PREV_D]
+    along, length = leg_rules.along_line(ctl, legs[i], p)
+    if ctl[S.LINE] == 0.0 or length < 1.0 or ctl[S.ON] > 0.0 or int(legs[i, KIND]) == TAKEOFF:
+        return -legs[i, P_D]
+    return -ctl[S.PREV_D] + (ctl[S.PREV_D] - legs[i, P_D]) * clip(along / length, 0.0, 1.0)
