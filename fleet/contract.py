@@ -89,6 +89,8 @@ COLUMNS: dict[str, tuple[tuple[str, str], ...]] = {
     "target": (("lat", "1e-7 deg"), ("lon", "1e-7 deg"), ("alt", "mm above mean sea level")),
 }
 """Columns of each `Rows` field of a `Sample`: name and unit, in wire order. Specific force and rates are FRD."""
+UNTOLD = {"command": 2}
+"""Fields whose columns from this one on are nan where the autopilot does not tell them."""
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True):

@@ -10,7 +10,8 @@ A leg is one row of float64; the columns are named below, the first one is a kin
     TAKEOFF          climb wings level to the altitude
     LAND             fly to the point; nothing after it is flown by itself
 
-Item 0 is home (ArduPilot). How often a DO_JUMP was already taken is not on the wire: the count starts fresh.
+Item 0 is home (ArduPilot), or the first to fly (PX4, whose mission does not hold home). How often a DO_JUMP was
+already taken is not on the wire: the count starts fresh.
 Source: MAVLink mission protocol, MAV_CMD and MAV_FRAME; ArduPlane mission command list.
 """
 
@@ -30,7 +31,8 @@ P_N, P_E, P_D = 1, 2, 3  # target, or centre of the circle, NED from the route's
 RADIUS = 4  # radius of the circle, positive clockwise; 0: the autopilot's WP_LOITER_RAD [m]
 TURNS = 5  # turns; seconds for LOITER_TIME
 VA_C = 6  # commanded airspeed; <= 0: cruise [m/s]
-ACCEPT = 7  # acceptance radius; 0: from the parameters; negative: fly past by that much [m]
+ACCEPT = 7  # acceptance radius; 0: from the parameters; negative: fly past by that much [m]; of a circle: 1: leave it
+# only towards the next leg (PX4; ArduPlane always does)
 SEQ = 8  # item this leg came from; -1: return to launch after the last one
 N_COLUMNS = 9
 
@@ -41,6 +43,7 @@ _RETURN, _LAST_NAV, _JUMP, _SPEED = 20, 95, 177, 178  # MAV_CMD: RETURN_TO_LAUNC
 _ABSOLUTE, _RELATIVE, _TERRAIN = (0, 5), (3, 6), (10, 11)  # MAV_FRAME
 GLOBAL_FRAMES = _ABSOLUTE + _RELATIVE + _TERRAIN
 _SHORTEST = 1.0  # a line shorter than this has no direction worth flying [m]
+FIRST = {"px4": 0}  # number of the first item to fly, by autopilot; 1 elsewhere
 _HIGHEST = 1e5  # altitudes beyond are noise [m]
 _RTL_ALTITUDE = 100.0  # ArduPlane's default RTL_ALTITUDE [m]
 
@@ -66,6 +69,7 @@ class _Walk:
     """A walk through the items: what is in force, what was found."""
 
     items: dict[int, Item]
+    first: int  # number of the first item to fly; below it is home
     last: int  # highest sequence number
     origin: Origin
     params: Mapping[str, float]
@@ -83,41 +87,45 @@ class _Walk:
         self.sentences.setdefault(sentence)
 
 
-def route(items: Sequence[Item], *, seq: int, origin: Origin, params: Mapping[str, float], limit: int = 64) -> Route:
+def route(
+    items: Sequence[Item], *, seq: int, origin: Origin, params: Mapping[str, float], limit: int = 64, first: int = 1
+) -> Route:
     """Unroll the legs from item `seq` on: jumps, speeds and altitude frames resolved. Never raises on a bad mission.
 
     Args:
-        items: mission as downloaded, in any order; item 0 is home
+        items: mission as downloaded, in any order
         seq: item in force
         origin: where the NED frame of the legs touches the earth
         params: autopilot parameters, for RTL_ALTITUDE, RTL_RADIUS and WP_LOITER_RAD
         limit: most legs to unroll
+        first: 1 where item 0 is home, 0 where it is the first to fly; home is the origin then. See `FIRST`
     Returns:
         legs, the point before them, and one sentence for everything that was wrong
     """
-    walk = _begin(items, origin, params)
+    walk = _begin(items, origin, params, first)
     at = _arrive(walk, _first(walk, seq))
     # after a circle or a takeoff ArduPlane begins the line where the aircraft is
     start = walk.point.copy() if walk.kind in (WAYPOINT, LAND) else np.full(3, np.nan)
     walk.legs = []
-    if walk.last >= 1:
+    if walk.last >= walk.first and walk.items:
         _unroll(walk, at, limit)
     legs = np.array(walk.legs[:limit]) if walk.legs[:limit] else np.empty((0, N_COLUMNS))
     return Route(origin, legs, start, tuple(walk.sentences))
 
 
-def _begin(items: Sequence[Item], origin: Origin, params: Mapping[str, float]) -> _Walk:
+def _begin(items: Sequence[Item], origin: Origin, params: Mapping[str, float], first: int) -> _Walk:
     kept = {item.seq: item for item in items if 0 <= item.seq < MAX_ITEMS}
-    walk = _Walk(kept, max(kept, default=0), origin, params, np.zeros(3), np.zeros(3))
+    walk = _Walk(kept, first, max(kept, default=0), origin, params, np.zeros(3), np.zeros(3))
     if any(not 0 <= item.seq < MAX_ITEMS for item in items):
         walk.say(f"mission: found {len(items)} items, expected at most {MAX_ITEMS}; kept the first, shorten it")
-    if walk.last < 1:
-        walk.say(f"mission: found {len(items)} items, expected home and one more; nothing to fly, upload a mission")
+    if walk.last < first or not kept:
+        wanted = "home and one more" if first else "one at least"
+        walk.say(f"mission: found {len(items)} items, expected {wanted}; nothing to fly, upload a mission")
         return walk
     lost = walk.last + 1 - len(kept)
     if lost:
         walk.say(f"mission: found {len(kept)} of {walk.last + 1} items; skipped {lost}, download the mission again")
-    walk.home = walk.point = _home(walk)
+    walk.home = walk.point = _home(walk) if first else np.zeros(3)
     return walk
 
 
@@ -155,15 +163,16 @@ def _number(value: float, otherwise: float = 0.0) -> float:
 
 
 def _first(walk: _Walk, seq: int) -> int:
-    if walk.last >= 1 and not 0 <= seq <= walk.last:
-        walk.say(f"mission: found item in force {seq}, expected 0..{walk.last}; began at 1, ask for MISSION_CURRENT")
-        return 1
-    return max(seq, 1)
+    if walk.last >= walk.first and not 0 <= seq <= walk.last:
+        began = f"began at {walk.first}, ask for MISSION_CURRENT"
+        walk.say(f"mission: found item in force {seq}, expected 0..{walk.last}; {began}")
+        return walk.first
+    return max(seq, walk.first)
 
 
 def _arrive(walk: _Walk, seq: int) -> int:
     """Walk the shortest way to `seq`, to learn the speed in force, the point before and the jumps used up."""
-    at = 1
+    at = walk.first
     while at < seq:
         item = walk.items.get(at)
         if item is not None and item.command == _JUMP:
@@ -199,18 +208,19 @@ def _ends(walk: _Walk) -> bool:
 
 
 def _target(walk: _Walk, item: Item) -> int:
-    """Read where a DO_JUMP goes; 0 when it goes nowhere."""
-    if 1 <= item.param1 <= walk.last:
+    """Read where a DO_JUMP goes; -1 when it goes nowhere."""
+    if walk.first <= item.param1 <= walk.last:
         return int(item.param1)
-    walk.say(f"mission item {item.seq}: found jump to {item.param1}, expected 1..{walk.last}; skipped, upload again")
-    return 0
+    expected = f"expected {walk.first}..{walk.last}"
+    walk.say(f"mission item {item.seq}: found jump to {item.param1}, {expected}; skipped, upload again")
+    return -1
 
 
 def _jump(walk: _Walk, item: Item) -> int:
     """Take a DO_JUMP while it has jumps left, and give the next sequence number."""
     target = _target(walk, item)
     left = walk.left.get(item.seq, _number(item.param2))
-    if target == 0 or left == 0:
+    if target < 0 or left == 0:
         return item.seq + 1
     if item.seq in walk.taken:
         walk.say(f"mission item {item.seq}: found a jump circle without a leg to fly; left it, put a waypoint inside")
@@ -287,14 +297,22 @@ def _leg(walk: _Walk, item: Item, kind: int, target: np.ndarray) -> np.ndarray:
         leg[RADIUS] = _number(item.param3)
     elif kind == LOITER_TO_ALT:
         leg[RADIUS] = _number(item.param2)
+    elif kind == LOITER_TIME and not walk.first:
+        leg[RADIUS] = _number(item.param3)
     elif kind == LOITER_TIME and _number(item.param3) < 0:  # ArduPlane reads the direction only
         leg[RADIUS] = -abs(_number(walk.params.get("WP_LOITER_RAD", 60.0), 60.0))
+    if not walk.first and kind in (LOITER_TIME, LOITER_TO_ALT):
+        heading = item.param2 if kind == LOITER_TIME else item.param1
+        leg[ACCEPT] = float(_number(heading) > 0)
     return leg
 
 
 def _return(walk: _Walk) -> np.ndarray:
-    """Make the leg that ArduPlane flies after the last item: circle over home at RTL_ALTITUDE."""
+    """Make the leg that is flown after the last item: ArduPlane circles over home at RTL_ALTITUDE, PX4 where it is."""
     leg = np.zeros(N_COLUMNS)
+    if not walk.first:
+        leg[KIND], leg[SEQ], leg[P_N : P_D + 1] = LOITER_UNLIMITED, -1, walk.point
+        return leg
     height = walk.params.get("RTL_ALTITUDE", walk.params.get("ALT_HOLD_RTL", 100.0 * _RTL_ALTITUDE) / 100.0)
     height = _number(height, _RTL_ALTITUDE)
     leg[KIND], leg[SEQ] = LOITER_UNLIMITED, -1

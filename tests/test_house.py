@@ -35,7 +35,7 @@ ALONE = {  # a foreign library, and the only places that may import it
     "zenoh": ("fleet/bus.py",),
     "viser": ("viewer/",),
     "jsbsim": ("fleet/pretend/jsbsim.py",),
-    "pymavlink": ("fleet/telemetry/", "fleet/pretend/mavlink.py", "gateway/"),
+    "pymavlink": ("fleet/telemetry/", "fleet/pretend/mavlink.py", "fleet/pretend/mavlink_said.py", "gateway/"),
 }
 
 APART = (  # who, and what it must never import

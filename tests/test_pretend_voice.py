@@ -15,7 +15,8 @@ from fleet.frames import to_ned
 from fleet.pretend import drive
 from fleet.pretend.jsbsim import DT
 from fleet.pretend.link import Link
-from fleet.pretend.mavlink import AUTO, TELEMETRY, Voice
+from fleet.pretend.mavlink import Voice
+from fleet.pretend.mavlink_said import AUTO, TELEMETRY
 from fleet.pretend.sensors import Servos
 from fleet.pretend.tuning import tuned
 from fleet.pretend.uav import PretendUav

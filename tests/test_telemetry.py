@@ -83,6 +83,16 @@ def test_commands_are_radians_and_each_autopilot_has_its_units_and_signs(autopil
     assert got == pytest.approx(want)
 
 
+def test_the_attitude_target_of_px4_is_a_command_that_leaves_errors_untold():
+    half = [math.cos(0.25), math.sin(0.25), 0.0, 0.0]  # phi 0.5 rad
+    sent = mav.MAVLink_attitude_target_message(900, 0, half, 0.0, 0.0, 0.0, 0.6)
+    got = columns("ATTITUDE_TARGET", "command", sent, "px4")
+    assert (got.pop("phi_c"), got.pop("theta_c")) == pytest.approx((0.5, 0.0), abs=1e-6)
+    assert all(math.isnan(value) for value in got.values())
+    assert believable("command", np.array([0.1, 0.1, np.nan, np.nan, np.nan]))
+    assert not believable("command", np.array([np.nan, 0.1, 0.0, 0.0, 0.0]))
+
+
 def test_only_servo_port_0_counts():
     intake, talker = Intake(), Talker()
     intake.hear(T0, talker.heartbeat() + talker.attitude(5.0))

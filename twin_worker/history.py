@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleet.contract import COLUMNS, Rows, Sample
+from fleet.contract import COLUMNS, UNTOLD, Rows, Sample
 
 _AHEAD_S = 1.0  # rows newer than their message by more are refused [s]
 _CHUNKS = 40  # chunks of one kind before they are joined
@@ -62,7 +62,7 @@ class History:
         t = np.concatenate([chunk[0] for chunk in found])
         x = np.concatenate([chunk[1] for chunk in found]).astype(float)
         most = _MOST_POSITION if name in ("position", "target") else _MOST
-        good = (t >= since) & (np.abs(x) < most).all(axis=1)  # nan is not
+        good = (t >= since) & (np.abs(x[:, : UNTOLD.get(name)]) < most).all(axis=1)  # nan is not
         t, x = t[good], x[good]
         if (np.diff(t) > 0).all():
             return t, x

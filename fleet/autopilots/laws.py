@@ -10,6 +10,7 @@ A newcomer adds a folder or file with `parameters, init, begin, fly, stabilise, 
 """
 
 from collections.abc import Callable, Mapping
+from math import hypot
 from typing import NamedTuple
 
 import numba as nb
@@ -198,3 +199,14 @@ def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) 
         textbook.shift(ctl, par, miss, told)
     else:
         shift_arduplane(ctl, par, miss, told)
+
+
+@kernel
+def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray) -> float:
+    """Give the height to be at, up positive above the origin [m]; p, v: position and ground velocity, NED, (3,)."""
+    law = mark(par)
+    if law == PX4:
+        return px4_fixedwing.height_demand(ctl, par, legs, p, hypot(v[0], v[1]))
+    if law == TEXTBOOK:
+        return textbook.height_demand(ctl, legs, p)
+    return leg_rules.height_demand(ctl, par, legs, p)

@@ -11,28 +11,10 @@ import jsbsim
 import numpy as np
 
 from fleet.frames import Origin, to_ned
+from fleet.pretend.types import CRUISE, TYPES, Type
 from fleet.pretend.weather import FT, wind_at_20ft
 
 DT = 0.01  # physics step [s]
-MODEL = "aerosonde"
-CRUISE = 23.0  # [m/s]
-SPREAD = {  # standard deviation of each factor vary/* between aircraft of one type [-]
-    "C_L_alpha": 0.04,
-    "C_D_p": 0.08,
-    "C_Y_beta": 0.08,
-    "C_l_beta": 0.08,
-    "C_l_p": 0.07,
-    "C_l_delta_a": 0.07,
-    "C_m_alpha": 0.08,
-    "C_m_q": 0.08,
-    "C_m_delta_e": 0.07,
-    "C_n_beta": 0.08,
-    "C_n_r": 0.10,
-    "C_n_delta_r": 0.07,
-    "thrust": 0.05,
-}
-OFFSETS = {"C_l_0": 0.001, "C_m_0": 0.004, "C_n_0": 0.0004}  # what building by hand leaves askew [-]
-PAYLOAD_KG = (0.5, 2.5)  # on 9.5 kg empty
 _KG_TO_LB = 2.2046226218
 _SLUG_FT3 = 515.378819  # [kg/m3]
 _READ = (
@@ -43,7 +25,9 @@ _READ = (
     *("accelerations/a-pilot-x-ft_sec2", "accelerations/a-pilot-y-ft_sec2", "accelerations/a-pilot-z-ft_sec2"),
     *("velocities/vt-fps", "aero/alpha-rad", "aero/beta-rad", "atmosphere/rho-slugs_ft3"),
 )
-_SURFACES = ("fcs/aileron-cmd-norm", "fcs/elevator-cmd-norm", "fcs/rudder-cmd-norm", "fcs/motor-cmd-norm")
+_SURFACES = ("fcs/aileron-cmd-norm", "fcs/elevator-cmd-norm", "fcs/rudder-cmd-norm")
+_MIXTURE = 0.87  # of a piston engine at these heights [-]
+__all__ = ["CRUISE", "DT", "Aircraft", "Truth"]
 
 
 class Truth(NamedTuple):
@@ -63,18 +47,20 @@ class Truth(NamedTuple):
 class Aircraft:
     """One JSBSim aircraft, with the small differences that every built aircraft has."""
 
-    def __init__(self, origin: Origin, seed: int, turbulence: int = 0):
+    def __init__(self, origin: Origin, seed: int, turbulence: int = 0, kind: Type = TYPES["small"]):
         """Load the model and draw what makes this aircraft its own.
 
         Args:
             origin: where the NED frame touches the earth
             seed: draws mass, coefficients and turbulence
             turbulence: MIL-F-8785C severity, 0..7
+            kind: what to load
         Raises:
             RuntimeError: when JSBSim refuses its aircraft file; reinstall the package.
         """
-        self._fdm = _executive()
-        self._nodes = {name: self._fdm.get_property_manager().get_node(name) for name in (*_READ, *_SURFACES)}
+        self._fdm, self._kind = _executive(kind), kind
+        self._driven = (*_SURFACES, kind.motor)
+        self._nodes = {name: self._fdm.get_property_manager().get_node(name) for name in (*_READ, *self._driven)}
         self._read = [self._nodes[name].get_double_value for name in _READ]
         self._origin = origin
         corner = np.array([[origin.lat_e7 + 10_000, origin.lon_e7 + 10_000, origin.alt_mm]])  # to_ned is linear
@@ -85,11 +71,13 @@ class Aircraft:
         self._seed = seed
 
     def _vary(self, rng: np.random.Generator) -> None:
-        self.payload_kg = rng.uniform(*PAYLOAD_KG)
-        self._fdm["inertia/pointmass-weight-lbs"] = self.payload_kg * _KG_TO_LB
-        for name, spread in SPREAD.items():
+        self.payload_kg = rng.uniform(*self._kind.payload_kg)
+        self._fdm["inertia/pointmass-weight-lbs[1]" if self._kind.shipped else "inertia/pointmass-weight-lbs"] = (
+            self.payload_kg * _KG_TO_LB
+        )
+        for name, spread in self._kind.spread.items():
             self._fdm[f"vary/{name}"] = 1 + spread * float(np.clip(rng.standard_normal(), -2, 2))
-        for name, spread in OFFSETS.items():
+        for name, spread in self._kind.offsets.items():
             self._fdm[f"vary/{name}"] = spread * float(np.clip(rng.standard_normal(), -2, 2))
 
     def start(self, p: np.ndarray, psi: float, Va: float, wind: tuple[float, float]) -> tuple[float, float, float]:
@@ -111,7 +99,7 @@ class Aircraft:
         fdm["ic/h-sl-ft"] = (self._origin.alt_mm * 1e-3 - p[2]) / FT
         fdm["ic/psi-true-rad"] = psi
         fdm["ic/phi-rad"] = 0.0
-        trim = self._trim(Va)
+        trim = self._trim_engine(Va) if self._kind.shipped else self._trim(Va)
         fdm["ic/vw-mag-fps"] = hypot(*wind) / FT
         fdm["ic/vw-dir-deg"] = degrees(atan2(wind[1], wind[0])) % 360
         fdm["ic/vn-fps"] = (Va * cos(psi) + wind[0]) / FT
@@ -122,8 +110,25 @@ class Aircraft:
         fdm["atmosphere/turbulence/milspec/severity"] = float(self._turbulence)
         fdm.run_ic()
         fdm.set_trim_status(False)
+        if self._kind.shipped:
+            fdm["propulsion/set-running"] = -1
         self.blow(*wind)
         return trim
+
+    def _trim_engine(self, Va: float) -> tuple[float, float, float]:
+        """Start the engine and let JSBSim trim; the pitch trim wheel is left to the elevator."""
+        fdm = self._fdm
+        fdm["ic/vt-fps"], fdm["ic/gamma-deg"] = Va / FT, 0.0
+        fdm["propulsion/magneto_cmd"], fdm["fcs/mixture-cmd-norm"] = 3, _MIXTURE
+        fdm[self._kind.motor] = 0.6
+        fdm.run_ic()
+        fdm["propulsion/set-running"] = -1
+        fdm["simulation/do_simple_trim"] = 0  # longitudinal
+        theta, delta_e, delta_t = fdm["attitude/theta-rad"], -fdm["fcs/pitch-trim-cmd-norm"], fdm[self._kind.motor]
+        fdm["fcs/pitch-trim-cmd-norm"] = 0.0
+        fdm["ic/alpha-rad"] = fdm["ic/theta-rad"] = theta
+        self.drive(0.0, delta_e, 0.0, delta_t)
+        return float(theta), float(delta_e), float(delta_t)
 
     def _trim(self, Va: float) -> tuple[float, float, float]:
         """Solve udot = wdot = qdot = 0 for alpha, delta_e, delta_t by Newton's method; servo lags pass through."""
@@ -148,7 +153,7 @@ class Aircraft:
 
     def drive(self, delta_a: float, delta_e: float, delta_r: float, delta_t: float) -> None:
         """Command the servos, -1..1 (+ rolls right, pitches up, yaws right), and the motor, 0..1."""
-        for name, value in zip(_SURFACES, (delta_a, -delta_e, -delta_r, delta_t), strict=True):
+        for name, value in zip(self._driven, (delta_a, -delta_e, -delta_r, delta_t), strict=True):
             self._nodes[name].set_double_value(value)
 
     def blow(self, w_n: float, w_e: float) -> None:
@@ -179,12 +184,13 @@ class Aircraft:
         return float(self._fdm[name])
 
 
-def _executive() -> Any:
-    """Make a silent JSBSim executive with our aircraft loaded."""
+def _executive(kind: Type) -> Any:
+    """Make a silent JSBSim executive with an aircraft loaded."""
     jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.ERROR))
-    fdm = jsbsim.FGFDMExec(str(Path(__file__).parent))
+    fdm = jsbsim.FGFDMExec(None if kind.shipped else str(Path(__file__).parent))
     fdm.set_debug_level(0)
-    if not fdm.load_model(MODEL):
-        raise RuntimeError(f"jsbsim: found no loadable {MODEL!r}, expected it beside this file; reinstall the package")
+    if not fdm.load_model(kind.model):
+        place = "in the jsbsim package" if kind.shipped else "beside this file"
+        raise RuntimeError(f"jsbsim: found no loadable {kind.model!r}, expected it {place}; reinstall the package")
     fdm.set_dt(DT)
     return fdm

@@ -1,29 +1,21 @@
-"""The voice of a pretend aircraft: MAVLink 2 as ArduPlane speaks it, telemetry out, questions in, answers out.
+"""The voice of a pretend aircraft: MAVLink 2 as ArduPlane or PX4 speak it, telemetry out, questions in, answers out.
 
-Degrees, centimetres and whole percent begin and end in this file.
-Source: MAVLink common and ardupilotmega dialects; rates as an ArduPlane telemetry link streams them.
+What is told unasked is in `mavlink_said`.
+Source: MAVLink common and ardupilotmega dialects.
 """
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from math import atan2, degrees, hypot
-from typing import Any, NamedTuple
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.contract import Item
-from fleet.pretend.sensors import Estimate
+from fleet.pretend.mavlink_said import DIALECTS, Dialect, Flight, value_message
 
 TICK_HZ = 100
 COMPONENT = mav.MAV_COMP_ID_AUTOPILOT1
-AUTO = 10  # ArduPlane custom_mode
 MOST_AIRCRAFT = 250  # system ids 1..250 belong to vehicles
-_ARMED = (
-    mav.MAV_MODE_FLAG_SAFETY_ARMED
-    | mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-    | mav.MAV_MODE_FLAG_STABILIZE_ENABLED
-    | mav.MAV_MODE_FLAG_GUIDED_ENABLED
-)
 _CAPABILITIES = (
     mav.MAV_PROTOCOL_CAPABILITY_MISSION_FLOAT
     | mav.MAV_PROTOCOL_CAPABILITY_MISSION_INT
@@ -31,122 +23,33 @@ _CAPABILITIES = (
     | mav.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
 )
-_VERSION = 0x040600FF  # 4.6.0, official release
 _ANSWERS_PER_TICK = 2  # parameters are streamed, not thrown
-
-
-class Flight(NamedTuple):
-    """What one aircraft has to tell at one instant."""
-
-    t: float  # since boot [s]
-    now: Estimate
-    place: tuple[int, int, int]  # believed position [1e-7 deg, 1e-7 deg, mm above mean sea level]
-    height: float  # above home [m]
-    pulses: tuple[int, int, int, int]  # servos 1..4 [us]
-    delta_t: float  # [-]
-    phi_c: float  # [rad]
-    theta_c: float  # [rad]
-    target: tuple[float, float]  # horizontal, from the aircraft to the waypoint, NED [m]
-    alt_error: float  # [m]
-    Va_error: float  # [m/s]
-    xtrack_error: float  # [m]
-    seq: int  # mission item in force
-    total: int  # items in the mission
-
-
-def _boot_ms(t: float) -> int:
-    return round(t * 1e3) & 0xFFFFFFFF
-
-
-def _attitude(f: Flight) -> Any:
-    return mav.MAVLink_attitude_message(_boot_ms(f.t), *map(float, f.now.euler), *map(float, f.now.rates))
-
-
-def _imu(f: Flight) -> Any:
-    fields = 0b111111  # accelerometers and gyros
-    zeros = (0.0,) * 7
-    return mav.MAVLink_highres_imu_message(
-        round(f.t * 1e6), *map(float, f.now.force), *map(float, f.now.rates), *zeros, fields
-    )
-
-
-def _servos(f: Flight) -> Any:
-    return mav.MAVLink_servo_output_raw_message(round(f.t * 1e6) & 0xFFFFFFFF, 0, *f.pulses, 0, 0, 0, 0)
-
-
-def _position(f: Flight) -> Any:
-    v = [round(float(x) * 100) for x in f.now.v]
-    heading = round(degrees(f.now.euler[2]) * 100) % 36_000
-    return mav.MAVLink_global_position_int_message(_boot_ms(f.t), *f.place, round(f.height * 1e3), *v, heading)
-
-
-def _hud(f: Flight) -> Any:
-    heading = int(degrees(f.now.euler[2])) % 360
-    ground = hypot(f.now.v[0], f.now.v[1])
-    return mav.MAVLink_vfr_hud_message(
-        f.now.Va, ground, heading, round(f.delta_t * 100), f.place[2] * 1e-3, -float(f.now.v[2])
-    )
-
-
-def _nav(f: Flight) -> Any:
-    bearing = round(degrees(atan2(f.target[1], f.target[0])))
-    distance = min(round(hypot(*f.target)), 65_535)
-    Va_error = f.Va_error * 100  # ArduPlane sends centimetres per second here, against the dialect's text
-    return mav.MAVLink_nav_controller_output_message(
-        degrees(f.phi_c), degrees(f.theta_c), bearing, bearing, distance, f.alt_error, Va_error, f.xtrack_error
-    )
-
-
-def _mission_current(f: Flight) -> Any:
-    return mav.MAVLink_mission_current_message(f.seq, f.total, mav.MISSION_STATE_ACTIVE, 1)
-
-
-def _heartbeat(f: Flight) -> Any:
-    del f
-    return mav.MAVLink_heartbeat_message(
-        mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA, _ARMED, AUTO, mav.MAV_STATE_ACTIVE, 3
-    )
-
-
-def _sys_status(f: Flight) -> Any:
-    present = mav.MAV_SYS_STATUS_SENSOR_3D_GYRO | mav.MAV_SYS_STATUS_SENSOR_3D_ACCEL | mav.MAV_SYS_STATUS_AHRS
-    volts = round(48_000 - 2_000 * f.delta_t)
-    return mav.MAVLink_sys_status_message(
-        present, present, present, 250, volts, round(2_000 * f.delta_t), 80, 0, 0, 0, 0, 0, 0
-    )
-
-
-TELEMETRY: tuple[tuple[int, int, Callable[[Flight], Any]], ...] = (
-    # rate [Hz], phase [ticks], maker
-    (25, 0, _attitude),
-    (25, 2, _imu),
-    (20, 1, _servos),
-    (10, 0, _position),
-    (10, 5, _hud),
-    (5, 7, _nav),
-    (1, 11, _mission_current),
-    (1, 23, _heartbeat),
-    (1, 37, _sys_status),
-)
 
 
 class Voice:
     """One MAVLink system: counts its frames, knows its mission and parameters, answers."""
 
-    def __init__(self, system: int, items: tuple[Item, ...], params: Mapping[str, float]):
+    def __init__(
+        self,
+        system: int,
+        items: tuple[Item, ...],
+        params: Mapping[str, float],
+        dialect: Dialect = DIALECTS["ardupilot"],
+    ):
         """Speak as `system`.
 
         Args:
             system: MAVLink system id, 1..250
             items: the mission on board
-            params: parameters in ArduPilot's names and units
+            params: parameters in the autopilot's names and units
+            dialect: how the autopilot speaks
         """
         self._out = mav.MAVLink(None, srcSystem=system, srcComponent=COMPONENT)
         self._in = mav.MAVLink(None)
         self._in.robust_parsing = True
         self._items = items
         self._names = sorted(params)
-        self._params = params
+        self._params, self._dialect = params, dialect
         self._waiting: deque[int] = deque()  # parameters still to be streamed
 
     def _frame(self, message: Any) -> bytes:
@@ -156,7 +59,7 @@ class Voice:
 
     def telemetry(self, tick: int, flight: Callable[[], Flight]) -> list[bytes]:
         """Give the frames due at this tick of 10 ms; `flight` is asked only when one is."""
-        due = [make for rate, phase, make in TELEMETRY if (tick - phase) % (TICK_HZ // rate) == 0]
+        due = [make for rate, phase, make in self._dialect.telemetry if (tick - phase) % round(TICK_HZ / rate) == 0]
         now = flight() if due else None
         frames = [self._frame(make(now)) for make in due if now is not None]
         return frames + self.stream(_ANSWERS_PER_TICK)
@@ -182,8 +85,7 @@ class Voice:
     def _param(self, index: int, asked_by_name: bool = False) -> Any:
         name = self._names[index]
         shown = 65_535 if asked_by_name else index
-        kind = mav.MAV_PARAM_TYPE_REAL32
-        return mav.MAVLink_param_value_message(name.encode(), self._params[name], kind, len(self._names), shown)
+        return value_message(name, self._params[name], (len(self._names), shown), self._dialect)
 
     def _param_list(self, message: Any, t: float) -> list[Any]:
         del message, t
@@ -227,7 +129,9 @@ class Voice:
     def _version(self) -> Any:
         none = [0] * 8
         uid = self._out.srcSystem
-        return mav.MAVLink_autopilot_version_message(_CAPABILITIES, _VERSION, 0, 0, 0, none, none, none, 0, 0, uid)
+        return mav.MAVLink_autopilot_version_message(
+            _CAPABILITIES, self._dialect.version, 0, 0, 0, none, none, none, 0, 0, uid
+        )
 
     def _timesync(self, message: Any, t: float) -> list[Any]:
         return [mav.MAVLink_timesync_message(round(t * 1e9), message.ts1)] if message.tc1 == 0 else []

@@ -1,24 +1,39 @@
 """Missions for pretend aircraft: each its own walk round a common home, with turns, climbs, loiters and speed changes.
 
-Items are as MAVLink knows them; item 0 is home; the last is a DO_JUMP back to the first waypoint, for ever.
+Items are as MAVLink knows them; the last is a DO_JUMP back to the first waypoint, for ever. Item 0 is home; PX4 has no
+such item, and circles by the clock where ArduPlane counts turns.
 """
 
+from collections.abc import Iterator
 from math import atan2, cos, hypot, pi, radians, sin
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from fleet.contract import Item
 from fleet.frames import Origin, to_geodetic, wrap
 
 HOME = Origin(474_000_000, 85_000_000, 450_000)  # over open country [1e-7 deg, 1e-7 deg, mm]
-WAYPOINT, LOITER_TURNS, DO_JUMP, DO_CHANGE_SPEED = 16, 18, 177, 178
+WAYPOINT, LOITER_TURNS, LOITER_TIME, DO_JUMP, DO_CHANGE_SPEED = 16, 18, 19, 177, 178
 ABSOLUTE, RELATIVE_ALT = 0, 3
 REACH_M = 1_300.0  # waypoints stay this near to home
 LEGS = 10
 TURNS_DEG = (25, 45, 60, 75, 90, 90, 110, 130, 150)
 LOW_M, HIGH_M = 80.0, 200.0  # above home
-CLIMB, SINK = 0.08, 0.055  # steepest slopes: what the motor lifts, what an idling motor sinks [-]
+
+
+class Field(NamedTuple):
+    """What the missions of a type of aircraft look like."""
+
+    scale: float = 1.0  # of lengths over ground
+    circle: float = 1.0  # of radii
+    height: float = 1.0  # of heights above home
+    climb: float = 0.08  # steepest slopes: what the motor lifts, what an idling motor sinks [-]
+    sink: float = 0.055
+
+
+SMALL = Field()
 
 
 class Start(NamedTuple):
@@ -32,23 +47,26 @@ class Start(NamedTuple):
 class _Walk:
     """A random walk of waypoints, NED from home."""
 
-    def __init__(self, rng: np.random.Generator):
-        self._rng = rng
+    def __init__(self, rng: np.random.Generator, field: Field):
+        self._rng, self._field = rng, field
         self.course = rng.uniform(-pi, pi)
-        radius = rng.uniform(200, 700)
+        radius = rng.uniform(200, 700) * field.scale
         bearing = rng.uniform(-pi, pi)
         self.n, self.e = radius * cos(bearing), radius * sin(bearing)
-        self.h = rng.uniform(100, 180)
+        self.h = rng.uniform(100, 180) * field.height
 
     def advance(self, turn: float, length: float, climb: float) -> None:
         """Turn by `turn` [rad], fly `length` [m], climb by `climb` [m]; turn homewards when too far out."""
-        if hypot(self.n + length * cos(self.course + turn), self.e + length * sin(self.course + turn)) > REACH_M:
+        if (
+            hypot(self.n + length * cos(self.course + turn), self.e + length * sin(self.course + turn))
+            > REACH_M * self._field.scale
+        ):
             home = wrap(atan2(-self.e, -self.n) - self.course)
             turn = float(np.clip(home, -2.4, 2.4)) + self._rng.uniform(-0.3, 0.3)
         self.course = wrap(self.course + turn)
         self.n += length * cos(self.course)
         self.e += length * sin(self.course)
-        self.h = float(np.clip(self.h + climb, LOW_M, HIGH_M))
+        self.h = float(np.clip(self.h + climb, LOW_M * self._field.height, HIGH_M * self._field.height))
 
     def spot(self) -> tuple[float, float, float]:
         """Give the current spot, NED from home [m]."""
@@ -60,29 +78,36 @@ def _turn(rng: np.random.Generator, at_least: float = 0.0) -> float:
     return radians(rng.choice([t for t in TURNS_DEG if t >= at_least])) * rng.choice([-1, 1])
 
 
-def mission(seed: int, cruise: float, origin: Origin = HOME) -> tuple[tuple[Item, ...], Start]:
+def mission(
+    seed: int, cruise: float, origin: Origin = HOME, field: Field = SMALL, autopilot: str = "ardupilot"
+) -> tuple[tuple[Item, ...], Start]:
     """Make one aircraft's endless mission and the place it is found at, in front of a turn.
 
     Args:
         seed: draws everything
         cruise: airspeed the speed changes are about [m/s]
         origin: home
+        field: what its type of aircraft needs
+        autopilot: ardupilot or px4, which read some items differently
     """
     rng = np.random.default_rng((seed, 2))
-    walk = _Walk(rng)
+    walk, px4 = _Walk(rng, field), autopilot == "px4"
     items = [_item(0, WAYPOINT, origin, (0.0, 0.0, 0.0), frame=ABSOLUTE)]
     loiter_at = int(rng.integers(3, LEGS))
     before = walk.spot()
     for leg in range(LEGS):
         turn = _turn(rng, at_least=60) if leg == 2 else _turn(rng)
-        length = rng.uniform(350, 750)
-        climb = float(rng.choice([0, 0, CLIMB, -SINK, CLIMB, -SINK])) * rng.uniform(0.5, 1.0) * length
+        length = rng.uniform(350, 750) * field.scale
+        slope = float(rng.choice([0, 0, field.climb, -field.sink, field.climb, -field.sink]))
+        climb = slope * rng.uniform(0.5, 1.0) * length
         walk.advance(turn, length, climb)
         if leg == 1:
-            start = _before_turn(rng, before, walk.spot(), len(items))
+            start = _before_turn(rng, (before, walk.spot()), len(items), field.scale)
         if leg == loiter_at:
-            radius = float(rng.choice([-1, 1])) * rng.uniform(80, 120)
-            items.append(_item(len(items), LOITER_TURNS, origin, walk.spot(), params=(1.0, 0.0, radius)))
+            radius = float(rng.choice([-1, 1])) * rng.uniform(80, 120) * field.circle
+            turn_s = round(2 * pi * abs(radius) / cruise)
+            command, params = (LOITER_TIME, (turn_s, 1.0, radius)) if px4 else (LOITER_TURNS, (1.0, 0.0, radius))
+            items.append(_item(len(items), command, origin, walk.spot(), params=params))
         else:
             items.append(_item(len(items), WAYPOINT, origin, walk.spot()))
         if leg in (3, 7):
@@ -90,14 +115,21 @@ def mission(seed: int, cruise: float, origin: Origin = HOME) -> tuple[tuple[Item
             items.append(_item(len(items), DO_CHANGE_SPEED, origin, params=(0.0, round(speed, 1), -1.0)))
         before = walk.spot()
     items.append(_item(len(items), DO_JUMP, origin, params=(1.0, -1.0)))
-    return tuple(items), start
+    return (tuple(_from_zero(items[1:])), start._replace(seq=start.seq - 1)) if px4 else (tuple(items), start)
 
 
-def _before_turn(rng: np.random.Generator, a: tuple, b: tuple, seq: int) -> Start:
-    """Stand on the leg a -> b, so near to b that the next turn begins within about ten seconds."""
-    p, q = np.array(a), np.array(b)
+def _from_zero(items: list[Item]) -> Iterator[Item]:
+    """Number items from zero, the jump back with them."""
+    for item in items:
+        first = item.param1 - 1 if item.command == DO_JUMP else item.param1
+        yield msgspec.structs.replace(item, seq=item.seq - 1, param1=first)
+
+
+def _before_turn(rng: np.random.Generator, leg: tuple[tuple, tuple], seq: int, scale: float) -> Start:
+    """Stand on the leg, so near to its end that the next turn begins within about ten seconds."""
+    p, q = np.array(leg[0]), np.array(leg[1])
     length = hypot(q[0] - p[0], q[1] - p[1])
-    share = 1 - rng.uniform(120, 280) / max(length, 300.0)
+    share = 1 - rng.uniform(120, 280) * scale / max(length, 300.0 * scale)
     return Start(seq, p + (q - p) * max(share, 0.05), atan2(q[1] - p[1], q[0] - p[0]))
 
 

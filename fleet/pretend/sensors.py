@@ -65,6 +65,19 @@ class Sensors:
         )
 
 
+class WindEstimate:
+    """What the autopilot believes of the wind: the mean wind it flies in, wandering by 0.4 m/s in a minute."""
+
+    def __init__(self, rng: np.random.Generator, dt: float):
+        """Draw the first error; `dt` is the time between two calls of `measure` [s]."""
+        self._error = GaussMarkov(rng, np.full(2, 0.4), np.full(2, 60.0), dt)
+
+    def measure(self, wind: tuple[float, float]) -> tuple[float, float]:
+        """Add this instant's error to the mean wind, NED [m/s]."""
+        off = self._error.step()
+        return wind[0] + float(off[0]), wind[1] + float(off[1])
+
+
 class Servos:
     """The pulse widths between autopilot and servos: what is sent is what is flown, in whole microseconds."""
 

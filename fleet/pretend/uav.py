@@ -5,27 +5,40 @@ from math import pi, sin
 import numpy as np
 
 from fleet import mission as legs_of
-from fleet.autopilots import arduplane
+from fleet.autopilots import laws
 from fleet.autopilots.arduplane import state as memory
-from fleet.autopilots.arduplane.legs import height_demand
+from fleet.autopilots.slots import W_E, W_N
 from fleet.frames import G, Origin, to_geodetic
-from fleet.pretend.jsbsim import CRUISE, Aircraft
-from fleet.pretend.mavlink import MOST_AIRCRAFT, TICK_HZ, Flight, Ground, Voice
+from fleet.pretend.jsbsim import Aircraft
+from fleet.pretend.mavlink import MOST_AIRCRAFT, TICK_HZ, Ground, Voice
+from fleet.pretend.mavlink_said import DIALECTS, Flight
 from fleet.pretend.missions import HOME, mission
-from fleet.pretend.sensors import Estimate, Sensors, Servos
+from fleet.pretend.sensors import Estimate, Sensors, Servos, WindEstimate
 from fleet.pretend.tuning import tuned
+from fleet.pretend.types import TYPES
 from fleet.pretend.weather import Wind
 
 DT = 1 / TICK_HZ
 _INNER, _OUTER = 2, 10  # attitude loop at 50 Hz, guidance at 10 Hz [ticks]
 _LEGS_AHEAD = 200
+_LAWS = {"ardupilot": "arduplane", "px4": "px4"}
 _GROUND_M = 3.0  # below this height above home the flight is over
 
 
 class PretendUav:
-    """An aircraft in AUTO on its own mission; `step` makes it fly and talk, `hear` makes it answer."""
+    """An aircraft on its own mission; `step` makes it fly and talk, `hear` makes it answer."""
 
-    def __init__(self, uav_id: int, seed: int, *, wind: float = 4.0, turbulence: int = 2, origin: Origin = HOME):
+    def __init__(
+        self,
+        uav_id: int,
+        seed: int,
+        *,
+        wind: float = 4.0,
+        turbulence: int = 2,
+        origin: Origin = HOME,
+        autopilot: str = "ardupilot",
+        aircraft: str = "small",
+    ):
         """Put one aircraft in the air.
 
         Args:
@@ -34,6 +47,8 @@ class PretendUav:
             wind: mean wind at 100 m [m/s]
             turbulence: MIL-F-8785C severity, 0..7
             origin: home, where the NED frame touches the earth
+            autopilot: whose law flies it and whose MAVLink it speaks, ardupilot or px4
+            aircraft: name in `types.TYPES`
         Raises:
             ValueError: when MAVLink has no system id for it.
         """
@@ -43,31 +58,40 @@ class PretendUav:
         own = int(np.random.SeedSequence((seed, uav_id)).generate_state(1)[0])
         rng = np.random.default_rng((own, 4))
         self.uav_id, self.origin = uav_id, origin
-        self.items, start = mission(own, CRUISE, origin)
-        self.params = tuned(own)
+        self._kind = kind = TYPES[aircraft]
+        self._law = _LAWS[autopilot]
+        self._first = legs_of.FIRST.get(autopilot, 1)
+        self.items, start = mission(own, kind.cruise, origin, kind.field, autopilot)
+        self.params = tuned(own, autopilot, aircraft)
         self.boot_s = float(rng.uniform(60, 600))  # on the ground before the world began [s]
         self.tick = 0
         self.down = False  # it hit the ground
         self._wind = Wind(wind, rng, DT * _OUTER, np.random.default_rng((seed, 5)).uniform(-pi, pi))
         self._sensors = Sensors(rng, DT * _INNER)
-        self._voice = Voice(uav_id + 1, self.items, self.params)
-        self.aircraft = Aircraft(origin, own, turbulence)
+        self._wind_hat = WindEstimate(np.random.default_rng((own, 8)), DT * _OUTER)
+        self._voice = Voice(uav_id + 1, self.items, self.params, DIALECTS[autopilot])
+        self.aircraft = Aircraft(origin, own, turbulence, kind)
         blowing = self._wind.step(-start.p[2])
+        self._believed = self._wind_hat.measure(blowing)
         self._phi_c = 0.0
-        self._theta_c, delta_e, self._delta_t = self.aircraft.start(start.p, start.psi, CRUISE, blowing)
+        self._theta_c, delta_e, self._delta_t = self.aircraft.start(start.p, start.psi, kind.cruise, blowing)
         self.pulses = Servos.pulses(0.0, delta_e, 0.0, self._delta_t)
         self.now: Estimate = self._sensors.measure(self.aircraft.truth())
         self._engage(start.seq)
 
     def _engage(self, seq: int) -> None:
         """Start the autopilot on item `seq`."""
-        self._par, _ = arduplane.parameters(self.params, self.origin.alt_mm * 1e-3 - self.now.p[2])
-        route = legs_of.route(self.items, seq=seq, origin=self.origin, params=self.params, limit=_LEGS_AHEAD)
-        self._legs = route.legs
+        par, _ = laws.parameters(self._law, self.params, self.origin.alt_mm * 1e-3 - self.now.p[2])
+        self._par = laws.blown(par, *self._believed)
+        self._legs, start = self._route(seq)
         e = self.now
-        self._ctl = arduplane.init(
-            self._par, self._legs, 0, route.start, e.p, e.v, e.euler, e.Va, self._theta_c, self._delta_t
-        )
+        self._ctl = laws.init(self._par, self._legs, 0, start, e.p, e.v, e.euler, e.Va, self._theta_c, self._delta_t)
+
+    def _route(self, seq: int) -> tuple[np.ndarray, np.ndarray]:
+        """Unroll the mission from item `seq`; give its legs and where the first begins."""
+        more = {"params": self.params, "limit": _LEGS_AHEAD, "first": self._first}
+        way = legs_of.route(self.items, seq=seq, origin=self.origin, **more)  # type: ignore[arg-type]
+        return way.legs, way.start
 
     def step(self, t: float) -> list[bytes]:
         """Fly on to `t` [s] since the start and give the frames sent on the way."""
@@ -89,11 +113,13 @@ class PretendUav:
     @property
     def leg(self) -> np.ndarray:
         """The leg in force, columns as in `fleet.mission`."""
-        return self._legs[int(self._ctl[arduplane.LEG])]
+        return self._legs[int(self._ctl[memory.LEG])]
 
     def _tick(self) -> list[bytes]:
         if self.tick % _OUTER == 0:
-            self.aircraft.blow(*self._wind.step(-self.now.p[2]))
+            blowing = self._wind.step(-self.now.p[2])
+            self._believed = self._wind_hat.measure(blowing)
+            self.aircraft.blow(*blowing)
         if self.tick % _INNER == 0:
             self._control()
         frames = self._voice.telemetry(self.tick, self._flight)
@@ -107,12 +133,13 @@ class PretendUav:
         self.down = not -e.p[2] > _GROUND_M
         if self.tick % _OUTER == 0:
             Va_dot = float(e.force[0]) - G * sin(e.euler[1])
-            self._phi_c, self._theta_c, self._delta_t = arduplane.guide(
+            self._par[[W_N, W_E]] = self._believed
+            self._phi_c, self._theta_c, self._delta_t = laws.guide(
                 self._ctl, self._par, self._legs, e.p, e.v, e.euler, e.Va, Va_dot, DT * _OUTER
             )
-            if self._ctl[arduplane.LEG] >= len(self._legs) - 2:
+            if self._ctl[memory.LEG] >= len(self._legs) - 2:
                 self._renew()
-        delta_a, delta_e, delta_r = arduplane.stabilise(
+        delta_a, delta_e, delta_r = laws.stabilise(
             self._ctl, self._par, self._phi_c, self._theta_c, e.euler, e.rates, e.Va, DT * _INNER
         )
         self.pulses = Servos.pulses(delta_a, delta_e, delta_r, self._delta_t)
@@ -120,14 +147,13 @@ class PretendUav:
 
     def _renew(self) -> None:
         """Unroll the endless mission further, without disturbing the autopilot's memory."""
-        seq = int(self.leg[legs_of.SEQ])
-        self._legs = legs_of.route(self.items, seq=seq, origin=self.origin, params=self.params, limit=_LEGS_AHEAD).legs
-        self._ctl[arduplane.LEG] = 0
+        self._legs, _ = self._route(int(self.leg[legs_of.SEQ]))
+        self._ctl[memory.LEG] = 0
 
     def _flight(self) -> Flight:
         e, leg = self.now, self.leg
         target = leg[legs_of.P_N : legs_of.P_D + 1] - e.p
-        commanded = leg[legs_of.VA_C] if leg[legs_of.VA_C] > 0 else self.params["AIRSPEED_CRUISE"]
+        commanded = leg[legs_of.VA_C] if leg[legs_of.VA_C] > 0 else self._kind.cruise
         place = to_geodetic(self.origin, e.p)
         return Flight(
             t=self.boot_s + self.tick * DT,
@@ -139,11 +165,13 @@ class PretendUav:
             phi_c=self._phi_c,
             theta_c=self._theta_c,
             target=(float(target[0]), float(target[1])),
-            alt_error=float(height_demand(self._ctl, self._par, self._legs, e.p) + e.p[2]),
+            alt_error=float(laws.height_demand(self._ctl, self._par, self._legs, e.p, e.v) + e.p[2]),
             Va_error=float(commanded - e.Va),
             xtrack_error=self._xtrack(),
             seq=int(leg[legs_of.SEQ]),
             total=len(self.items),
+            home=(self.origin.lat_e7, self.origin.lon_e7, self.origin.alt_mm),
+            wind=self._believed,
         )
 
     def _xtrack(self) -> float:
@@ -151,7 +179,7 @@ class PretendUav:
         e, leg, ctl = self.now, self.leg, self._ctl
         centre = leg[legs_of.P_N : legs_of.P_D]
         if leg[legs_of.KIND] != legs_of.WAYPOINT:
-            radius = abs(leg[legs_of.RADIUS]) or self.params["WP_LOITER_RAD"]
+            radius = abs(leg[legs_of.RADIUS])
             return float(np.hypot(*(e.p[:2] - centre)) - radius)
         a = ctl[[memory.PREV_N, memory.PREV_E]]
         line, way = centre - a, e.p[:2] - a

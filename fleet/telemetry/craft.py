@@ -139,6 +139,8 @@ class Craft:
             self.params.hear(message, self.autopilot, now)
         elif name in MESSAGES:
             self.route.hear(message, up=False, now=now)
+        elif name == "HOME_POSITION" and self.autopilot == "px4":
+            self.route.place_home(message.altitude * 1e-3)
         elif name == "STATUSTEXT":
             self._read(message.severity, str(message.text).strip(), now)
         elif name == "AUTOPILOT_VERSION" and message.flight_sw_version:

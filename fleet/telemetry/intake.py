@@ -21,7 +21,7 @@ NOT_YET = "no aircraft heartbeat yet"
 MOST_EARLY = 4096  # messages of one system kept until its first heartbeat; a recording may begin anywhere
 
 News = Sample | Status | Mission | Params
-EARLY = MESSAGES | {"PARAM_VALUE"}  # said once, so worth keeping; rows come again
+EARLY = MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # said once, so worth keeping; rows come again
 SINGLE = np.zeros(len(EXTRA), bool)  # by message id: heard one by one; all others are rows, or only counted
 SINGLE[[IDS[name] for name in (*EARLY, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
 SINGLE[IDS["MISSION_CURRENT"]] = True  # a row too

@@ -4,6 +4,8 @@ from itertools import pairwise
 from math import isfinite
 from typing import Any
 
+import msgspec
+
 from fleet.contract import MAX_ITEMS, Item, Mission
 
 NOTHING = 0  # no MAV_CMD; stands for an item that cannot be flown
@@ -12,6 +14,9 @@ DO_JUMP = 177
 WAYPOINT = 16
 ACCEPT_S = 3.0  # an upload without an acknowledgement is believed after this silence [s]
 SETTLE_S = 2.0  # an incomplete list is shown after this silence [s]
+
+_MOVED_M = 1.0  # a home that moves less stays [m]
+_ABSOLUTE = {3: 0, 6: 5}  # MAV_FRAME: relative to home -> above sea level
 
 _NAMES = ("MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_ACK", "MISSION_CLEAR_ALL", "MISSION_CURRENT")
 MESSAGES = frozenset(_NAMES)
@@ -41,6 +46,7 @@ class RouteBook:
         self.seq = -1
         self.count: int | None = None  # of the download on its way
         self.rejected = 0
+        self._home_m: float | None = None
         self._sentence = ""
         self._drafts: dict[bool, _Draft | None] = {False: None, True: None}
         self._changed = False
@@ -67,6 +73,12 @@ class RouteBook:
         draft.items = dict(enumerate(items))
         self._adopt(draft)
 
+    def place_home(self, altitude_m: float) -> None:
+        """Learn how high home is above sea level [m], for a mission that does not hold home (PX4)."""
+        if isfinite(altitude_m) and (self._home_m is None or abs(altitude_m - self._home_m) > _MOVED_M):
+            self._home_m = altitude_m
+            self._changed = self._changed or bool(self.items)
+
     def missing(self) -> list[int] | None:
         """Give the sequence numbers a download on its way still lacks; None when no count was heard."""
         draft = self._drafts[False]
@@ -89,7 +101,8 @@ class RouteBook:
             return None
         self._changed = False
         sentence = f"uav-{self.uav}: {self._sentence}" if self._sentence else ""
-        return Mission(uav=self.uav, t=now, items=self.items, seq=self.seq, complete=self.complete, sentence=sentence)
+        items = self.items if self._home_m is None else tuple(_absolute(i, self._home_m) for i in self.items)
+        return Mission(uav=self.uav, t=now, items=items, seq=self.seq, complete=self.complete, sentence=sentence)
 
     def _in_force(self, seq: int) -> None:
         seq = -1 if seq == 65535 else seq
@@ -152,6 +165,13 @@ class RouteBook:
     def _say(self, sentence: str) -> None:
         self._changed = self._changed or sentence != self._sentence
         self._sentence = sentence
+
+
+def _absolute(item: Item, home_m: float) -> Item:
+    """Give an item with its altitude above sea level, where it was above home."""
+    if item.frame not in _ABSOLUTE:
+        return item
+    return msgspec.structs.replace(item, frame=_ABSOLUTE[item.frame], alt_m=item.alt_m + home_m)
 
 
 def read_item(message: Any) -> tuple[Item, str]:

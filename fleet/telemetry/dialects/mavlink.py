@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fleet.telemetry.clock import BOOT, NONE, USEC, USEC32
-from fleet.telemetry.dialects.row import Row
+from fleet.telemetry.dialects.row import Row, euler
 
 DEG = pi / 180  # [rad/deg]
 MILLI_G = 9.80665e-3  # [m/s2 per milli-g]
@@ -86,6 +86,14 @@ TABLE: tuple[Row, ...] = (
         lambda m: _command(m, m.alt_error, m.aspd_error),
         NONE,
         autopilots=("generic",),
+    ),
+    Row(
+        "ATTITUDE_TARGET",
+        "command",
+        lambda m: (*euler(np.asarray(m.q, float).T)[:2], np.nan, np.nan, np.nan),
+        BOOT,
+        rank=1,  # PX4 sends the set points of its attitude loop here, at a rate; in the other only some builds do
+        autopilots=("px4",),
     ),
     Row("MISSION_CURRENT", "leg", lambda m: (np.where(m.seq == _NO_ITEM, -1.0, m.seq),), NONE),
     Row("WIND", "wind", _wind, NONE, rank=1),

@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fleet.contract import UNTOLD
+
 
 class Row(NamedTuple):
     """One way from a message to columns of a `Sample` field.
@@ -41,5 +43,23 @@ _HIGHEST = {field: np.array(values) for field, values in HIGHEST.items()}
 
 
 def believable(field: str, values: np.ndarray) -> np.ndarray:
-    """Tell for each row, (n, k), whether every column is finite and within its largest believable magnitude, (n,)."""
-    return (np.abs(values) <= _HIGHEST[field]).all(axis=-1)
+    """Tell for each row, (n, k), whether every column is within its largest believable magnitude, (n,).
+
+    Every column is finite but those of `UNTOLD`.
+    """
+    good = np.abs(values) <= _HIGHEST[field]
+    untold = UNTOLD.get(field, values.shape[-1])
+    good[..., untold:] |= np.isnan(values[..., untold:])
+    return good.all(axis=-1)
+
+
+def euler(q: Any) -> tuple[Any, ...]:
+    """Give phi theta psi [rad] of a quaternion's columns, scalar first, body -> NED.
+
+    Source: Beard & McLain eq. B.1.
+    """
+    norm = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    e0, e1, e2, e3 = (e / np.where(np.abs(norm - 1) < 0.1, norm, np.nan) for e in q)
+    phi = np.arctan2(2 * (e0 * e1 + e2 * e3), e0**2 + e3**2 - e1**2 - e2**2)
+    theta = np.arcsin(np.clip(2 * (e0 * e2 - e1 * e3), -1, 1))
+    return phi, theta, np.arctan2(2 * (e0 * e3 + e1 * e2), e0**2 + e1**2 - e2**2 - e3**2)

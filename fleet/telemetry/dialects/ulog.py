@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fleet.telemetry.dialects.row import Row
+from fleet.telemetry.dialects.row import Row, euler
 
 DEG = pi / 180  # [rad/deg]
 _NO_FIX_DEG = 0.01  # a kilometre round zero, zero [deg]
@@ -22,15 +22,6 @@ _EARTH_M = 6_371_000.0  # the sphere on which PX4 projects its local frame
 _SHORTEST_US, _LONGEST_US = 700.0, 2300.0  # pulse widths a servo knows
 
 Columns = Callable[[Any], tuple[Any, ...]]
-
-
-def _euler(q: Any) -> tuple[Any, ...]:
-    """Give phi theta psi of a quaternion, scalar first, body -> NED. Source: Beard & McLain eq. B.1."""
-    norm = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    e0, e1, e2, e3 = (e / np.where(np.abs(norm - 1) < 0.1, norm, np.nan) for e in q)
-    phi = np.arctan2(2 * (e0 * e1 + e2 * e3), e0**2 + e3**2 - e1**2 - e2**2)
-    theta = np.arcsin(np.clip(2 * (e0 * e2 - e1 * e3), -1, 1))
-    return phi, theta, np.arctan2(2 * (e0 * e3 + e1 * e2), e0**2 + e1**2 - e2**2 - e3**2)
 
 
 def _somewhere(lat_deg: Any, lon_deg: Any) -> Any:
@@ -117,7 +108,7 @@ def _driven(m: Any) -> Any:
 
 _WANTED: tuple[tuple[Columns, str, Columns], ...] = (  # roll and pitch, path topic, altitude and airspeed error
     (
-        lambda m: _euler(m.q_d)[:2],  # 1.16 has no roll_body
+        lambda m: euler(m.q_d)[:2],  # 1.16 has no roll_body
         "position_controller_status",
         lambda m: (
             m.beside("tecs_status").altitude_sp - m.beside("vehicle_global_position").alt,
@@ -177,14 +168,14 @@ def _command_row(attitude: Columns, path: str, errors: Columns, rank: int) -> Ro
 # --- the table ----------------------------------------------------------------------------------------------------
 
 TABLE: tuple[Row, ...] = (
-    Row("vehicle_attitude", "attitude", lambda m: (*_euler(m.q), *m.beside("vehicle_angular_velocity").xyz), rank=3),
+    Row("vehicle_attitude", "attitude", lambda m: (*euler(m.q), *m.beside("vehicle_angular_velocity").xyz), rank=3),
     Row(
         "vehicle_attitude",  # until 1.9
         "attitude",
-        lambda m: (*_euler(m.q), m.rollspeed, m.pitchspeed, m.yawspeed),
+        lambda m: (*euler(m.q), m.rollspeed, m.pitchspeed, m.yawspeed),
         rank=2,
     ),
-    Row("vehicle_attitude", "attitude", lambda m: (*_euler(m.q), *m.beside("sensor_combined").gyro_rad), rank=1),
+    Row("vehicle_attitude", "attitude", lambda m: (*euler(m.q), *m.beside("sensor_combined").gyro_rad), rank=1),
     Row("sensor_combined", "imu", lambda m: (*m.accelerometer_m_s2, *m.gyro_rad), rank=2),
     Row("vehicle_acceleration", "imu", lambda m: (*m.xyz, *m.beside("vehicle_angular_velocity").xyz), rank=1),
     Row(
