@@ -17,6 +17,9 @@ _MIXES = {  # share of each servo's deflection that goes into each input
 }
 _INPUTS = ("delta_a", "delta_e", "delta_r", "delta_t")
 _SERVOS = 8
+_PX4_MOTORS, _PX4_SURFACES = 101, 201  # PWM_MAIN_FUNCn of the first motor, of the first control surface
+_PX4_TYPES = {1: "delta_a", 2: "delta_a", 3: "delta_e", 4: "delta_r", 5: "delta_e+a", 6: "delta_e-a"}  # CA_SV_CSn_TYPE
+_PX4_LEFT = 1  # a left aileron: up for what is right roll
 
 
 @dataclass(frozen=True)
@@ -44,9 +47,11 @@ class ServoMap:
 def servo_map(params: Mapping[str, float]) -> ServoMap:
     """Read SERVOn_FUNCTION, _MIN, _MAX, _TRIM, _REVERSED; without them assume aileron, elevator, throttle, rudder.
 
-    Source: ArduPilot, "Servo functions" (4 aileron, 19 elevator, 21 rudder, 70 throttle, 77 and 78 elevons).
+    Source: ArduPilot, "Servo functions" (4 aileron, 19 elevator, 21 rudder, 70 throttle, 77 and 78 elevons); PX4's
+    PWM_MAIN_* and CA_SV_CSn_TYPE say the same in other words.
     """
     params = {name: value for name, value in params.items() if isfinite(value)}
+    params = {**_as_ardupilot(params), **params}
     functions = {n: _FUNCTION.get(int(params.get(f"SERVO{n}_FUNCTION", -1))) for n in range(1, _SERVOS + 1)}
     known = {n: name for n, name in functions.items() if name}
     sentence = ""
@@ -67,3 +72,20 @@ def servo_map(params: Mapping[str, float]) -> ServoMap:
             up[n - 1, column] = sign * weight / share[to] / max(high - middle, 1.0)
             down[n - 1, column] = sign * weight / share[to] / max(middle - low, 1.0)
     return ServoMap(trim, up, down, sentence)
+
+
+def _as_ardupilot(params: Mapping[str, float]) -> dict[str, float]:
+    """Say what PX4's outputs drive in ArduPilot's words; empty where PX4 says nothing."""
+    numbers = {name: number for number, name in reversed(_FUNCTION.items())}
+    found: dict[str, float] = {}
+    for n in range(1, _SERVOS + 1):
+        function = int(params.get(f"PWM_MAIN_FUNC{n}", 0))
+        kind = int(params.get(f"CA_SV_CS{function - _PX4_SURFACES}_TYPE", 0))
+        name = "delta_t" if function == _PX4_MOTORS else _PX4_TYPES.get(kind)
+        if name is None:
+            continue
+        reverse = bool(int(params.get("PWM_MAIN_REV", 0)) >> (n - 1) & 1) != (kind == _PX4_LEFT)
+        found |= {f"SERVO{n}_FUNCTION": float(numbers[name]), f"SERVO{n}_REVERSED": float(reverse)}
+        found |= {f"SERVO{n}_MIN": params.get(f"PWM_MAIN_MIN{n}", 1000.0)}
+        found |= {f"SERVO{n}_MAX": params.get(f"PWM_MAIN_MAX{n}", 2000.0)}
+    return found

@@ -14,8 +14,10 @@ if TYPE_CHECKING:
 EXAMPLES = """
   fleet fly --uavs 0-7
   fleet fly --uavs 0-49 --to 127.0.0.1:14550 --wind 6 --turbulence 4 --loss 0.05
+  fleet fly --uavs 0-1 --autopilot px4 --aircraft c172p
   fleet fly --uavs 0 --seed 3 --for 300 --tlog flight.tlog     as fast as possible, no network
 """
+AUTOPILOTS, AIRCRAFT = ("ardupilot", "px4"), ("small", "c172p")  # as in `fleet.pretend.tuning`, which loads slowly
 _RECORDED_S = 300.0  # length of a recording when --for is not given [s]
 
 
@@ -23,6 +25,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options."""
     parser.add_argument("--uavs", type=id_range, default=range(8), metavar="A-B", help="aircraft ids (0-7)")
     parser.add_argument("--to", default="127.0.0.1:14550", metavar="HOST:PORT", help="where the frames go")
+    parser.add_argument("--autopilot", choices=AUTOPILOTS, default="ardupilot", help="whose law and MAVLink (ardupilot)")
+    parser.add_argument("--aircraft", choices=AIRCRAFT, default="small", help="11 kg electric or a Cessna 172 (small)")
     parser.add_argument("--seed", type=int, default=1, help="draws aircraft, missions, weather and noise (1)")
     parser.add_argument("--wind", type=float, default=4.0, metavar="M/S", help="mean wind at 100 m (4)")
     parser.add_argument(
@@ -50,7 +54,8 @@ def run(args: argparse.Namespace) -> int:
     stop = stop_on_signal()
     level = turbulence_level(args.turbulence)
     host, port = _address(args.to)
-    uavs = [PretendUav(i, args.seed, wind=args.wind, turbulence=level) for i in args.uavs]
+    kind = {"autopilot": args.autopilot, "aircraft": args.aircraft}
+    uavs = [PretendUav(i, args.seed, wind=args.wind, turbulence=level, **kind) for i in args.uavs]
     print("fly: compiling the autopilot, once", flush=True)
     PretendUav(args.uavs[0], args.seed).step(0.2)
     if args.tlog is not None:

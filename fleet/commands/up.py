@@ -15,6 +15,7 @@ from rich.text import Text
 from fleet.bus import ROUTER, Bus, connect, open_router, reachable
 from fleet.children import Children
 from fleet.cli import stop_on_signal
+from fleet.commands.fly import AIRCRAFT, AUTOPILOTS
 from fleet.commands.replay import check as check_playing
 from fleet.commands.replay import link
 from fleet.commands.status import as_objects, fleet_rows, table
@@ -22,6 +23,7 @@ from fleet.contract import FleetRow, FleetState, State
 
 EXAMPLES = """
   fleet up --uavs 8
+  fleet up --uavs 4 --autopilot px4 --aircraft c172p
   fleet up --link udpin:0.0.0.0:14550
   fleet up --replay flight.tlog.xz log7.bin --speed 4
   fleet up --replay monday.parauav --results
@@ -35,6 +37,8 @@ _PLAIN_S = 10.0  # between progress lines where the output is no terminal [s]
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--uavs", type=int, default=8, metavar="N", help="simulated aircraft, ids 0 to N-1 (8)")
+    parser.add_argument("--autopilot", choices=AUTOPILOTS, default="ardupilot", help="theirs (ardupilot)")
+    parser.add_argument("--aircraft", choices=AIRCRAFT, default="small", help="their type (small)")
     parser.add_argument("--mavlink", default=_MAVLINK, metavar="HOST:PORT", help=f"where they send UDP ({_MAVLINK})")
     parser.add_argument("--link", action="append", default=[], help="real aircraft instead, e.g. udpin:0.0.0.0:14550")
     parser.add_argument(
@@ -111,6 +115,7 @@ def _start(children: Children, args: argparse.Namespace) -> None:
     else:
         children.start("gateway", "gateway", f"--link=udpin:{args.mavlink}", "--offset=-1", *router)
         aircraft = ["--uavs", f"0-{args.uavs - 1}", "--to", args.mavlink, "--seed", str(args.seed)]
+        aircraft += ["--autopilot", args.autopilot, "--aircraft", args.aircraft]
         children.start("aircraft", "fleet.cli", "fly", *aircraft)
     if not args.no_viewer:
         children.start("viewer", "viewer", "--port", str(args.port), *router)
