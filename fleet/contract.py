@@ -298,18 +298,19 @@ class Prediction(Message, frozen=True, kw_only=True):
     ]
     law: Annotated[str, Meta(description="controller twin in force, e.g. arduplane: L1 + TECS")] = ""
     origin: Annotated[tuple[int, int, int], Meta(description="NED origin: lat, lon [1e-7 deg], alt [mm AMSL]")]
-    ahead: Annotated[Array, Meta(description="look-ahead from `t`, (n,) <f4 [s]")]
+    ahead: Annotated[Array, Meta(description="look-ahead from `t`, rising, not evenly, (n,) <f4 [s]")]
     path: Annotated[Array, Meta(description="mean position, NED from origin, (n, 3) <f4 [m]")]
-    tube: Annotated[Array, Meta(description="half-axes of the band, along, cross, vertical, (n, 3) <f4 [m]")]
+    tube: Annotated[Array, Meta(description="half-axes along, cross, vertical; to be held all at once, (n, 3) <f4 [m]")]
     quantile: Annotated[float, Meta(description="share of flights the tube is meant to hold, 0..1")] = 0.9
     horizon_s: Annotated[float, Meta(description="confidence horizon: `quantile` of its like stay within 10 % [s]")] = (
         0.0
     )
     horizon_open: Annotated[bool, Meta(description="true: still below 10 % at the end of `ahead`")] = False
-    held: Annotated[float, Meta(description="measured share inside the tube so far, 0..1; nan before any")] = float(
-        "nan"
+    held: Annotated[float, Meta(description="share of answered look-aheads inside the tube, 0..1; nan before any")] = (
+        float("nan")
     )
     held_n: Annotated[int, Meta(description="past predictions behind `held`")] = 0
+    calibration: Annotated[str, Meta(description="table that tube and horizon rest on, and how far adapted")] = ""
     coast_s: Annotated[float, Meta(description="time flown by the twin alone since the last sample [s]")] = 0.0
     seq: Annotated[int, Meta(description="mission item the prediction starts on; -1 none")] = -1
     sentence: Annotated[str, Meta(description="what limits this prediction, or empty")] = ""

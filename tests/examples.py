@@ -144,6 +144,7 @@ MESSAGES = (
         horizon_open=True,
         held=0.875,
         held_n=8,
+        calibration="calibrated on 288 predictions of 16 flights",
         coast_s=0.5,
         seq=3,
         sentence="as far as the mission goes",

@@ -120,7 +120,7 @@ def test_another_mode_invalidates_at_once(twin, heard):
     (said,) = predictions(results)
     assert said.method == "imm" and "LOITER follows no mission" in said.sentence and said.seq == -1
     assert twin.since == now and twin.state is State.VERIFIED
-    assert all(made.t >= now - 1.0 for made in twin.record.waiting)  # what was predicted in AUTO is not scored
+    assert all(t >= now - 1.0 for t in twin.record.waiting)  # what was predicted in AUTO is not scored
     (back,) = predictions(drive(twin, [status(twin, mode="AUTO")]))
     assert back.method == "imm" and "5 s are needed" in back.sentence
 

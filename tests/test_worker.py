@@ -8,8 +8,7 @@ from flights import item
 
 from fleet.bus import MemoryBus
 from fleet.codec import Stamp
-from fleet.contract import FleetState, Message, Mission, Model, Params, Prediction, Sample, State, Status
-from tests.flights import ROUTE
+from fleet.contract import Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, State, Status
 from twin_worker import worker as live
 from twin_worker.worker import Worker, resample, wanted
 
@@ -75,7 +74,7 @@ def test_a_recorded_flight_is_learnt_live(bus, worker, heard):
         bus.publish(msgspec.structs.replace(message, uav=3))
     assert worker.turn() == len(heard)
     assert "verified" in {m.verdict.outcome for m, _ in models}
-    assert any(p.method in ROUTE for p, _ in made)
+    assert any(p.method == "dynamics" for p, _ in made)
     (row,) = worker.state().rows
     assert (row.uav, row.state) == (3, State.PREDICTING)
     assert row.worker == f"{bus.writer:016x}" and row.epoch > 1.6e12
@@ -125,8 +124,23 @@ def test_a_query_chooses_horizon_and_step(bus, worker):
     assert np.array_equal(asked.ahead.numpy(), np.arange(0, 30.25, 0.5))
     assert asked.path.shape == asked.tube.shape == (61, 3)
     assert np.allclose(asked.path.numpy()[::2], whole.path.numpy()[:31])
-    assert np.allclose(asked.path.numpy()[1], whole.path.numpy()[:2].mean(axis=0))
+    assert np.allclose(asked.path.numpy()[1], whole.path.numpy()[:2].mean(axis=0), atol=1.0)
     assert (asked.t, asked.horizon_s) == (whole.t, whole.horizon_s)
+
+
+def test_a_query_cuts_no_corner_where_look_aheads_are_far_apart(bus, worker):
+    fly(bus, 2)
+    worker.turn()
+    ((whole, _),) = bus.query(Prediction)
+    t = whole.ahead.numpy().astype(float)
+    path = 80.0 * np.column_stack([np.cos(t / 4), np.sin(t / 4), 0 * t])
+    circle = msgspec.structs.replace(whole, path=Array.of(path))
+    asked = resample(circle, wanted({"horizon": "180"}))
+    assert len(asked.path.numpy()) == 181
+    assert np.allclose(np.linalg.norm(asked.path.numpy(), axis=1), 80.0, atol=2.0)  # a chord lies 10 m inside
+    cut = {name: Array.of(getattr(whole, name).numpy()[:70]) for name in ("ahead", "path", "tube")}
+    short = resample(msgspec.structs.replace(whole, **cut), wanted({"horizon": "180"}))
+    assert short.ahead.numpy()[-1] == 96.0  # no further than it was flown
 
 
 @pytest.mark.parametrize(
@@ -137,7 +151,7 @@ def test_a_query_chooses_horizon_and_step(bus, worker):
         {"horizon": "inf"},
         {"horizon": "-1"},
         {"horizon": "0"},
-        {"horizon": "61"},
+        {"horizon": "181"},
         {"step": "0"},
         {"step": "-0.5"},
         {"step": "nan"},
@@ -155,7 +169,8 @@ def test_absurd_queries_are_refused_with_a_sentence(bus, worker, asked):
 def test_what_a_query_may_ask():
     assert wanted({}) is None and wanted({"colour": "red"}) is None
     assert wanted({"horizon": "2"}).tolist() == [0.0, 1.0, 2.0]
-    assert len(wanted({"step": "0.06"})) == 1001
+    assert len(wanted({"step": "0.18"})) == 1001
+    assert wanted({"horizon": "180", "step": "60"}).tolist() == [0.0, 60.0, 120.0, 180.0]
     assert len(wanted({"horizon": "60", "step": "60"})) == 2
 
 

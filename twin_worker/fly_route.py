@@ -9,7 +9,7 @@ from twin_worker.hybrid import ensemble
 from twin_worker.hybrid.fly import fly_hybrid
 from twin_worker.kinds import Flight, nothing
 from twin_worker.memory import Twin
-from twin_worker.plant import method
+from twin_worker.plant import DYNAMICS, method
 from twin_worker.predict import Flown, Situation, Start, fly_from, set_out
 
 HYBRID, BOTH = "hybrid", "both"
@@ -51,12 +51,12 @@ def _paths(
     if twin.hybrid is not None and twin.method in (HYBRID, "auto"):
         flown = fly_hybrid(*begin, twin.hybrid, ahead)
         paths, why = _kept(paths, HYBRID, flown), flown.sentence
-    wanted = not paths or due or twin.contest.best((BOTH, HYBRID, "dynamics")) != HYBRID
+    wanted = not paths or due or twin.contest.best((BOTH, HYBRID, DYNAMICS)) != HYBRID
     if twin.plant is not None and twin.method != HYBRID and wanted:
         near = ahead[: np.searchsorted(ahead, max(_NEAR_S, ahead[0]), side="right")] if paths else ahead
         flown = fly_from(begin[1], twin.plant, near)
         why = why if paths else flown.sentence
-        if flown.path is not None and np.isfinite(flown.path).all():
+        if flown.path is not None:
             path = _lengthened(flown.path, paths[HYBRID]) if paths else flown.path
             paths = {**paths, method(twin.plant): path}
     if len(paths) > 1:
@@ -65,8 +65,7 @@ def _paths(
 
 
 def _kept(paths: dict[str, np.ndarray], name: str, flown: Flown) -> dict[str, np.ndarray]:
-    good = flown.path is not None and bool(np.isfinite(flown.path).all())
-    return {**paths, name: flown.path} if good else paths  # type: ignore[dict-item]
+    return paths if flown.path is None else {**paths, name: flown.path}
 
 
 def _lengthened(path: np.ndarray, further: np.ndarray) -> np.ndarray:
@@ -82,3 +81,16 @@ def _spread(twin: Twin, begin: tuple[Situation, Start]) -> None:
         return
     rng = np.random.default_rng((twin.uav, int(t)))
     twin.spread, twin.spread_t = ensemble.spread(*begin, twin.hybrid, AHEAD, rng), t
+
+
+def in_force(twin: Twin, method: str, ahead: np.ndarray) -> np.ndarray | None:
+    """Give the spread of the newest ensemble at some look-aheads, (k, 3) [m]; None where it does not belong to these.
+
+    Args:
+        twin: whose ensemble
+        method: of the prediction
+        ahead: rising; beyond the ensemble's end the spread stays (k,) [s]
+    """
+    if twin.spread is None or method not in (HYBRID, BOTH, DYNAMICS):
+        return None
+    return np.column_stack([np.interp(ahead, AHEAD, column) for column in twin.spread.T])

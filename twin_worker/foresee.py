@@ -5,18 +5,22 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
+from fleet.autopilots import arduplane
 from fleet.contract import Array, Message, Prediction, State
-from twin_worker.fly_route import fly_route
-from twin_worker.horizon import AHEAD, QUANTILE, Made
+from twin_worker.calibration.groups import airframe_class, group_of
+from twin_worker.fly_route import fly_route, in_force
+from twin_worker.horizon import AHEAD, QUANTILE, Made, Trust
 from twin_worker.imm import STEP, imm
 from twin_worker.kinds import Flight, fly_kind, hangs, nothing, seen
 from twin_worker.memory import Twin
+from twin_worker.predict import LEAST_AHEAD_S
 from twin_worker.track import STEP as TRACK_STEP
 from twin_worker.track import Track
 
 _LOOK_BACK_S = 62.0  # telemetry a prediction starts from [s]
 _COAST_S = 120.0  # the twin flies on alone for as long; then its last prediction ages [s]
 _STALE_S = 3.0  # positions older than other telemetry by more say nothing of now [s]
+_MISSED = 2  # autopilot parameters that may be lacking where they count as known [-]
 _IMM_LAW = "none: turn rate only"
 
 
@@ -29,15 +33,25 @@ def foresee(twin: Twin, now: float) -> list[Message]:
     if coast > _COAST_S or flown is None or not flown.ok[-1] or twin.history.newest - flown.t[-1] > _STALE_S:
         return []
     made, t0 = _best(twin, flown, ahead)
-    if made.path is None or not np.isfinite(made.path).all():
+    n = _whole(made.path)
+    if made.path is None or not n:
         return []
-    prediction = _trusted(twin, made.path, ahead, t0, made.method)
+    speed = float(np.linalg.norm(flown.v[-1]))
+    guess = Made(
+        t0,
+        made.method,
+        _group(twin, made, speed),
+        ahead[:n],
+        made.path[:n],
+        speed,
+        in_force(twin, made.method, ahead[:n]),
+    )
+    trust = twin.record.trust(guess)
+    prediction = _trusted(twin, guess, trust)
     said = " ".join(part for part in (f"link lost {coast:.0f} s ago" if twin.lost else "", made.sentence) if part)
-    t = t0 + float(ahead[0])
-    twin.prediction = msgspec.structs.replace(prediction, t=t, seq=made.seq, sentence=said, coast_s=coast, law=made.law)
+    twin.prediction = msgspec.structs.replace(prediction, seq=made.seq, sentence=said, coast_s=coast, law=made.law)
     if not twin.lost:
-        speed = float(np.linalg.norm(flown.v[-1]))
-        twin.record.keep(Made(t0, made.method, made.path, twin.prediction.tube.numpy().astype(float), speed))
+        twin.record.keep(guess, trust)
     return [twin.prediction]
 
 
@@ -67,7 +81,24 @@ def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
 
 
 def _good(flight: Flight) -> bool:
-    return flight.path is not None and bool(np.isfinite(flight.path).all())
+    return _whole(flight.path) > 0
+
+
+def _whole(path: np.ndarray | None) -> int:
+    """Give how many look-aheads a path was flown for without a break; 0 where that is too short to be of use."""
+    if path is None:
+        return 0
+    broken = np.flatnonzero(~np.isfinite(path).all(axis=1))
+    n = int(broken[0]) if len(broken) else len(path)
+    return n if AHEAD[n - 1] >= LEAST_AHEAD_S else 0
+
+
+def _group(twin: Twin, flight: Flight, speed: float) -> str:
+    """Name the calibration group of a flight ahead."""
+    values = twin.params.values if twin.params else {}
+    absent = sum(name not in values for name in arduplane.DEFAULTS)
+    known = "known" if absent <= _MISSED or (twin.params is not None and twin.params.complete) else "absent"
+    return group_of(flight.method, flight.law, airframe_class(twin.vehicle, speed), known)
 
 
 def _strange_law(twin: Twin) -> str:
@@ -88,24 +119,24 @@ def _state(twin: Twin, otherwise: State) -> State:
     return State.LINK_LOST if twin.lost else otherwise
 
 
-def _trusted(twin: Twin, path: np.ndarray, ahead: np.ndarray, t: float, method: str) -> Prediction:
-    """Wrap the path in its tube and say up to when the 90 % error stays below 10 % of the path."""
-    tube = twin.record.tube(method, np.arange(0.0, ahead[-1] + 1.0))[-len(ahead) :]
-    horizon, open_end = twin.record.horizon(method)
+def _trusted(twin: Twin, made: Made, trust: Trust) -> Prediction:
+    """Publish a path with its tube and up to when the 90 % error stays below 10 % of the path."""
     held, n = twin.record.held
+    begin = float(made.ahead[0])
     assert twin.origin is not None
     return Prediction(
         uav=twin.uav,
-        t=t,
+        t=made.t + begin,
         state=twin.state,
-        method=method,
+        method=made.method,
         origin=(twin.origin.lat_e7, twin.origin.lon_e7, twin.origin.alt_mm),
-        ahead=Array.of(AHEAD),
-        path=Array.of(path),
-        tube=Array.of(tube),
+        ahead=Array.of(made.ahead - begin),
+        path=Array.of(made.path),
+        tube=Array.of(trust.tube),
         quantile=QUANTILE,
-        horizon_s=max(horizon - float(ahead[0]), 0.0),
-        horizon_open=bool(open_end and not ahead[0]),
+        horizon_s=max(trust.horizon_s - begin, 0.0),
+        horizon_open=trust.horizon_open,
         held=held,
         held_n=n,
+        calibration=trust.sentence,
     )

@@ -21,6 +21,7 @@ from twin_worker.plant import Plant, acting, settled
 from twin_worker.speed import aimed_at, as_told
 from twin_worker.wind import WindFilter
 
+LEAST_AHEAD_S = 60.0  # a flight ahead that ends before is none [s]
 SHADOW_S = 60.0  # telemetry the controller twin is synchronised on [s]
 _SHADOW_STEP = 2  # window rows per shadow step
 _REFUSED = {TAKEOFF: "take-off", LAND: "landing"}
@@ -140,14 +141,16 @@ def set_out(now: Situation) -> Start | Flown:
 
 
 def fly_from(start: Start, plant: Plant, ahead: np.ndarray) -> Flown:
-    """Fly one model from there; arguments as for `fly_ahead`."""
+    """Fly one model from there; arguments as for `fly_ahead`. Beyond its envelope, if that is far, the path is nan."""
     ctl, par, legs = start.control
     dt = start.good.dt
     out = np.empty((int(ahead[-1] / dt) + 2, N_STATE))
     done = simulate(ctl.copy(), par, legs, settled(plant, start.good), *start.state, dt, out)
-    if done <= ahead[-1] / dt:
+    if done <= min(ahead[-1], ahead[0] + LEAST_AHEAD_S) / dt:
         return Flown(None, start.seq, f"the twin leaves its envelope {done * dt:.0f} s ahead", True)
-    path = np.column_stack([np.interp(ahead, dt * np.arange(done), column) for column in out[:done, :3].T])
+    path = np.column_stack(
+        [np.interp(ahead, dt * np.arange(done), column, right=np.nan) for column in out[:done, :3].T]
+    )
     return Flown(path, start.seq, start.sentence)
 
 

@@ -1,7 +1,8 @@
 """`python -m twin_worker.replay FILE…`: run recordings through the twins offline, and say how their predictions fared.
 
 Per UAV: vehicle, methods and how many predictions each made, when it was first verified, the share of predictions
-within 10 % (relative error M1) up to 10, 30 and 60 s, and the last sentences.
+within 10 % (relative error M1) up to 10, 30, 60 and 120 s, those ended by an event counted as long as they were
+flown, and the last sentences.
 """
 
 import argparse
@@ -16,10 +17,11 @@ from typing import Any
 from fleet.cli import guarded, parser_for
 from fleet.contract import Message, Model, Outcome, Prediction
 from fleet.telemetry.recordings import replay_messages
+from twin_worker.calibration.quantile import survival
 from twin_worker.offline import run
 from twin_worker.twin import Twin
 
-WITHIN_S = (10, 30, 60)
+WITHIN_S = (10, 30, 60, 120)
 _SAY_EVERY_S = 60.0  # recorded time between two words of progress [s]
 
 EXAMPLES = """
@@ -36,7 +38,7 @@ class Tally:
     verified_s: float | None = None  # since its first message
     verdict: str = ""
     sentence: str = ""
-    passages: dict[str, list[float]] = field(default_factory=dict)  # times to 10 % by method [s]
+    passages: dict[str, list[tuple[float, bool]]] = field(default_factory=dict)  # by method: time to 10 % [s], censored
     seen: dict[str, int] = field(default_factory=dict)  # predictions already scored by method
 
 
@@ -60,6 +62,9 @@ def replay(messages: Iterable[Message], progress: str = "") -> dict[str, dict[st
         for result in run((message,), twins):
             _take(tally, result, start)
         _collect(tally, twins[message.uav])
+    for uav, twin in twins.items():
+        twin.record.forget()  # the recording is over: what was still followed counts as far as it went
+        _collect(tallies[uav], twin)
     return {str(uav): _row(twins[uav], tallies[uav], begun[uav]) for uav in sorted(twins)}
 
 
@@ -79,7 +84,7 @@ def _collect(tally: Tally, twin: Twin) -> None:
         new = n - tally.seen.get(method, 0)
         if new:
             latest = list(twin.record.passages[method])[-new:]
-            tally.passages.setdefault(method, []).extend(time for time, _ in latest)
+            tally.passages.setdefault(method, []).extend(latest)
             tally.seen[method] = n
 
 
@@ -91,8 +96,7 @@ def _row(twin: Twin, tally: Tally, start: float) -> dict[str, Any]:
         "first_verified_s": None if tally.verified_s is None else round(tally.verified_s, 1),
         "scored": {method: len(found) for method, found in tally.passages.items()},
         "within_10_percent": {
-            method: {str(s): round(sum(x >= s for x in found) / len(found), 3) for s in WITHIN_S}
-            for method, found in tally.passages.items()
+            method: {str(s): round(survival(found, s), 3) for s in WITHIN_S} for method, found in tally.passages.items()
         },
         "verdict": twin.verdict.sentence or tally.verdict,
         "prediction": tally.sentence,

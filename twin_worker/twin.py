@@ -6,8 +6,8 @@ import numpy as np
 
 from fleet.contract import Alert, AlertKind, FleetRow, Link, Message, Sample, State
 from fleet.frames import to_ned
+from twin_worker import contest
 from twin_worker.foresee import foresee
-from twin_worker.horizon import AHEAD
 from twin_worker.learn import learn
 from twin_worker.memory import Twin, hear
 
@@ -15,6 +15,7 @@ HOP_S = 1.0  # between identifications [s]
 PREDICT_S = 1.0  # between predictions [s]
 LOST_S = 3.0  # without a sample: link lost [s]
 _TICK_S = 1.0  # between turns while data are silent, and between scorings [s]
+_BEFORE_S = 3.0  # positions from before those that were scored last, so that none falls between [s]
 _SILENT_TURNS = 150  # most of them [-]
 _LATEST = 4e9  # times beyond are noise [s since 1970]
 
@@ -110,14 +111,14 @@ def _blow(twin: Twin) -> None:
 
 
 def _score(twin: Twin) -> None:
-    if twin.contest.waiting and twin.history.newest >= twin.contest.waiting[0][0] + AHEAD[-1]:
+    if twin.contest.waiting and twin.history.newest >= twin.contest.waiting[0][0] + contest.AT[-1]:
         assert twin.origin is not None
-        t, position = twin.history.rows("position")
+        t, position = twin.history.rows("position", twin.contest.waiting[0][0] - _BEFORE_S)
         twin.contest.answer(t, to_ned(twin.origin, *position.T))
-    if not twin.record.waiting or twin.history.newest < twin.record.waiting[0].t + AHEAD[-1]:
+    if not twin.record.waiting:
         return
     assert twin.origin is not None
-    t, position = twin.history.rows("position")
+    t, position = twin.history.rows("position", twin.record.answered - _BEFORE_S)
     twin.record.answer(t, to_ned(twin.origin, *position.T))
 
 

@@ -128,6 +128,7 @@ def _facts(vehicle: Vehicle, now: float) -> str:
     at = vehicle.clock(now)
     figures = {
         "coverage": coverage(vehicle),
+        "trust": told.calibration or "–" if told is not None else "–",
         "method": f"{told.method} · {told.law or 'no law'}" if told is not None else "–",
         "mode": f"{status.mode or '–'} · {status.autopilot} · {'armed' if status.armed else 'disarmed'}"
         if status is not None

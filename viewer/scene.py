@@ -15,7 +15,7 @@ from viewer.vehicle import Vehicle
 
 CHUNKS, STEPS = 5, 12  # the trail: immutable chunks of 12 s, and a head of up to 12 s, one point a second
 MINUTE = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # how long ago each point of the trail is, (73,) [s]
-DASHES = 14  # dashes of one predicted path
+DASHES = 28  # dashes of one predicted path
 CROWD = 300  # above this many, stems go and only exceptions keep their predicted path
 LEAP_M = 1_000.0  # farther within a second is no flight but another one (a recording begun anew): a new trail [m]
 HOVER = ("multirotor", "helicopter")  # kinds of vehicle drawn with rotors

@@ -14,7 +14,7 @@ from viewer.tube import closed, curtain, marks, rings, skin
 from viewer.vehicle import Forecast, Vehicle
 from viewer.words import CLAIMS_S
 
-BANDS, BAND_STEPS = 4, 10  # the tube fades in bands, each of so many slices
+BANDS, BAND_STEPS = 4, 20  # the tube fades in bands, each of so many slices
 HINDCAST_S = 25.0  # how old the prediction is that is laid beside what happened
 BEYOND_S = 20.0  # how far past the horizon the grey dashes go
 LABELS = ("name", "horizon", "m0", "m1", "m2", "m3", "then")
@@ -115,7 +115,7 @@ class Selection:
         self._curtain.vertices, self._curtain.visible = curtain(path, ground)[0], self.tube
         bold.add(chain(path), rgb(p.ink))
         thin.add(chain(path * [1, 1, 0] + [0, 0, ground + 0.05]), mix(p.tube, p.ground, 0.5))
-        steps = [s for s in marks(until) if s > start + 1.0][:4]
+        steps = [s for s in marks(until) if s > start + 1.0][-4:]
         hoop = rings(told.at(np.array([0.0, *steps, until])), told.width(np.array([0.0, *steps, until])))[1:]
         thin.add(closed(hoop[:-1]).reshape(-1, 2, 3), mix(p.tube, p.ground, 0.85))
         self._horizon.draw(closed(hoop[-1]), rgb(p.horizon))

@@ -62,6 +62,6 @@ def curtain(path: np.ndarray, ground: float) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([path, foot], axis=1).reshape(-1, 3), faces.astype(np.uint32)
 
 
-def marks(until: float, steps: tuple[float, ...] = (5, 10, 20, 30, 60)) -> list[float]:
+def marks(until: float, steps: tuple[float, ...] = (5, 10, 20, 30, 60, 120)) -> list[float]:
     """Choose the look-aheads to mark [s]: those that leave room before the horizon."""
     return [step for step in steps if step < until - max(2.0, 0.12 * until)]

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from fleet.contract import Alert, AlertKind, FleetRow, Link, Mission, Model, Prediction, Sample, State, Status
 from viewer.datatime import DataTime
@@ -20,6 +21,7 @@ LATE_S = 5.0  # a prediction older than this is no news, in wall time [s]
 ENDED_S = 3.0  # a recording whose player is silent for so long is over [s]
 JUMP_S = 5.0  # a step back in time by more than this is another flight: start afresh [s]
 AWAY_S = 86_400.0  # a status whose time lies farther from the samples is of another flight [s]
+_CHORD_S, _MOST_PARTS = 1.5, 4  # look-aheads farther apart get points between, at most so many
 MAX_STEPS, MAX_AHEAD_S = 5_000, 3_600.0  # look-ahead accepted from outside: steps, and time [s]
 
 
@@ -69,7 +71,16 @@ def forecast(message: Prediction, place: Place, heard: float) -> Forecast | None
     ):
         raise ValueError(f"uav-{message.uav}: prediction has times that do not rise within an hour; resend")
     tube = np.clip(np.nan_to_num(tube / UNIT_M), 0.0, 1e4)
-    return Forecast(message.t, heard, ahead, place.local(message.ned_origin(), path), tube, message)
+    return Forecast(message.t, heard, *_smooth(ahead, place.local(message.ned_origin(), path), tube), message)
+
+
+def _smooth(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lay points between look-aheads that are seconds apart: a chord would cut a turn by metres."""
+    if np.diff(ahead).max() <= _CHORD_S or len(ahead) < 4:
+        return ahead, path, tube
+    parts = np.minimum(np.ceil(np.diff(ahead) / _CHORD_S), _MOST_PARTS).astype(int)
+    at = np.interp(np.arange(parts.sum() + 1), np.concatenate([[0], np.cumsum(parts)]), ahead)
+    return at, CubicSpline(ahead, path)(at), np.stack([np.interp(at, ahead, column) for column in tube.T], axis=-1)
 
 
 @dataclass

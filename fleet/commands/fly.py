@@ -25,7 +25,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Describe the options."""
     parser.add_argument("--uavs", type=id_range, default=range(8), metavar="A-B", help="aircraft ids (0-7)")
     parser.add_argument("--to", default="127.0.0.1:14550", metavar="HOST:PORT", help="where the frames go")
-    parser.add_argument("--autopilot", choices=AUTOPILOTS, default="ardupilot", help="whose law and MAVLink (ardupilot)")
+    parser.add_argument(
+        "--autopilot", choices=AUTOPILOTS, default="ardupilot", help="whose law and MAVLink (ardupilot)"
+    )
     parser.add_argument("--aircraft", choices=AIRCRAFT, default="small", help="11 kg electric or a Cessna 172 (small)")
     parser.add_argument("--seed", type=int, default=1, help="draws aircraft, missions, weather and noise (1)")
     parser.add_argument("--wind", type=float, default=4.0, metavar="M/S", help="mean wind at 100 m (4)")

@@ -7,7 +7,7 @@ import numpy as np
 from fleet import hybrid as H
 from fleet.window import Window
 from twin_worker.hybrid.fit import Hybrid, flight_of
-from twin_worker.predict import Flown, Situation, Start
+from twin_worker.predict import LEAST_AHEAD_S, Flown, Situation, Start
 from twin_worker.wind import DRIFT, DRIFT_S, GUST, GUST_S
 
 _SPEED_ROWS = 8  # rows of 0.1 s that the airspeed at the start is the mean of
@@ -72,7 +72,7 @@ def begin(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fly_hybrid(now: Situation, start: Start, found: Hybrid, ahead: np.ndarray) -> Flown:
-    """Fly the identified hybrid from there.
+    """Fly the identified hybrid from there; beyond its envelope, if that is far, the path is nan.
 
     Args:
         now, start: the situation, and where its flights start
@@ -83,7 +83,8 @@ def fly_hybrid(now: Situation, start: Start, found: Hybrid, ahead: np.ndarray) -
     state, air = begin(now, start.good)
     out = np.empty((int(ahead[-1] / H.STEP) + 2, 3))
     done = H.fly(ctl.copy(), par, legs, found.body, air, state, _NO_CHANCE, H.STEP, out)
-    if done < len(out):
+    if done <= min(ahead[-1], ahead[0] + LEAST_AHEAD_S) / H.STEP:
         return Flown(None, start.seq, f"the twin leaves its envelope {done * H.STEP:.0f} s ahead", True)
-    path = np.column_stack([np.interp(ahead, H.STEP * np.arange(len(out)), column) for column in out.T])
+    t = H.STEP * np.arange(done)
+    path = np.column_stack([np.interp(ahead, t, column, right=np.nan) for column in out[:done].T])
     return Flown(path, start.seq, start.sentence)

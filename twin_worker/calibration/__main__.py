@@ -1,0 +1,93 @@
+"""`python -m twin_worker.calibration fit|check FILE…`: calibration tables from scored predictions, and their worth.
+
+`fit` writes a table for every group and every wider one, and says what tables that had not seen a flight (a group,
+where a table spans several) claim of it. `check` says what tables claim of other predictions, alone and adapted.
+"""
+
+import argparse
+import sys
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+
+from fleet.cli import guarded, parser_for
+from twin_worker.calibration.check import adapted, claimed, figures, left_out, said
+from twin_worker.calibration.fit import fit
+from twin_worker.calibration.groups import wider
+from twin_worker.calibration.scored import Scored, read
+from twin_worker.calibration.table import Table
+from twin_worker.calibration.written import Source, load, read_tables, write
+
+LEAST_STARTS, LEAST_FLIGHTS = 30, 3  # fewer teach no table
+
+EXAMPLES = """
+  python -m twin_worker.calibration fit predictions.npz --out twin_worker/calibration/pretend.json
+  python -m twin_worker.calibration check other.npz --with pretend.json
+"""
+
+
+def _fit(args: argparse.Namespace) -> int:
+    scored = read(args.files)
+    groups = dict.fromkeys(name for group in sorted(set(scored.group.tolist())) for name in wider(group))
+    tables = []
+    for group in groups:
+        mine = scored.part(scored.within(group))
+        flights = len(set(mine.flight.tolist()))
+        if len(mine) < LEAST_STARTS or flights < LEAST_FLIGHTS:
+            least = f"{LEAST_STARTS} of {LEAST_FLIGHTS} flights are needed"
+            print(f"{group}: no table from {len(mine)} predictions of {flights} flights, {least}")
+            continue
+        tables.append(_table(mine, group))
+    if not tables:
+        raise ValueError(f"calibration: found no group of {LEAST_STARTS} predictions; give more flights")
+    sources = [_source(path) for path in args.files]
+    command = " ".join(["python -m twin_worker.calibration fit", *(path.name for path in args.files)])
+    write(args.out, tables, sources, date.today().isoformat(), command)
+    print(f"{args.out.name}: {len(tables)} tables")
+    return 0
+
+
+def _table(mine: Scored, group: str) -> Table:
+    table = fit(mine, group)
+    measured = figures(mine, left_out(mine, group))
+    apart = "groups" if len(set(mine.group.tolist())) > 1 else "flights"
+    print(
+        said(f"{group}: {table.starts} predictions of {table.flights} flights; {apart} left out", measured), flush=True
+    )
+    return replace(table, held_out=measured)
+
+
+def _source(path: Path) -> Source:
+    scored = read([path])
+    return Source(path.name, len(scored), tuple(sorted(set(scored.flight.tolist()))))
+
+
+def _check(args: argparse.Namespace) -> int:
+    scored = read(args.files)
+    tables = read_tables(args.tables) if args.tables else load()
+    for group in sorted(set(scored.group.tolist())):
+        mine = scored.part(scored.group == group)
+        table, which = tables.choose(group)
+        print(f"{group}: {len(mine)} predictions of {len(set(mine.flight.tolist()))} flights; {which}")
+        print(said("  table alone", figures(mine, claimed(table, mine))))
+        print(said("  adapted in flight", figures(mine, adapted(tables, mine))), flush=True)
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Fit or check calibration tables as the command line says."""
+    parser = parser_for("python -m twin_worker.calibration", "Calibration tables of tubes and horizons.", EXAMPLES)
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="fit|check")
+    for verb, what in (("fit", "fit tables"), ("check", "measure what tables claim")):
+        one = verbs.add_parser(verb, help=what)
+        one.add_argument("files", nargs="+", type=Path, metavar="FILE", help="scored predictions, .npz")
+        if verb == "fit":
+            one.add_argument("--out", type=Path, required=True, metavar="FILE", help="tables to write, .json")
+        else:
+            one.add_argument("--with", dest="tables", type=Path, metavar="FILE", help="tables (those that come along)")
+    args = parser.parse_args(argv)
+    return guarded("twin_worker.calibration", _fit if args.verb == "fit" else _check, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

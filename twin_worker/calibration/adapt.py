@@ -1,0 +1,99 @@
+"""Adapt tube and horizon to one aircraft by what became of its own past predictions.
+
+The factor on a table's half-axes is a quantile of the aircraft's own scores, the table counting as a few more of
+them; its level moves up at each miss and down a little at each hit, so that in the long run the wanted share holds
+whatever the flight does. Short look-aheads are answered first: what they say in common moves the longer ones too.
+
+Source: Gibbs & Candes 2021, "Adaptive conformal inference under distribution shift".
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from twin_worker.calibration.ledger import EVERY_S, Ledger
+from twin_worker.calibration.miss import AHEAD, QUANTILE
+from twin_worker.calibration.quantile import censored_quantile, weighted_quantile
+from twin_worker.calibration.risk import critical
+from twin_worker.calibration.table import ATOMS, COLUMN, KNOTS, Table
+
+_TABLE = 10.0  # independent predictions the table counts as [-]
+_FADES_S = 400.0  # scores fade with age [s]
+_SHARE = np.minimum(1.0, EVERY_S / (0.5 * KNOTS))  # independent predictions one counts as: overlapping ones agree [-]
+_SHARE_HORIZON = EVERY_S / 30.0  # the same for a first passage [-]
+_TUBE_STEP, _HORIZON_STEP = 0.03, 0.02  # of the level, per independent miss [-]
+_LEAST_LEVEL, _MOST_LEVEL = 0.5, 0.99
+_COLUMN_OF = np.full(len(AHEAD), -1)
+_COLUMN_OF[COLUMN] = np.arange(len(KNOTS))
+_LEAST_FACTOR, _MOST_FACTOR = 0.3, 20.0
+
+
+@dataclass
+class Levels:
+    """Quantiles that the tube at each knot and the horizon of one group take now."""
+
+    tube: np.ndarray = field(default_factory=lambda: np.full(len(KNOTS), QUANTILE))
+    horizon: float = QUANTILE
+
+    def learn(self, ledger: Ledger, r: np.ndarray, j: np.ndarray, mine: np.ndarray) -> None:
+        """Take new answers: rows and columns of the ledger, and which rows are of this group, bool."""
+        knot, score = _COLUMN_OF[j], ledger.score[r, j]
+        new = mine[r] & (knot >= 0) & np.isfinite(score)
+        step = _TUBE_STEP * _SHARE[knot[new]] * ((score[new] > 1.0) - (1.0 - QUANTILE))
+        np.add.at(self.tube, knot[new], step)
+        np.clip(self.tube, _LEAST_LEVEL, _MOST_LEVEL, out=self.tube)
+        held = mine & ledger.claimed & (ledger.followed >= ledger.horizon)
+        failed = mine & ledger.claimed & ledger.passed & ~held
+        ledger.claimed[held | failed] = False
+        moved = failed.sum() * QUANTILE - held.sum() * (1.0 - QUANTILE)
+        self.horizon = float(np.clip(self.horizon + _HORIZON_STEP * moved, _LEAST_LEVEL, _MOST_LEVEL))
+
+
+@dataclass(frozen=True)
+class Factors:
+    """Factors in force for one group now.
+
+    Attributes:
+        tube: on the table's half-axes, by knot, (13,) [-]
+        horizon: on the largest half-axes, where the horizon is sought [-]
+        own: predictions of this aircraft behind them [-]
+    """
+
+    tube: np.ndarray
+    horizon: float
+    own: int
+
+    def at(self, ahead: np.ndarray) -> np.ndarray:
+        """Give the factor on half-axes by look-ahead, (n,) [-]."""
+        return np.interp(ahead, KNOTS, self.tube)
+
+
+def factors(ledger: Ledger, group: str, table: Table, levels: Levels) -> Factors:
+    """Join the table with what the aircraft's own predictions of this group came to."""
+    rows = np.flatnonzero(ledger.group == group)
+    scores = ledger.score[np.ix_(rows, COLUMN)] * ledger.factor[rows]
+    age = ledger.until - ledger.t0[rows]
+    weight = np.exp(-np.clip(age, 0.0, None) / _FADES_S)[:, None] * np.where(np.isfinite(scores), _SHARE, 0.0)
+    level = np.array([levels.tube.mean()])
+    pooled = _join(table.scores, scores.reshape(1, -1), weight.reshape(1, -1) / len(KNOTS), level)[0]
+    tube = _join(table.scores * pooled, scores.T, weight.T, levels.tube)
+    horizon = _horizon(ledger, rows, table.risks * pooled, levels.horizon)
+    own = int((weight > 0).any(axis=1).sum())
+    return Factors(np.clip(tube, _LEAST_FACTOR, _MOST_FACTOR), horizon, own)
+
+
+def _join(atoms: np.ndarray, scores: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Give quantiles of the rows of scores (r, n), a table's atoms (20,) among them."""
+    r = len(scores)
+    x = np.hstack([np.broadcast_to(atoms, (r, ATOMS)), scores])
+    return weighted_quantile(x, np.hstack([np.full((r, ATOMS), _TABLE / ATOMS), weight]), level)
+
+
+def _horizon(ledger: Ledger, rows: np.ndarray, risks: np.ndarray, level: float) -> float:
+    """Give the factor that keeps the wanted share of first passages behind the horizon."""
+    followed, passed = ledger.followed[rows], ledger.passed[rows]
+    x, exact = critical(ledger.ratio[rows], followed, passed, AHEAD[np.maximum(ledger.size[rows] - 1, 0)])
+    age = np.clip(ledger.until - ledger.t0[rows], 0.0, None)
+    weight = np.where((followed > 0) | passed, _SHARE_HORIZON * np.exp(-age / _FADES_S), 0.0)
+    x, exact = np.append(risks, x), np.append(np.ones(ATOMS, bool), exact)
+    return censored_quantile(x, np.append(np.full(ATOMS, _TABLE / ATOMS), weight), exact, level)

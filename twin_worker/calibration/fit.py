@@ -1,0 +1,110 @@
+"""Fit a calibration table: likelihood for what sigma is, left-out predictions for how many of them to claim.
+
+Source: Vovk 2015, "Cross-conformal predictors"; Angelopoulos et al. 2024, "Conformal risk control".
+"""
+
+import numpy as np
+from scipy.optimize import minimize
+
+from twin_worker.calibration.miss import AHEAD, QUANTILE, first_passage
+from twin_worker.calibration.quantile import censored_quantile, weighted_quantile
+from twin_worker.calibration.risk import critical, growth
+from twin_worker.calibration.scored import Scored
+from twin_worker.calibration.table import KNOTS, LEVELS, Table, untaught
+
+_NEAR = 1.2  # look-aheads within this factor of a knot speak for it [-]
+_SPEAKERS = 3  # as many of them, evenly: neighbours say much the same
+_NU = 4.0  # degrees of freedom of the errors: heavy tails
+_RIDGE = 0.05  # holds the scale near 1 where the spread never varies [-]
+_MOST_SPREAD = 3.0  # scale lies within exp of this, either way
+_FOLDS = 4  # most of them when a table is fitted; leaving one out is another matter
+_LEAST_M = 0.02  # smallest floor [m]
+
+
+def near(knot: float) -> np.ndarray:
+    """Give the columns of the look-ahead grid that speak for a knot."""
+    found = np.flatnonzero(np.abs(np.log(np.maximum(AHEAD, 1e-9) / knot)) <= np.log(_NEAR))
+    return found[np.unique(np.linspace(0, len(found) - 1, _SPEAKERS).round().astype(int))]
+
+
+def fit_sigma(spread: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fit scale and floor by knot and axis to spreads and errors (s, k, 3) [m]; each (13, 3)."""
+    scale, floor = np.ones((len(KNOTS), 3)), np.full((len(KNOTS), 3), _LEAST_M)
+    for i, knot in enumerate(KNOTS):
+        columns = near(knot)
+        for axis in range(3):
+            s, e = spread[:, columns, axis].ravel(), error[:, columns, axis].ravel()
+            known = np.isfinite(e)
+            if known.any():
+                scale[i, axis], floor[i, axis] = _likeliest(s[known] ** 2, e[known] ** 2)
+            elif i:
+                scale[i, axis], floor[i, axis] = scale[i - 1, axis], floor[i - 1, axis] * knot / KNOTS[i - 1]
+    return scale, floor
+
+
+def _likeliest(s2: np.ndarray, e2: np.ndarray) -> tuple[float, float]:
+    """Give scale and floor under errors with Student's t law of `_NU` degrees of freedom."""
+
+    def cost(x: np.ndarray) -> float:
+        sigma2 = np.exp(2 * x[0]) * s2 + np.exp(2 * x[1])
+        fit = np.mean(np.log(sigma2) + (_NU + 1) * np.log1p(e2 / (_NU * sigma2)))
+        return float(fit + _RIDGE * x[0] ** 2)
+
+    typical = max(float(np.sqrt(np.median(e2))), _LEAST_M)
+    bounds = [(-_MOST_SPREAD, _MOST_SPREAD), (np.log(_LEAST_M), np.log(max(20 * typical, 10 * _LEAST_M)))]
+    found = minimize(cost, [0.0, np.log(typical)], method="Nelder-Mead", bounds=bounds, options={"maxiter": 120})
+    return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
+
+
+def fit(scored: Scored, group: str) -> Table:
+    """Fit the table of one group to its predictions; every score comes from a fit that had not seen its flight."""
+    error, folds = scored.errors()[..., :3], scored.folds(group)
+    weight = 1.0 / np.bincount(folds)[folds]  # each flight speaks as loud
+    scale, floor = fit_sigma(scored.spread, error)
+    ratio = np.empty(error.shape[:2])  # of the largest error to its sigma
+    batch = folds % min(_FOLDS, int(folds.max()) + 1)
+    for b in np.unique(batch):
+        left = batch == b
+        apart = _raw(group, *(fit_sigma(scored.spread[~left], error[~left]) if not left.all() else (scale, floor)))
+        ratio[left] = (error[left] / apart.sigma(scored.spread[left], AHEAD)).max(axis=2)
+    factor = _known(np.array([_factor(ratio[:, near(knot)], weight) for knot in KNOTS]))
+    again = ratio / np.interp(AHEAD, KNOTS, factor)
+    known = np.isfinite(again[:, 1:])
+    loud = np.where(known, weight[:, None], 0.0).ravel()
+    scores = [float(weighted_quantile(again[:, 1:].reshape(1, -1), loud[None], np.array([p]))[0]) for p in LEVELS]
+    shape = np.maximum.accumulate(np.maximum(scores, 1e-3))
+    table = Table(group, len(scored), len(set(scored.flight.tolist())), scale, floor, factor, shape, shape)
+    return _with_risks(table, scored, weight)
+
+
+def _raw(group: str, scale: np.ndarray, floor: np.ndarray) -> Table:
+    plain = untaught("imm")
+    return Table(group, 0, 0, scale, floor, plain.factor, plain.scores, plain.risks)
+
+
+def _factor(ratio: np.ndarray, weight: np.ndarray) -> float:
+    """Give the quantile of scores (s, k) that holds the wanted share of the next one too; nan where none is known."""
+    known = np.isfinite(ratio)
+    n = int(known.any(axis=1).sum())
+    if not n:
+        return float("nan")
+    level = min(QUANTILE * (n + 1) / n, 1.0)
+    loud = np.where(known, weight[:, None], 0.0)
+    return float(weighted_quantile(ratio.reshape(1, -1), loud.reshape(1, -1), np.array([level]))[0])
+
+
+def _known(factor: np.ndarray) -> np.ndarray:
+    """Let look-aheads nobody followed take the factor of their neighbours."""
+    known = np.isfinite(factor)
+    return np.interp(KNOTS, KNOTS[known], factor[known]) if known.any() else np.full(len(KNOTS), 2.0)
+
+
+def _with_risks(table: Table, scored: Scored, weight: np.ndarray) -> Table:
+    """Add how the critical factors of these predictions are distributed."""
+    ratio = growth(table.half_axes(scored.spread, AHEAD), scored.predicted_length)
+    relative = scored.errors()[..., 3] / scored.length
+    followed, censored = zip(*(first_passage(miss) for miss in relative), strict=True)
+    x, exact = critical(ratio, np.array(followed), ~np.array(censored), AHEAD[-1])
+    n = len(x)
+    risks = [censored_quantile(x, weight, exact, min(p * (n + 1) / n, 1.0)) for p in LEVELS]
+    return Table(**{**vars(table), "risks": np.maximum.accumulate(risks)})

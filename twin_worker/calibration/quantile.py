@@ -1,0 +1,88 @@
+"""Quantiles of weighted scores, some of them known only from above.
+
+Source: Tibshirani et al. 2019, "Conformal prediction under covariate shift" (weights); Kaplan & Meier 1958.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def weighted_quantile(x: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Give a quantile of each row, interpolated between the middles of the weights.
+
+    Args:
+        x: values, (r, n); those of no weight may be anything
+        weight: not negative, (r, n)
+        level: wanted quantiles, (r,) 0..1
+    Returns:
+        (r,)
+    """
+    order = np.argsort(np.where(weight > 0, x, np.inf), axis=1)
+    x, weight = np.take_along_axis(x, order, 1), np.take_along_axis(weight, order, 1)
+    total = np.cumsum(weight, axis=1)
+    place = (total - 0.5 * weight) / total[:, -1:]
+    n = np.maximum((weight > 0).sum(axis=1), 1)  # the weightless stand behind
+    right = np.clip((place < level[:, None]).sum(axis=1), 1, np.maximum(n - 1, 1))
+    left, row = np.minimum(right - 1, n - 1), np.arange(len(x))
+    right = np.minimum(right, n - 1)
+    gap = np.maximum(place[row, right] - place[row, left], 1e-12)
+    share = np.clip((level - place[row, left]) / gap, 0.0, 1.0)
+    return x[row, left] + share * (x[row, right] - x[row, left])
+
+
+def masses(x: np.ndarray, weight: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    """Give each exact value its share of all the weight, where others are only known to lie below theirs.
+
+    Kaplan-Meier from above: the weight of a bound goes to what lies below it.
+
+    Args:
+        x: values, or bounds from above, (n,)
+        weight: not negative, (n,)
+        exact: whether each is a value, (n,) bool
+    Returns:
+        masses, 0 for bounds, (n,); they may add up to less than one: what is left lies below every value
+    """
+    order = np.lexsort((~exact, -x))  # from the top, a value before a bound of the same size
+    w, d = weight[order], exact[order]
+    at_risk = np.cumsum(w[::-1])[::-1]
+    stays = 1.0 - np.divide(w * d, at_risk, out=np.zeros(len(w)), where=at_risk > 0)
+    left = np.cumprod(stays)
+    out = np.empty(len(x))
+    out[order] = np.concatenate([[1.0], left[:-1]]) - left
+    return out
+
+
+def censored_quantile(x: np.ndarray, weight: np.ndarray, exact: np.ndarray, level: float) -> float:
+    """Give a quantile of values of which some are only bounded from above; 0 where it lies below every value."""
+    mass = masses(x, weight, exact)
+    nothing = max(1.0 - float(mass.sum()), 0.0)
+    x, mass = np.append(x, 0.0), np.append(mass, nothing)
+    return float(weighted_quantile(x[None], mass[None], np.array([level]))[0])
+
+
+Passages = Sequence[tuple[float, bool]]  # time to 10 % [s], or how long it was followed without; whether the latter
+
+
+def _survival(passages: Passages) -> tuple[np.ndarray, np.ndarray]:
+    """Give times, rising, and the share still within 10 % after each of them."""
+    times, censored = (np.array(column) for column in zip(*passages, strict=True))
+    order = np.lexsort((censored, times))
+    at_risk = len(times) - np.arange(len(times))
+    return times[order], np.cumprod(1.0 - ~censored[order] / at_risk)
+
+
+def survival(passages: Passages, t: float) -> float:
+    """Give the share of predictions still within 10 % at `t` [s]; nan of none."""
+    if not passages:
+        return float("nan")
+    times, share = _survival(passages)
+    before = int(np.searchsorted(times, t))
+    return float(share[before - 1]) if before else 1.0
+
+
+def median_passage(passages: Passages) -> float:
+    """Give the time at which half have passed 10 % [s]; where fewer ever do, the longest any was followed."""
+    times, share = _survival(passages)
+    half = np.flatnonzero(share <= 0.5)
+    return float(times[half[0]] if len(half) else times[-1])

@@ -1,0 +1,91 @@
+"""Scored predictions as `assess` writes them: what was said, and what then happened."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from twin_worker.calibration.groups import ANY, wider
+from twin_worker.calibration.miss import AHEAD, axes_error
+from twin_worker.calibration.table import filled
+
+_WHOLE = ("path", "spread", "flown")
+_ROWS = ("t0", "length", "predicted_length", "group", "method", "flight")
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Predictions (s of them) on the common look-ahead grid of k points.
+
+    Attributes:
+        t0: start of each, (s,) [s since 1970]
+        path: as predicted, NED, (s, k, 3) [m]
+        spread: of the ensemble along, cross, vertical, the law of growth where there was none, (s, k, 3) [m]
+        flown: what happened, nan where it was not followed, (s, k, 3) [m]
+        length, predicted_length: path length so far, never below two seconds of ground speed, (s, k) [m]
+        group, method, flight: names, (s,)
+    """
+
+    t0: np.ndarray
+    path: np.ndarray
+    spread: np.ndarray
+    flown: np.ndarray
+    length: np.ndarray
+    predicted_length: np.ndarray
+    group: np.ndarray
+    method: np.ndarray
+    flight: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.t0)
+
+    def part(self, rows: np.ndarray) -> "Scored":
+        """Choose rows."""
+        return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    def errors(self) -> np.ndarray:
+        """Give errors along, cross, vertical and the distance, nan where not followed, (s, k, 4) [m]."""
+        return axes_error(self.path, self.flown)
+
+    def within(self, group: str) -> np.ndarray:
+        """Tell which belong to a group, or to a wider one with `*`, (s,) bool."""
+        named = {name: group in wider(name) for name in set(self.group.tolist())}
+        return np.array([named[name] for name in self.group.tolist()], bool)
+
+    def folds(self, group: str) -> np.ndarray:
+        """Number what is left out together, (s,): a whole group of a table of several, else a flight.
+
+        A table of several groups stands in for one it has not seen: that is what leaving out must show.
+        """
+        groups = self.group if ANY in group and len(set(self.group.tolist())) > 1 else self.flight
+        return np.unique(groups, return_inverse=True)[1]
+
+
+def read(paths: Sequence[Path]) -> Scored:
+    """Read and join files of scored predictions.
+
+    Raises:
+        ValueError: when one does not hold what `assess` writes.
+    """
+    parts = [_read(path) for path in paths]
+    return Scored(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Scored)})
+
+
+def _read(path: Path) -> Scored:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            held = {name: file[name] for name in ("ahead", *_WHOLE, *_ROWS)}
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"{path.name}: found no scored predictions ({error}); write them with `assess`") from None
+    s, k = len(held["t0"]), len(AHEAD)
+    if not np.array_equal(held.pop("ahead"), AHEAD):
+        raise ValueError(f"{path.name}: found another look-ahead grid, expected 0 to 180 s in {k} points; assess again")
+    wanted: dict[str, tuple[int, ...]] = dict.fromkeys(_WHOLE, (s, k, 3))
+    wanted |= dict.fromkeys(("length", "predicted_length"), (s, k))
+    for name, value in held.items():
+        if value.shape != wanted.get(name, (s,)):
+            raise ValueError(f"{path.name}: found {name} of shape {value.shape}, expected {wanted.get(name, (s,))}")
+    made = Scored(**held)
+    spread = [filled(one, method, AHEAD) for one, method in zip(made.spread, made.method.tolist(), strict=True)]
+    return replace(made, spread=np.array(spread).reshape(s, k, 3))
