@@ -24,9 +24,14 @@ _SETTLE_S = 20.0  # before the wind is known [s]
 
 def mode_of(stretch: Window) -> str:
     """Name the mode of a stretch: a turn by its mean bank, else climb or descent by its mean vertical speed."""
-    if np.abs(stretch.columns(("phi",))[stretch.ok]).mean() > _TURN:
+    bank = float(np.abs(stretch.columns(("phi",))[stretch.ok]).mean())
+    return mode_named(bank, -float(stretch.v[stretch.ok, 2].mean()))
+
+
+def mode_named(bank: float, up: float) -> str:
+    """Name the mode by the mean bank, without its sign [rad], and the mean vertical speed [m/s]."""
+    if bank > _TURN:
         return "turn"
-    up = -float(stretch.v[stretch.ok, 2].mean())
     return "climb" if up > _CLIMB else "descent" if up < -_CLIMB else "level"
 
 

@@ -10,11 +10,10 @@ from fleet.contract import Array, Message, Prediction, State
 from twin_worker.calibration.groups import airframe_class, group_of
 from twin_worker.fly_route import fly_route, in_force
 from twin_worker.horizon import AHEAD, QUANTILE, Made, Trust
-from twin_worker.imm import STEP, imm
+from twin_worker.imm import turn_on
 from twin_worker.kinds import Flight, fly_kind, hangs, nothing, seen
 from twin_worker.memory import Twin
 from twin_worker.predict import LEAST_AHEAD_S
-from twin_worker.track import STEP as TRACK_STEP
 from twin_worker.track import Track
 
 _LOOK_BACK_S = 62.0  # telemetry a prediction starts from [s]
@@ -76,7 +75,7 @@ def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
         return replace(second, sentence=said), float(flown.t[-1])
     twin.state = _state(twin, State.VERIFIED if twin.plant else State.IDENTIFYING if whole else State.WAITING)
     parts = dict.fromkeys(part for part in (why, second.sentence, flown.sentence, "turn rate only") if part)
-    path = _imm_path(flown, ahead)
+    path = turn_on(flown, ahead)
     return Flight(path, "imm", _IMM_LAW, second.seq if path is None else -1, "; ".join(parts)), float(flown.t[-1])
 
 
@@ -105,14 +104,6 @@ def _strange_law(twin: Twin) -> str:
     """Say where the controller twin is not the autopilot's own."""
     autopilot = twin.status.autopilot if twin.status else "unknown"
     return "" if autopilot == "ardupilot" else f"autopilot {autopilot} is flown by ArduPlane's law, not its own"
-
-
-def _imm_path(flown: Track, ahead: np.ndarray) -> np.ndarray | None:
-    every = round(STEP / TRACK_STEP)
-    whole = flown.whole()
-    rows = slice((len(whole) - 1) % every, None, every)
-    p, v = whole.p[rows][-24:], whole.v[rows][-24:]
-    return imm(p, v, ahead) if len(p) >= 4 else None
 
 
 def _state(twin: Twin, otherwise: State) -> State:

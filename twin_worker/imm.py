@@ -8,7 +8,11 @@ from math import cos, sin
 import numpy as np
 from filterpy.kalman import IMMEstimator, KalmanFilter
 
+from twin_worker.track import STEP as TRACK_STEP
+from twin_worker.track import Track
+
 STEP = 0.5  # filter step [s]
+_ROWS = 24  # steps of the past the filter runs over
 _TURN = 0.3  # turn rate of the two turning models [rad/s]
 _STAY = np.array([[0.97, 0.015, 0.015], [0.06, 0.93, 0.01], [0.06, 0.01, 0.93]])  # model switching per step
 
@@ -35,6 +39,20 @@ def _filter(rate: float, noise: float, start: np.ndarray) -> KalmanFilter:
     filt.F, filt.H, filt.R = _transition(rate), np.eye(4), np.diag([0.5, 0.05, 0.5, 0.05])
     filt.Q, filt.x, filt.P = np.kron(np.eye(2), q) * noise, start.copy(), np.eye(4)
     return filt
+
+
+def turn_on(flown: Track, ahead: np.ndarray) -> np.ndarray | None:
+    """Predict from the end of a track, NED, (k, 3) [m]; None while less than four steps of it are unbroken.
+
+    Args:
+        flown: newest flight
+        ahead: wanted look-ahead times, (k,) [s]
+    """
+    every = round(STEP / TRACK_STEP)
+    whole = flown.whole()
+    rows = slice((len(whole) - 1) % every, None, every)
+    p, v = whole.p[rows][-_ROWS:], whole.v[rows][-_ROWS:]
+    return imm(p, v, ahead) if len(p) >= 4 else None
 
 
 def imm(p: np.ndarray, v: np.ndarray, ahead: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """THE loop of one aircraft, `advance(twin, messages, now)`. Data time only: no bus, no thread, no wall clock."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -35,8 +35,9 @@ def advance(twin: Twin, messages: Iterable[Message], now: float = -np.inf) -> li
     """
     results: list[Message] = []
     for message in messages:
-        heard = message.t if 0 < message.t < _LATEST else -np.inf
-        results += _through_silence(twin, heard)
+        for at in silence(twin, message):
+            results += _turn(twin, at)
+        heard = _heard(message)
         hear(twin, message)
         if isinstance(message, Sample) or np.isfinite(twin.data_t):  # after a jump of the clock telemetry leads
             twin.data_t = max(twin.data_t, heard)
@@ -44,16 +45,21 @@ def advance(twin: Twin, messages: Iterable[Message], now: float = -np.inf) -> li
     return results + _turn(twin, now) if now > twin.data_t else results
 
 
-def _through_silence(twin: Twin, until: float) -> list[Message]:
-    """Turn once a second up to `until`; a longer silence than any prediction is worth is leapt over."""
-    results: list[Message] = []
-    at = max(twin.data_t, twin.turned_t)
+def silence(twin: Twin, message: Message) -> Iterator[float]:
+    """Give the instants at which the loop turns before `message`, where the data were silent [s since 1970].
+
+    Once a second; a longer silence than any prediction is worth is leapt over.
+    """
+    at, until = max(twin.data_t, twin.turned_t), _heard(message)
     for _ in range(_SILENT_TURNS):
         if not until - at > 2 * _TICK_S or not np.isfinite(at):
-            break
+            return
         at += _TICK_S
-        results += _turn(twin, at)
-    return results
+        yield at
+
+
+def _heard(message: Message) -> float:
+    return message.t if 0 < message.t < _LATEST else -np.inf
 
 
 def _turn(twin: Twin, now: float) -> list[Message]:
