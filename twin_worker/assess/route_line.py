@@ -1,0 +1,121 @@
+"""The route ahead as a line of points: straight legs, circles with their tangents, corners as they are drawn.
+
+Columns of a point: north, east, down [m], commanded airspeed [m/s], 0 for cruise. What a ground station shows, no more:
+no guidance, no bank, no energy.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import acos, atan2, cos, hypot, pi, sin
+
+import numpy as np
+
+from fleet.autopilots.arduplane import params as P
+from fleet.mission import KIND, LOITER_TIME, LOITER_TO_ALT, LOITER_TURNS, LOITER_UNLIMITED, P_D, P_N, RADIUS, TURNS
+from fleet.mission import VA_C, Route
+
+_CIRCLES = (LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT)
+_STEP = 5.0  # between points [m]
+_ON_CIRCLE = 1.3  # within so many radii it circles [-]
+_LATE = 0.6  # past the course to the next target by less, a circle is left at once [rad]
+_CLIMB = 2.5  # climb while circling to an altitude [m/s]
+
+
+@dataclass(frozen=True)
+class Ride:
+    """What the line depends on beside the route.
+
+    Attributes:
+        p: where the aircraft is, NED, (3,) [m]
+        past: where it was on the item in force, NED, oldest first, (n, 3) [m]
+        speed: usual ground speed [m/s]
+        par: autopilot parameters
+        length: of line wanted [m]
+    """
+
+    p: np.ndarray
+    past: np.ndarray
+    speed: float
+    par: np.ndarray
+    length: float
+
+
+def line(way: Route, ride: Ride) -> np.ndarray:
+    """Give the route from where the aircraft is abreast of it, points every few metres, (n, 4)."""
+    parts, left = [], ride.length + 2000.0  # the part of the first leg that lies behind is cut off below
+    at = way.start if np.isfinite(way.start).all() else ride.past[0]
+    for k, leg in enumerate(way.legs):
+        after = way.legs[k + 1, P_N : P_N + 2] if k + 1 < len(way.legs) else None
+        for part in _leg(leg, at, after, ride, first=k == 0):
+            parts.append(np.column_stack([part, np.full(len(part), leg[VA_C])]))
+            left -= _lengths(part).sum()
+        at = parts[-1][-1, :3]
+        if left < 0:
+            break
+    points = np.vstack(parts)
+    away = np.linalg.norm(points[: len(parts[0]), :2] - ride.p[:2], axis=1)
+    return points[int(np.argmin(away)) :]
+
+
+def _lengths(points: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
+
+
+def _leg(
+    leg: np.ndarray, at: np.ndarray, after: np.ndarray | None, ride: Ride, *, first: bool
+) -> Iterator[np.ndarray]:
+    """Give the points of one leg, (n, 3) each part: the way there, then the circle."""
+    target = leg[P_N : P_D + 1]
+    if int(leg[KIND]) not in _CIRCLES:
+        yield _straight(at, target)
+        return
+    R = abs(leg[RADIUS]) or abs(ride.par[P.LOITER_RAD])
+    side = np.sign(leg[RADIUS]) or np.sign(ride.par[P.LOITER_RAD]) or 1.0
+    at = ride.p if first else at
+    out = at[:2] - target[:2]
+    D, angle = hypot(*out), atan2(out[1], out[0])
+    if first and _ON_CIRCLE * R > D:
+        done = _swept(ride.past, target, _ON_CIRCLE * R)
+    else:
+        done = 0.0
+        angle += side * acos(min(R / max(D, R), 1.0))
+        yield _straight(at, np.array([*(target[:2] + R * np.array([cos(angle), sin(angle)])), target[2]]))
+    arc = max(_arc(leg, R, at, ride) - done, 0.0)
+    if after is not None and int(leg[KIND]) != LOITER_UNLIMITED:
+        arc += _to_tangent(angle + side * arc, target, after, (R, side))
+    sweep = angle + side * np.linspace(0.0, arc, int(arc * R / _STEP) + 2)
+    yield np.column_stack([target[0] + R * np.cos(sweep), target[1] + R * np.sin(sweep), np.full(len(sweep), target[2])])
+
+
+def _straight(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    share = np.linspace(0.0, 1.0, int(hypot(*(end - start)[:2]) / _STEP) + 2)[:, None]
+    return start + share * (end - start)
+
+
+def _swept(past: np.ndarray, centre: np.ndarray, within: float) -> float:
+    """Give the angle already flown around a centre, since the circle was reached [rad]."""
+    out = past[:, :2] - centre[:2]
+    near = np.hypot(*out.T) < within
+    on = out[int(np.argmax(near)) :] if near.any() else out[:0]
+    around = np.unwrap(np.arctan2(on[:, 1], on[:, 0]))
+    return float(abs(around[-1] - around[0])) if len(around) else 0.0
+
+
+def _arc(leg: np.ndarray, R: float, at: np.ndarray, ride: Ride) -> float:
+    """Give the angle to circle by the item's own measure [rad]."""
+    kind = int(leg[KIND])
+    if kind == LOITER_TURNS:
+        return 2 * pi * leg[TURNS]
+    if kind == LOITER_TIME:
+        return leg[TURNS] * ride.speed / R
+    if kind == LOITER_TO_ALT:
+        return abs(leg[P_D] - at[2]) / _CLIMB * ride.speed / R
+    return ride.length / R
+
+
+def _to_tangent(angle: float, centre: np.ndarray, after: np.ndarray, circle: tuple[float, float]) -> float:
+    """Give how much further to circle until the course points at the next target [rad]."""
+    R, side = circle
+    out = after - centre[:2]
+    leave = atan2(out[1], out[0]) - side * acos(R / max(hypot(*out), R))
+    return max((((leave - angle) * side) + _LATE) % (2 * pi) - _LATE, 0.0)
