@@ -56,7 +56,7 @@ def _runs(one: "Experiment", names: Sequence[str], first: str) -> Figure:
         low, high = spread(one.actual[:, k], least=0.02)
         ax.set_ylim(low - (high - low), high + (high - low))
         fits = " → ".join(f"{one.fit[i, k]:.0f}" for i in (0, 1))
-        _house(ax, f"{name} [{_UNITS.get(name, 'rad')}]   fit {fits} %")
+        house(ax, f"{name} [{_UNITS.get(name, 'rad')}]   fit {fits} %")
     figure.axes[0].legend(frameon=False, fontsize=8)
     figure.supxlabel("unseen data [s]", fontsize=9, color=INK)
     figure.suptitle(f"{one.mode}, uav-{one.uav}: free run from {first} and refined", fontsize=11, color=INK)
@@ -80,7 +80,7 @@ def _boxes(fits: dict[str, np.ndarray], names: Sequence[str], title: str) -> Fig
             ax.plot([], [], color=colour, lw=5, alpha=0.5, label=label)
         ax.axhline(0, color=MUTED, lw=0.6)
         ax.set_xticks(places, names)
-        _house(ax, f"{mode}, n {len(fit)}")
+        house(ax, f"{mode}, n {len(fit)}")
     for ax in list(panels):
         ax.set_visible(False)
     figure.axes[0].legend(frameon=False, fontsize=8)
@@ -89,7 +89,8 @@ def _boxes(fits: dict[str, np.ndarray], names: Sequence[str], title: str) -> Fig
     return figure
 
 
-def _house(ax: Any, title: str) -> None:
+def house(ax: Any, title: str) -> None:
+    """Give a panel its title and the colours of the page."""
     ax.set_title(title, fontsize=9, color=INK)
     ax.tick_params(labelsize=8, colors=MUTED)
     ax.grid(color=GRID, lw=0.6)

@@ -24,8 +24,8 @@ def compare(scores: dict[str, Scores]) -> dict[str, Any]:
     """Give, by method, ours minus it: mean first passage up to 60 s, median errors; and the verdict on each.
 
     Returns:
-        by method: `t10_s`, `p50_16_m`, `p50_60_m`, each with difference, low, high, verdict; `skill_16`, `skill_60`: 1 -
-        median error of ours over its
+        by method: `t10_s`, `p50_16_m`, `p50_60_m`, each with difference, low, high, verdict; `skill_16`, `skill_60`:
+        1 - median error of ours over its
     """
     ours = scores.get(OURS)
     return {name: _against(ours, other) for name, other in scores.items() if ours is not None and name != OURS}
@@ -71,4 +71,9 @@ def _difference(
     ]
     low, high = np.percentile(drawn, _SHARES)
     verdict = MATCHED if low <= 0 <= high else BEATEN if value * better > 0 else WORSE
-    return {"difference": round(value, 2), "low": round(low, 2), "high": round(high, 2), "verdict": verdict}
+    return {
+        "difference": round(value, 2),
+        "low": round(float(low), 2),
+        "high": round(float(high), 2),
+        "verdict": verdict,
+    }

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleet.contract import Message, Params, Prediction, Sample, Status
+from fleet.contract import Message, Params, Prediction, Status
 from twin_worker.assess.case import OURS, Asked, Case, Told
 from twin_worker.assess.log import Log
 from twin_worker.assess.methods import BASELINES, Now

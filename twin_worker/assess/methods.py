@@ -1,12 +1,12 @@
 """The methods ours is compared with: what a user could do instead, from the same telemetry and nothing later.
 
-    cv          straight on at constant velocity
-    ct          constant turn rate and constant speed
-    imm         interacting multiple model of straight flight and turns
-    route       the mission at the present ground speed
-    route_wind  the mission at the commanded airspeed through the estimated wind, rejoined smoothly
-    paper       two linear axes, identified and refined, flown by the controller twin (a twin of its own)
-    dynamics    the identified coupled model, flown by the controller twin, whatever the twin itself would choose
+cv          straight on at constant velocity
+ct          constant turn rate and constant speed
+imm         interacting multiple model of straight flight and turns
+route       the mission at the present ground speed
+route_wind  the mission at the commanded airspeed through the estimated wind, rejoined smoothly
+paper       two linear axes, identified and refined, flown by the controller twin (a twin of its own)
+dynamics    the identified coupled model, flown by the controller twin, whatever the twin itself would choose
 """
 
 from collections.abc import Callable

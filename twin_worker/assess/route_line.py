@@ -11,8 +11,19 @@ from math import acos, atan2, cos, hypot, pi, sin
 import numpy as np
 
 from fleet.autopilots.arduplane import params as P
-from fleet.mission import KIND, LOITER_TIME, LOITER_TO_ALT, LOITER_TURNS, LOITER_UNLIMITED, P_D, P_N, RADIUS, TURNS
-from fleet.mission import VA_C, Route
+from fleet.mission import (
+    KIND,
+    LOITER_TIME,
+    LOITER_TO_ALT,
+    LOITER_TURNS,
+    LOITER_UNLIMITED,
+    P_D,
+    P_N,
+    RADIUS,
+    TURNS,
+    VA_C,
+    Route,
+)
 
 _CIRCLES = (LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT)
 _STEP = 5.0  # between points [m]
@@ -61,9 +72,7 @@ def _lengths(points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
 
 
-def _leg(
-    leg: np.ndarray, at: np.ndarray, after: np.ndarray | None, ride: Ride, *, first: bool
-) -> Iterator[np.ndarray]:
+def _leg(leg: np.ndarray, at: np.ndarray, after: np.ndarray | None, ride: Ride, *, first: bool) -> Iterator[np.ndarray]:
     """Give the points of one leg, (n, 3) each part: the way there, then the circle."""
     target = leg[P_N : P_D + 1]
     if int(leg[KIND]) not in _CIRCLES:
@@ -84,7 +93,9 @@ def _leg(
     if after is not None and int(leg[KIND]) != LOITER_UNLIMITED:
         arc += _to_tangent(angle + side * arc, target, after, (R, side))
     sweep = angle + side * np.linspace(0.0, arc, int(arc * R / _STEP) + 2)
-    yield np.column_stack([target[0] + R * np.cos(sweep), target[1] + R * np.sin(sweep), np.full(len(sweep), target[2])])
+    yield np.column_stack(
+        [target[0] + R * np.cos(sweep), target[1] + R * np.sin(sweep), np.full(len(sweep), target[2])]
+    )
 
 
 def _straight(start: np.ndarray, end: np.ndarray) -> np.ndarray:
