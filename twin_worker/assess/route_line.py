@@ -52,34 +52,36 @@ class Ride:
 
 
 def line(way: Route, ride: Ride) -> np.ndarray:
-    """Give the route from where the aircraft is abreast of it, points every few metres, (n, 4)."""
-    parts, left = [], ride.length + 2000.0  # the part of the first leg that lies behind is cut off below
+    """Give the route from abreast of the aircraft on, points every few metres, (n, 4)."""
+    parts, left = [], ride.length
     at = way.start if np.isfinite(way.start).all() else ride.past[0]
+    at = _abreast(at, way.legs[0, P_N : P_D + 1], ride.p)
     for k, leg in enumerate(way.legs):
         after = way.legs[k + 1, P_N : P_N + 2] if k + 1 < len(way.legs) else None
         for part in _leg(leg, at, after, ride, first=k == 0):
             parts.append(np.column_stack([part, np.full(len(part), leg[VA_C])]))
-            left -= _lengths(part).sum()
+            left -= float(np.linalg.norm(np.diff(part[:, :2], axis=0), axis=1).sum())
         at = parts[-1][-1, :3]
         if left < 0:
             break
-    points = np.vstack(parts)
-    away = np.linalg.norm(points[: len(parts[0]), :2] - ride.p[:2], axis=1)
-    return points[int(np.argmin(away)) :]
+    return np.vstack(parts)
 
 
-def _lengths(points: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
+def _abreast(start: np.ndarray, end: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Give the point of a straight leg nearest to the aircraft, seen from above, (3,) [m]."""
+    way = end - start
+    share = (p[:2] - start[:2]) @ way[:2] / max(float(way[:2] @ way[:2]), 1e-6)
+    return start + np.clip(share, 0.0, 1.0) * way
 
 
 def _leg(leg: np.ndarray, at: np.ndarray, after: np.ndarray | None, ride: Ride, *, first: bool) -> Iterator[np.ndarray]:
     """Give the points of one leg, (n, 3) each part: the way there, then the circle."""
     target = leg[P_N : P_D + 1]
     if int(leg[KIND]) not in _CIRCLES:
-        yield _straight(at, target)
+        yield _straight(at, target, ride.length)
         return
-    R = abs(leg[RADIUS]) or abs(ride.par[P.LOITER_RAD])
-    side = np.sign(leg[RADIUS]) or np.sign(ride.par[P.LOITER_RAD]) or 1.0
+    wanted = leg[RADIUS] or ride.par[P.LOITER_RAD]
+    R, side = max(abs(wanted), 1.0), 1.0 if wanted >= 0 else -1.0
     at = ride.p if first else at
     out = at[:2] - target[:2]
     D, angle = hypot(*out), atan2(out[1], out[0])
@@ -88,19 +90,22 @@ def _leg(leg: np.ndarray, at: np.ndarray, after: np.ndarray | None, ride: Ride, 
     else:
         done = 0.0
         angle += side * acos(min(R / max(D, R), 1.0))
-        yield _straight(at, np.array([*(target[:2] + R * np.array([cos(angle), sin(angle)])), target[2]]))
+        edge = np.array([*(target[:2] + R * np.array([cos(angle), sin(angle)])), target[2]])
+        yield _straight(at, edge, ride.length)
     arc = max(_arc(leg, R, at, ride) - done, 0.0)
     if after is not None and int(leg[KIND]) != LOITER_UNLIMITED:
         arc += _to_tangent(angle + side * arc, target, after, (R, side))
+    arc = min(arc, ride.length / R + 2 * pi)
     sweep = angle + side * np.linspace(0.0, arc, int(arc * R / _STEP) + 2)
-    yield np.column_stack(
-        [target[0] + R * np.cos(sweep), target[1] + R * np.sin(sweep), np.full(len(sweep), target[2])]
-    )
+    yield target + R * np.column_stack([np.cos(sweep), np.sin(sweep), np.zeros(len(sweep))])
 
 
-def _straight(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    share = np.linspace(0.0, 1.0, int(hypot(*(end - start)[:2]) / _STEP) + 2)[:, None]
-    return start + share * (end - start)
+def _straight(start: np.ndarray, end: np.ndarray, longest: float) -> np.ndarray:
+    """Give points from start towards end, no farther than is wanted, (n, 3) [m]."""
+    length = hypot(*(end - start)[:2])
+    share = min(longest / max(length, 1e-6), 1.0)
+    along = np.linspace(0.0, share, int(share * length / _STEP) + 2)[:, None]
+    return start + along * (end - start)
 
 
 def _swept(past: np.ndarray, centre: np.ndarray, within: float) -> float:
@@ -121,7 +126,7 @@ def _arc(leg: np.ndarray, R: float, at: np.ndarray, ride: Ride) -> float:
         return leg[TURNS] * ride.speed / R
     if kind == LOITER_TO_ALT:
         return abs(leg[P_D] - at[2]) / _CLIMB * ride.speed / R
-    return ride.length / R
+    return ride.length / R + 2 * pi  # for good
 
 
 def _to_tangent(angle: float, centre: np.ndarray, after: np.ndarray, circle: tuple[float, float]) -> float:
