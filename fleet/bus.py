@@ -70,7 +70,7 @@ class Bus(AbstractContextManager, Protocol):
 
 
 def newest(found: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
-    """Keep the reply with the highest epoch, then the newest, per UAV (and kind of alert); without a UAV all stay."""
+    """Keep the reply with the highest epoch, then the newest, per UAV (and thing alerted of); without a UAV all stay."""
     best: dict[tuple[int, str], tuple[M, Stamp | None]] = {}
     rest = []
     for message, stamp in found:
@@ -78,7 +78,7 @@ def newest(found: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
         if uav is None:
             rest.append((message, stamp))
             continue
-        what = uav, str(getattr(message, "kind", ""))
+        what = uav, str(getattr(message, "about", ""))
         rank = (stamp.epoch if stamp else 0, message.t)  # type: ignore[attr-defined]
         held = best.get(what)
         if held is None or rank > (held[1].epoch if held[1] else 0, held[0].t):  # type: ignore[attr-defined]

@@ -8,7 +8,7 @@
     parauav/{uav}/model                  Model        worker   identified model with its verdict
     parauav/{uav}/prediction             Prediction   worker   mean path, tube, horizon; also answers queries
     parauav/{uav}/mismatch               Mismatch     worker   where, what physics, fit before and after
-    parauav/{uav}/alert                  Alert        worker   predicted conflict, horizon too short, link lost
+    parauav/{uav}/alert                  Alert        worker   predicted conflict, fence, ground, …; answers queries
     parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; answers queries
     parauav/@gateway/{writer}            Account      gateway  counters of one gateway; answers queries
 
@@ -343,16 +343,32 @@ class AlertKind(StrEnum):
     CONFLICT = "conflict"
     GEOFENCE = "geofence"
     GROUND = "ground"
+    NOT_ACHIEVABLE = "not_achievable"
+
+
+About = tuple[AlertKind, int]
+"""What the alerts of one UAV are told apart by: the kind, and the other UAV of a conflict (-1 none)."""
 
 
 class Alert(Message, frozen=True, kw_only=True):
-    """A warning for the operator; `active` false withdraws it."""
+    """A warning for the operator, raised once; the same with `active` false withdraws it, once."""
 
     topic: ClassVar[str] = "alert"
 
     kind: AlertKind
     active: bool = True
     sentence: str = ""
+    other: Annotated[int, Meta(description="the other UAV of a conflict, always the higher id; -1 none")] = -1
+    probability: Annotated[float | None, Meta(description="that it comes to pass, 0..1; null: it is so now")] = None
+    at: Annotated[float | None, Meta(description="when it is predicted for [s since 1970]; null: now")] = None
+    lat: Annotated[int | None, Meta(description="where, latitude [1e-7 deg]; null: no one place")] = None
+    lon: Annotated[int | None, Meta(description="where, longitude [1e-7 deg]")] = None
+    alt: Annotated[int | None, Meta(description="where, height above mean sea level [mm]")] = None
+
+    @property
+    def about(self) -> About:
+        """Give what it is told apart by."""
+        return self.kind, self.other
 
 
 class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
@@ -372,6 +388,7 @@ class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     t10_censored: Annotated[float | None, Meta(description="share of them still within 10 % at their end, 0..1")] = None
     t10_n: Annotated[int, Meta(description="past predictions behind `t10_s`")] = 0
     epoch: Annotated[int, Meta(description="claim epoch of the writer")] = 0
+    alerts: Annotated[tuple[str, ...], Meta(description="sentences of the alerts in force")] = ()
 
 
 class FleetState(msgspec.Struct, frozen=True, kw_only=True):

@@ -91,6 +91,7 @@ ROW = FleetRow(
     t10_censored=0.25,
     t10_n=4,
     epoch=1_700_000_000_000,
+    alerts=("uav 8 in 12 s",),
 )
 
 MESSAGES = (
@@ -161,7 +162,19 @@ MESSAGES = (
         fit_after=92.0,
         sentence="drag grew",
     ),
-    Alert(uav=UAV, t=T, kind=AlertKind.CONFLICT, active=True, sentence="uav 8 in 12 s"),
+    Alert(
+        uav=UAV,
+        t=T,
+        kind=AlertKind.CONFLICT,
+        active=True,
+        sentence="uav 8 in 12 s",
+        other=8,
+        probability=0.75,
+        at=T + 12.0,
+        lat=474_000_000,
+        lon=85_000_000,
+        alt=550_000,
+    ),
     FleetState(t=T, rows=(ROW,), sentence="compiling the twin's physics, once"),
     Account(
         t=T,

@@ -174,6 +174,8 @@ def test_newest_prefers_the_epoch_then_the_time() -> None:
 def test_newest_keeps_every_kind_of_alert() -> None:
     both = [(Alert(uav=1, t=1.0, kind=kind), None) for kind in (AlertKind.CONFLICT, AlertKind.GROUND)]
     assert newest(both) == both
+    near = [(Alert(uav=1, t=1.0, kind=AlertKind.CONFLICT, other=other), None) for other in (2, 3)]
+    assert newest(near) == near
 
 
 # --- zenoh alone -----------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from fleet.contract import (
     Verdict,
 )
 from viewer.chronicle import ROWS, listing
-from viewer.events import MAX_EVENTS, MAX_STEPS, MAX_WORDS, Event, Kind, Known, closed, hear, merged
+from viewer.events import MAX_EVENTS, MAX_RAISED, MAX_STEPS, MAX_WORDS, Event, Kind, Known, closed, hear, merged
 from viewer.palette import DARK, LIGHT, MARK
 
 
@@ -36,8 +36,8 @@ def status(t: float, mode: str = "AUTO", *, armed: bool = True, lost: bool = Fal
     return Status(uav=7, t=T + t, mode=mode, armed=armed, link=Link.LOST if lost else Link.LIVE, sentence=sentence)
 
 
-def alert(t: float, kind: AlertKind = AlertKind.LINK_LOST, *, active: bool = True, sentence: str = "") -> Alert:
-    return Alert(uav=7, t=T + t, kind=kind, active=active, sentence=sentence)
+def alert(t: float, kind: AlertKind = AlertKind.LINK_LOST, *, active: bool = True, **more) -> Alert:
+    return Alert(uav=7, t=T + t, kind=kind, active=active, **more)
 
 
 def model(t: float, outcome: Outcome, *, in_force: bool) -> Model:
@@ -117,6 +117,22 @@ STORIES = {
     "an alert is raised once and withdrawn once": (
         [alert(k, AlertKind.GROUND, active=k < 3, sentence="uav-7: ground in 8 s") for k in range(5)],
         [(0, Kind.ALERT, "ground in 8 s"), (3, Kind.EASED, "ground is over")],
+    ),
+    "conflicts with two others are told apart": (
+        [
+            alert(0, AlertKind.CONFLICT, other=8, sentence="uav-7: near uav-8"),
+            alert(1, AlertKind.CONFLICT, other=9, sentence="uav-7: near uav-9"),
+            alert(2, AlertKind.CONFLICT, other=8, active=False),
+        ],
+        [
+            (0, Kind.ALERT, "near uav-8"),
+            (1, Kind.ALERT, "near uav-9"),
+            (2, Kind.EASED, "conflict with uav-8 is over"),
+        ],
+    ),
+    "a stranger cannot raise alerts without end": (
+        [alert(k, AlertKind.CONFLICT, other=k, sentence=f"{k}") for k in range(MAX_RAISED + 5)],
+        [(k, Kind.ALERT, f"{k}") for k in range(MAX_RAISED)],
     ),
     "a model that was never verified is none": (
         [model(0, Outcome.STARVED, in_force=False), model(4, Outcome.STARVED, in_force=False)],

@@ -9,6 +9,7 @@ from fleet.codec import Stamp
 from fleet.contract import Alert, AlertKind, Array, FleetRow, FleetState, Mission, Prediction, Rows, Sample, State
 from fleet.frames import Origin
 from viewer.detail import why
+from viewer.events import MAX_RAISED
 from viewer.feed import GIVE_UP_S, Feed
 from viewer.place import UNIT_M
 from viewer.vehicle import ABANDONED_S, SILENT_S
@@ -99,6 +100,16 @@ def test_an_alert_comes_and_goes(clock: Clock) -> None:
     for active, n in ((True, 1), (False, 0)):
         bus.publish(Alert(uav=0, t=T, kind=AlertKind.GROUND, active=active, sentence="x"))
         assert len(feed.alerts()) == n
+
+
+def test_of_two_conflicts_one_may_end(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    for other, active in ((4, True), (5, True), (4, False)):
+        bus.publish(Alert(uav=0, t=T, kind=AlertKind.CONFLICT, other=other, active=active, sentence=f"near {other}"))
+    assert [alert.other for _, _, alert in feed.alerts()] == [5]
+    for other in range(100):
+        bus.publish(Alert(uav=0, t=T, kind=AlertKind.CONFLICT, other=other, sentence="x"))
+    assert len(feed.alerts()) == MAX_RAISED
 
 
 def test_a_worker_that_died_is_not_believed_for_ever(clock: Clock) -> None:

@@ -41,5 +41,5 @@ def caption(vehicle: Vehicle, now: float) -> str:
     """Say in few words what is wrong with a UAV."""
     if vehicle.state(now) is State.LINK_LOST:
         return f"{GLYPH[State.LINK_LOST]} {vehicle.name} link lost {ago(vehicle.age(now))}"
-    kinds = ", ".join(kind.value.replace("_", " ") for kind in vehicle.alerts)
+    kinds = ", ".join(dict.fromkeys(alert.kind.value.replace("_", " ") for alert in vehicle.alerts.values()))
     return f"▲ {vehicle.name} {kinds}"

@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fleet.contract import Alert, AlertKind, Item, Link, Mission, Model, Outcome, Sample, Status, Verdict
+from fleet.contract import About, Alert, AlertKind, Item, Link, Mission, Model, Outcome, Sample, Status, Verdict
 from viewer.routes import ITEM_NAMES
 
 MAX_EVENTS = 200  # kept of one UAV; the oldest go first
+MAX_RAISED = 64  # alerts of one UAV in force at once; more are a stranger's
 MAX_WORDS = 200  # letters kept of a sentence from outside
 QUIET_S = 2.5  # a gateway that has not spoken for so long leaves it to the worker to call the link lost [s]
 MAX_STEPS = 20  # changes of the mission item believed of one sample
@@ -62,7 +63,7 @@ class Known(NamedTuple):
     seq: int = -1
     verdict: str | None = None  # last told of: none (no model), sound or doubted; None before any
     sound_t: float = -np.inf  # when a try last was sound [s since 1970]
-    raised: frozenset[AlertKind] = frozenset()
+    raised: frozenset[About] = frozenset()  # alerts in force, by `Alert.about`
 
 
 Told = tuple[Known, list[Event]]
@@ -119,13 +120,15 @@ def _link(known: Known, t: float, lost: bool) -> Told:
 def _alert(known: Known, alert: Alert) -> Told:
     if alert.kind is AlertKind.LINK_LOST:  # of a worker, which may be far behind the gateway and short of messages
         return _link(known, alert.t, alert.active) if alert.t > known.status_t + QUIET_S else (known, [])
-    if alert.active == (alert.kind in known.raised):
+    if alert.active == (alert.about in known.raised):
         return known, []
-    name = alert.kind.value.replace("_", " ")
+    name = alert.kind.value.replace("_", " ") + (f" with uav-{alert.other}" if alert.other >= 0 else "")
     if not alert.active:
-        return known._replace(raised=known.raised - {alert.kind}), [Event(alert.t, Kind.EASED, f"{name} is over")]
+        return known._replace(raised=known.raised - {alert.about}), [Event(alert.t, Kind.EASED, f"{name} is over")]
+    if len(known.raised) >= MAX_RAISED:
+        return known, []
     said = _own_words(alert.sentence, alert.uav) or name
-    return known._replace(raised=known.raised | {alert.kind}), [Event(alert.t, Kind.ALERT, said)]
+    return known._replace(raised=known.raised | {alert.about}), [Event(alert.t, Kind.ALERT, said)]
 
 
 def _mission(known: Known, mission: Mission) -> Told:

@@ -12,6 +12,7 @@ from fleet.bus import Bus, key
 from fleet.codec import Stamp
 from fleet.contract import Account, Alert, AlertKind, FleetState, Mission, Model, Prediction, Sample, State, Status
 from fleet.frames import Origin
+from viewer.events import MAX_RAISED
 from viewer.place import Place, TooFar
 from viewer.vehicle import ENDED_S, GIVE_UP_S, JUMP_S, Forecast, Vehicle, forecast
 
@@ -211,8 +212,9 @@ class Feed:
     def _alert(self, alert: Alert, _: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(alert.uav)
         vehicle.note(alert, now)
-        others = {kind: held for kind, held in vehicle.alerts.items() if kind is not alert.kind}
-        vehicle.alerts = {**others, alert.kind: alert} if alert.active else others
+        others = {about: held for about, held in vehicle.alerts.items() if about != alert.about}
+        if len(others) < MAX_RAISED or not alert.active:
+            vehicle.alerts = {**others, alert.about: alert} if alert.active else others
 
     def _fleet(self, fleet: FleetState, stamp: Stamp | None, now: float) -> None:
         self.sentences[stamp.writer if stamp else 0] = fleet.sentence
@@ -228,7 +230,7 @@ class Feed:
         with self.lock:
             now = self._clock()
             copies = [vehicle.still(now) for vehicle in self.vehicles.values() if vehicle.alerts]
-            found = [(copy, kind, alert) for copy in copies for kind, alert in copy.alerts.items()]
+            found = [(copy, alert.kind, alert) for copy in copies for alert in copy.alerts.values()]
         return sorted(found, key=lambda one: -one[2].t)
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from fleet.contract import Alert, AlertKind, FleetRow, Link, Mission, Model, Prediction, Sample, State, Status
+from fleet.contract import About, Alert, AlertKind, FleetRow, Link, Mission, Model, Prediction, Sample, State, Status
 from viewer.datatime import DataTime
 from viewer.events import Event, Known, closed, hear, merged
 from viewer.place import UNIT_M, Place
@@ -108,7 +108,7 @@ class Vehicle:
     ended: bool = False  # the recording is over: what is shown is its last instant
     known: Known = field(default_factory=Known)
     events: tuple[Event, ...] = ()  # oldest first; replaced as a whole, never changed
-    alerts: dict[AlertKind, Alert] = field(default_factory=dict)  # replaced as a whole, never changed
+    alerts: dict[About, Alert] = field(default_factory=dict)  # replaced as a whole, never changed
     refused: tuple[float, str] = (-np.inf, "")  # when a message was refused, monotonic [s], and why
     trail: deque = field(default_factory=lambda: deque(maxlen=TRAIL_ROWS))  # t, east, north, up, Va
     track: Track = field(default_factory=Track)  # the whole flight, thinned
@@ -144,7 +144,9 @@ class Vehicle:
         copy.__dict__.update(self.__dict__)
         if self.recorded and now - self.player > ENDED_S and now - self.heard > ENDED_S:
             copy.ended, copy.events = True, closed(self.events, self.time.t)
-            copy.alerts = {kind: alert for kind, alert in self.alerts.items() if kind is not AlertKind.LINK_LOST}
+            copy.alerts = {
+                about: alert for about, alert in self.alerts.items() if alert.kind is not AlertKind.LINK_LOST
+            }
             copy.forecast = self.past[-1] if self.past else None
             copy.prediction = copy.forecast.message if copy.forecast is not None else self.prediction
         return copy
