@@ -70,7 +70,7 @@ class Bus(AbstractContextManager, Protocol):
 
 
 def newest(found: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
-    """Keep the reply with the highest epoch, then the newest, per UAV (and thing alerted of); without a UAV all stay."""
+    """Keep the reply with the highest epoch, then the newest, per UAV (and alert); without a UAV all stay."""
     best: dict[tuple[int, str], tuple[M, Stamp | None]] = {}
     rest = []
     for message, stamp in found:

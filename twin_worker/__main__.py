@@ -15,16 +15,35 @@ EXAMPLES = """
 """
 
 
+def _two_metres(text: str) -> tuple[float, float]:
+    """Read `--separation 50,20` [m]."""
+    try:
+        wide, high = (float(part) for part in text.split(","))
+    except ValueError:
+        wide = high = float("nan")
+    if not (0 < wide < 1e5 and 0 < high < 1e5):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected two distances in m, e.g. 50,20; correct it")
+    return wide, high
+
+
 def _run(args: argparse.Namespace) -> int:
     airframe = load(args.airframe)
     stop = stop_on_signal()
     with connect(args.router) as bus:
         bus.present(f"worker/{bus.writer:016x}/{args.uavs.start}-{args.uavs.stop - 1}")
         bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
+        from twin_worker.conflict.separation import Separation
         from twin_worker.warm import warm_up  # numba is slow to import: say what happens first
         from twin_worker.worker import Worker
 
-        worker = Worker(bus, args.uavs, omega=args.omega, method=args.method, airframe=airframe)
+        worker = Worker(
+            bus,
+            args.uavs,
+            omega=args.omega,
+            method=args.method,
+            airframe=airframe,
+            separation=Separation(*args.separation),
+        )
         worker.listen()
         worker.sentence = "compiling the twin's physics, once"
         bus.publish(worker.state())
@@ -51,6 +70,13 @@ def main(argv: list[str] | None = None) -> int:
         "--airframe", default=GENERIC, metavar="NAME|FILE", help=f"what is known before flight, a TOML file ({GENERIC})"
     )
     parser.add_argument("--omega", type=float, default=0.0, help="least mean fit to verify, %% (0, as in the paper)")
+    parser.add_argument(
+        "--separation",
+        type=_two_metres,
+        default=(50.0, 20.0),
+        metavar="M,M",
+        help="two aircraft nearer than both, over ground and in height, have lost separation (50,20)",
+    )
     args = parser.parse_args(argv)
     return guarded("twin_worker", _run, args)
 

@@ -11,6 +11,7 @@ from fleet.autopilots import arduplane
 from fleet.contract import Message, Mission, Model, Outcome, Params, Prediction, Sample, State, Status, Verdict
 from fleet.frames import Origin
 from fleet.window import Window
+from twin_worker.conflict.ledger import Ledger
 from twin_worker.contest import Contest
 from twin_worker.coupled import Coupled
 from twin_worker.earned import Earned
@@ -75,6 +76,7 @@ class Twin:
     grid: Grid = field(default_factory=Grid)
     wind: WindFilter = field(default_factory=WindFilter)
     record: Record = field(default_factory=Record)
+    ledger: Ledger = field(default_factory=Ledger)
     rotor: Rotor = field(default_factory=Rotor)
     grey: Grey = field(default_factory=Grey)
     modes: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=_MODES))  # changes, (when, name)
@@ -111,7 +113,10 @@ class Twin:
     hybrid_t: float = -np.inf  # hybrid last identified
     checked_t: float = -np.inf  # hybrid last flown over what was held out
     spread_t: float = -np.inf  # ensemble last flown
+    achievable_t: float = -np.inf  # mission last judged
     lost: bool = False
+    stood: Origin | None = None  # where it last stood disarmed
+    aloft: bool = False  # it has been above the least height since it was disarmed
     bad: int = 0
 
     @property

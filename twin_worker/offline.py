@@ -3,17 +3,22 @@
 from collections.abc import Iterable, Iterator
 
 from fleet.contract import Message
+from twin_worker.conflict.traffic import Traffic
 from twin_worker.twin import Twin, advance
 
 
-def run(messages: Iterable[Message], twins: dict[int, Twin]) -> Iterator[Message]:
+def run(messages: Iterable[Message], twins: dict[int, Twin], traffic: Traffic | None = None) -> Iterator[Message]:
     """Drive twins by recorded messages; a twin is made for every new UAV.
 
     Args:
         messages: Sample, Status, Mission, Params in the order they were heard
         twins: twins by UAV id, filled and changed in place
+        traffic: judge of all pairs, changed in place; None makes one that ends with the messages
     Yields:
         Model, Prediction and Alert messages
     """
+    traffic = traffic or Traffic()
     for message in messages:
-        yield from advance(twins.setdefault(message.uav, Twin(message.uav)), (message,))
+        twin = twins.setdefault(message.uav, Twin(message.uav))
+        results = advance(twin, (message,))
+        yield from traffic.after(twin.uav, twin.turned_t, results)

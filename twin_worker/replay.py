@@ -18,6 +18,7 @@ from fleet.cli import guarded, parser_for
 from fleet.contract import Message, Model, Outcome, Prediction
 from fleet.telemetry.recordings import replay_messages
 from twin_worker.calibration.quantile import survival
+from twin_worker.conflict.traffic import Traffic
 from twin_worker.offline import run
 from twin_worker.twin import Twin
 
@@ -50,6 +51,7 @@ def replay(messages: Iterable[Message], progress: str = "") -> dict[str, dict[st
         progress: name to report progress under on stderr; empty: silently
     """
     twins: dict[int, Twin] = {}
+    traffic = Traffic()
     tallies: dict[int, Tally] = {}
     begun: dict[int, float] = {}
     said = 0.0
@@ -59,7 +61,7 @@ def replay(messages: Iterable[Message], progress: str = "") -> dict[str, dict[st
             said = message.t - start
             print(f"{progress}: {said:.0f} s of flight, {len(begun)} UAVs", file=sys.stderr, flush=True)
         tally = tallies.setdefault(message.uav, Tally())
-        for result in run((message,), twins):
+        for result in run((message,), twins, traffic):
             _take(tally, result, start)
         _collect(tally, twins[message.uav])
     for uav, twin in twins.items():

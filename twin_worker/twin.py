@@ -4,9 +4,10 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from fleet.contract import Alert, AlertKind, FleetRow, Link, Message, Sample, State
+from fleet.contract import Alert, FleetRow, Link, Message, Sample, State
 from fleet.frames import to_ned
 from twin_worker import contest
+from twin_worker.conflict.watch import link, watch
 from twin_worker.foresee import foresee
 from twin_worker.learn import learn
 from twin_worker.memory import Twin, hear
@@ -77,7 +78,8 @@ def _turn(twin: Twin, now: float) -> list[Message]:
         results += learn(twin)
     if _due(now, twin.predict_t, PREDICT_S):
         twin.predict_t = now
-        results += foresee(twin, now)
+        made = foresee(twin, now)
+        results += [*made, *watch(twin, now, twin.prediction if made else None)]
     return results
 
 
@@ -92,9 +94,7 @@ def _watch_link(twin: Twin, now: float) -> list[Message]:
         return []
     twin.lost, twin.predict_t = lost, -np.inf
     twin.state = State.LINK_LOST if lost else State.WAITING if twin.plant is None else State.VERIFIED
-    said = f"no sample for {silent:.1f} s; the twin flies on alone" if lost else "link back"
-    sentence = f"{twin.name}: {said}"
-    return [Alert(uav=twin.uav, t=now, kind=AlertKind.LINK_LOST, active=lost, sentence=sentence)]
+    return list(link(twin, now, silent))
 
 
 def _blow(twin: Twin) -> None:
@@ -128,8 +128,15 @@ def _score(twin: Twin) -> None:
     twin.record.answer(t, to_ned(twin.origin, *position.T))
 
 
-def fleet_row(twin: Twin, now: float, **claim: object) -> FleetRow:
-    """Give the aircraft's line of the fleet table; `now` is data time, `claim` names worker and epoch."""
+def fleet_row(twin: Twin, now: float, alerts: Iterable[Alert] = (), **claim: object) -> FleetRow:
+    """Give the aircraft's line of the fleet table.
+
+    Args:
+        twin: the aircraft's twin
+        now: data time [s since 1970]
+        alerts: those in force
+        claim: worker and epoch
+    """
     made = twin.prediction
     t10, censored, n = twin.record.t10(made.method if made and made.method != "imm" else twin.method)
     return FleetRow(
@@ -143,5 +150,6 @@ def fleet_row(twin: Twin, now: float, **claim: object) -> FleetRow:
         t10_s=t10,
         t10_censored=censored,
         t10_n=n,
+        alerts=tuple(alert.sentence for alert in alerts),
         **claim,  # type: ignore[arg-type]
     )

@@ -5,11 +5,12 @@ import numpy as np
 from fleet.airframes import GENERIC, load
 from fleet.autopilots import arduplane, copter, greybox
 from fleet.autopilots.shadow import shadow
-from fleet.contract import Item
+from fleet.contract import Array, Item, Prediction, State
 from fleet.frames import Origin
 from fleet.mission import route
 from fleet.simulate import N_STATE, coupled_plant, linear_plant, simulate
 from fleet.window import Window
+from twin_worker.conflict.traffic import Traffic
 from twin_worker.coupled import identify
 from twin_worker.identify import AXES, identify_axis
 
@@ -42,7 +43,19 @@ def warm_up() -> None:
     ahead, grey = np.empty((5, 3)), np.ones(greybox.N_PAR)
     greybox.follow(grey_ctl, par, legs, grey, np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0]), np.zeros(2), 0.1, ahead)  # type: ignore
     segments, told = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
+    _meet(origin)
     copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), told, 0.1, ahead)  # type: ignore
+
+
+def _meet(origin: Origin) -> None:
+    """Let two aircraft fly at each other."""
+    traffic, ahead = Traffic(), np.arange(0.0, 20.0)
+    for uav, way in ((0, 1.0), (1, -1.0)):
+        path = np.column_stack([way * _SPEED * (ahead - 10.0), 0.0 * ahead, -100.0 + 0.0 * ahead])
+        rows = {"ahead": Array.of(ahead), "path": Array.of(path), "tube": Array.of(np.ones((20, 3)))}
+        made = Prediction(uav=uav, t=1e9, state=State.PREDICTING, method="", origin=tuple(origin), **rows)
+        traffic.hear(made)
+    traffic.judge(0, 1e9)
 
 
 def _flight(seconds: float = 20.0, dt: float = 0.04) -> Window:

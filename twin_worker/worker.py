@@ -15,9 +15,11 @@ from scipy.interpolate import CubicSpline
 from fleet.airframes import GENERIC, Airframe, load
 from fleet.bus import Bus
 from fleet.codec import Stamp
-from fleet.contract import Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, Status
 from twin_worker.horizon import AHEAD
 from twin_worker.memory import AUTO
+from fleet.contract import Alert, Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, Status
+from twin_worker.conflict.separation import Separation
+from twin_worker.conflict.traffic import Traffic
 from twin_worker.twin import Twin, advance, fleet_row
 
 _log = logging.getLogger(__name__)
@@ -43,11 +45,21 @@ class Worker:
 
     def __init__(
         self, bus: Bus, uavs: range, *, omega: float, method: str = AUTO, airframe: Airframe | None = None
+        self,
+        bus: Bus,
+        uavs: range,
+        *,
+        omega: float,
+        method: str = DYNAMICS,
+        airframe: Airframe | None = None,
+        separation: Separation | None = None,
     ) -> None:
         self.bus = bus
         self.uavs = uavs
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
         self.sentence = ""
+        self.traffic = Traffic(separation or Separation())
+        self._epochs: dict[int, int] = {}  # highest heard of others' aircraft
         self._held: dict[int, Held] = {}
         self._lock = threading.Lock()
         self._news = threading.Event()
@@ -56,7 +68,9 @@ class Worker:
         """Subscribe, answer queries, and ask for what was said before this worker came."""
         for kind in (Sample, Status, Mission, Params):
             self.bus.subscribe(kind, lambda message, _: self._hear(message))
+        self.bus.subscribe(Prediction, self._overhear)
         self.bus.answer(Prediction, self._predictions)
+        self.bus.answer(Alert, lambda uav, *_: self._stamped((h, a) for h in self._asked(uav) for a in self.active(h)))
         self.bus.answer(Model, lambda uav, *_: self._stamped((h, h.twin.model) for h in self._asked(uav)))
         self.bus.answer(FleetState, lambda *_: [(self.state(), None)])
         for kind in (Status, Mission, Params):
@@ -78,6 +92,17 @@ class Worker:
         held.inbox.append(message)
         self._news.set()
 
+    def _overhear(self, made: Prediction, stamp: Stamp | None) -> None:
+        """Keep what others predict of their aircraft; of two writers the higher epoch is believed."""
+        epoch = stamp.epoch if stamp else 0
+        if made.uav not in self._held and epoch >= self._epochs.get(made.uav, 0):
+            self._epochs[made.uav] = epoch
+            self.traffic.hear(made)
+
+    def active(self, held: Held) -> list[Alert]:
+        """Give the alerts of one aircraft that are in force."""
+        return held.twin.ledger.active + self.traffic.active(held.twin.uav)
+
     def holding(self) -> list[Held]:
         """Give what this worker holds, by UAV id."""
         with self._lock:
@@ -90,7 +115,7 @@ class Worker:
             messages = [held.inbox.popleft() for _ in range(len(held.inbox))]
             taken += len(messages)
             try:
-                for result in _advance_all(held, messages):
+                for result in _advance_all(held, messages, self.traffic):
                     self.bus.publish(result, Stamp(held.epoch, self.bus.writer))
             except Exception as error:  # a defect met by one aircraft must not stop the others
                 held.failed = f"{held.twin.name}: found a defect ({error}), its results are missing; report it"
@@ -100,7 +125,7 @@ class Worker:
     def state(self) -> FleetState:
         """Give the fleet table of this worker."""
         writer = f"{self.bus.writer:016x}"
-        rows = [fleet_row(h.twin, data_time(h), worker=writer, epoch=h.epoch) for h in self.holding()]
+        rows = [fleet_row(h.twin, data_time(h), self.active(h), worker=writer, epoch=h.epoch) for h in self.holding()]
         shed = sum(held.shed for held in self.holding())
         said = [f"{shed} messages shed: too many UAVs for this worker"] if shed else []
         said += [held.failed for held in self.holding() if held.failed]
@@ -136,13 +161,16 @@ def data_time(held: Held) -> float:
     return newest + silent if silent > _SILENT_S else newest
 
 
-def _advance_all(held: Held, messages: list[Message]) -> Iterator[Message]:
+def _advance_all(held: Held, messages: list[Message], traffic: Traffic) -> Iterator[Message]:
     """Turn the loop after every message, as offline; the wall clock turns it on where data have fallen silent."""
+    twin = held.twin
     for message in messages:
-        yield from advance(held.twin, (message,))
+        results = advance(twin, (message,))
+        yield from traffic.after(twin.uav, twin.turned_t, results)
     now = data_time(held)
-    if not messages and now > held.twin.history.newest:  # a worker that is late hears no silence
-        yield from advance(held.twin, (), now)
+    if not messages and now > twin.history.newest:  # a worker that is late hears no silence
+        results = advance(twin, (), now)
+        yield from traffic.after(twin.uav, twin.turned_t, results)
 
 
 def wanted(asked: dict[str, str]) -> np.ndarray | None:

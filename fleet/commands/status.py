@@ -1,4 +1,4 @@
-"""Show every UAV of a running fleet: state, verdict, fit, horizon, worker, ages."""
+"""Show every UAV of a running fleet: state, alerts in force, verdict, fit, horizon, worker, ages."""
 
 import argparse
 import json
@@ -6,6 +6,7 @@ import sys
 
 import msgspec
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from fleet.bus import ROUTER, Bus, connect
@@ -60,10 +61,11 @@ def table(rows: list[FleetRow]) -> Table:
     for heading, justify in (("UAV", "right"), ("state", "left"), ("fit %", "right"), ("horizon s", "right")):
         out.add_column(heading, justify=justify)  # type: ignore[arg-type]
     out.add_column("sample age s", justify="right")
-    out.add_column("verdict", overflow="fold")
+    out.add_column("alerts and verdict", overflow="fold")
     for row in rows:
         fit = f"{sum(row.fit.values()) / len(row.fit):.0f}" if row.fit else "-"
         horizon = f"{row.horizon_s:.0f}" if row.horizon_s else "-"
         age = "-" if row.sample_age_s is None else f"{row.sample_age_s:.1f}"
-        out.add_row(str(row.uav), row.state.value, fit, horizon, age, row.verdict)
+        said = "\n".join((*(f"! {escape(alert)}" for alert in row.alerts), escape(row.verdict)))
+        out.add_row(str(row.uav), row.state.value, fit, horizon, age, said)
     return out

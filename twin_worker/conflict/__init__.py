@@ -1,0 +1,1 @@
+"""Alerts from predictions: pure judgement in data time; nothing here knows a bus."""

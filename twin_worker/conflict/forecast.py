@@ -1,0 +1,104 @@
+"""One prediction as what alerts are judged on: Gaussian positions on a grid of times that all aircraft share.
+
+The tube's half-axes (along, cross, vertical) are read as z standard deviations of three independent normal errors.
+The tube holds `quantile` of flights in all three at once, so one axis alone must hold quantile^(1/3):
+
+    z = Phi^-1((1 + q^(1/3)) / 2)        2.11 for q = 0.9
+
+Errors of one prediction are taken as one draw for its whole length (an aircraft that is late stays late), along and
+cross turned to NED by the direction of the path at each time. The covariance grows with the look-ahead, so what is far
+ahead weighs little by itself and no horizon cuts it off.
+"""
+
+from math import isfinite
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import norm, qmc
+
+from fleet.contract import Prediction
+from fleet.frames import Origin, to_geodetic
+from twin_worker.horizon import track_frame
+
+STEP = 2.0  # grid in fleet time, the same for all: instants k STEP [s since 1970]
+LONGEST_S = 180.0  # of a prediction that is judged [s]
+DRAWS = norm.ppf(qmc.Sobol(3, scramble=True, seed=5).random(128))  # evenly spread normal errors, (128, 3) [-]
+_MOST = 1e6  # places farther from their own origin are noise [m]
+_LEAST = 0.1  # standard deviations are never smaller [m]
+
+
+class Forecast(NamedTuple):
+    """A prediction, checked, on the common grid."""
+
+    made: Prediction
+    first: int  # instant of the first row, in steps since 1970
+    path: np.ndarray  # mean position, NED from the prediction's origin, (n, 3) [m]
+    along: np.ndarray  # direction of the path, horizontal unit vector, (n, 2)
+    sigma: np.ndarray  # standard deviations along, cross, vertical, (n, 3) [m]
+
+    @property
+    def t(self) -> np.ndarray:
+        """Give the instants, (n,) [s since 1970]."""
+        return STEP * (self.first + np.arange(len(self.path)))
+
+    def covariance(self) -> np.ndarray:
+        """Give nn, ne, ee of the horizontal covariance and the vertical variance, (n, 4) [m2]."""
+        (c, s), (a, b, d) = self.along.T, (self.sigma**2).T
+        return np.column_stack([a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c, d])
+
+    def draws(self, until: float = np.inf) -> np.ndarray:
+        """Give 128 equally probable flights up to an instant [s since 1970], NED, (128, k, 3) [m]."""
+        k = max(int(np.searchsorted(self.t, until, side="right")), 1)
+        e = DRAWS[:, None, :] * self.sigma[:k]
+        c, s = self.along[:k].T
+        error = [e[..., 0] * c - e[..., 1] * s, e[..., 0] * s + e[..., 1] * c, e[..., 2]]
+        return self.path[:k] + np.stack(error, axis=-1)
+
+    def place(self, k: int) -> Origin:
+        """Give the mean position at row `k`."""
+        return Origin(*map(int, to_geodetic(self.made.ned_origin(), self.path[k])))
+
+
+def axis_z(quantile: float) -> float:
+    """Give the half-axis of a tube that holds `quantile`, in standard deviations of one axis."""
+    return float(norm.ppf((1 + quantile ** (1 / 3)) / 2))
+
+
+def forecast(made: Prediction) -> Forecast | None:
+    """Check a prediction and lay it on the common grid; None where it cannot be judged."""
+    try:
+        ahead, path, tube = (array.numpy().astype(float) for array in (made.ahead, made.path, made.tube))
+    except ValueError:
+        return None
+    if not _sound(made, ahead, path, tube):
+        return None
+    t = made.t + ahead
+    first, last = int(np.ceil(t[0] / STEP)), int(np.floor(min(t[-1], t[0] + LONGEST_S) / STEP))
+    if last < first:
+        return None
+    at = STEP * np.arange(first, last + 1)
+    laid = [np.column_stack([np.interp(at, t, column) for column in rows.T]) for rows in (path, tube)]
+    sigma = np.maximum(laid[1] / axis_z(made.quantile), _LEAST)
+    along = track_frame(laid[0]) if len(at) > 1 else np.array([[1.0, 0.0]])
+    return Forecast(made, first, laid[0], along, sigma)
+
+
+def _sound(made: Prediction, ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
+    """Tell whether times rise, shapes agree, numbers are finite and the origin is on this earth."""
+    n = len(ahead) if ahead.ndim == 1 else 0
+    if n < 1 or path.shape != (n, 3) or tube.shape != (n, 3):
+        return False
+    lat, lon, alt = made.origin
+    return bool(
+        0 < made.t < 4e9
+        and 0 < made.quantile < 1
+        and isfinite(made.quantile)
+        and np.isfinite(ahead).all()
+        and (np.diff(ahead) > 0).all()
+        and (np.abs(path) < _MOST).all()
+        and (tube >= 0).all()
+        and (tube < _MOST).all()
+        and abs(lat) < 8.9e8
+        and abs(lon) <= 1.8e9
+        and abs(alt) <= 1e8
+    )
