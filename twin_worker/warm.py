@@ -52,8 +52,16 @@ def _meet(origin: Origin) -> None:
     traffic, ahead = Traffic(), np.arange(0.0, 20.0)
     for uav, way in ((0, 1.0), (1, -1.0)):
         path = np.column_stack([way * _SPEED * (ahead - 10.0), 0.0 * ahead, -100.0 + 0.0 * ahead])
-        rows = {"ahead": Array.of(ahead), "path": Array.of(path), "tube": Array.of(np.ones((20, 3)))}
-        made = Prediction(uav=uav, t=1e9, state=State.PREDICTING, method="", origin=tuple(origin), **rows)
+        made = Prediction(
+            uav=uav,
+            t=1e9,
+            state=State.PREDICTING,
+            method="",
+            origin=(origin.lat_e7, origin.lon_e7, origin.alt_mm),
+            ahead=Array.of(ahead),
+            path=Array.of(path),
+            tube=Array.of(np.ones((20, 3))),
+        )
         traffic.hear(made)
     traffic.judge(0, 1e9)
 

@@ -15,11 +15,11 @@ from scipy.interpolate import CubicSpline
 from fleet.airframes import GENERIC, Airframe, load
 from fleet.bus import Bus
 from fleet.codec import Stamp
-from twin_worker.horizon import AHEAD
-from twin_worker.memory import AUTO
 from fleet.contract import Alert, Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, Status
 from twin_worker.conflict.separation import Separation
 from twin_worker.conflict.traffic import Traffic
+from twin_worker.horizon import AHEAD
+from twin_worker.memory import AUTO
 from twin_worker.twin import Twin, advance, fleet_row
 
 _log = logging.getLogger(__name__)
@@ -44,13 +44,12 @@ class Worker:
     """Twins of the UAVs in one range of ids."""
 
     def __init__(
-        self, bus: Bus, uavs: range, *, omega: float, method: str = AUTO, airframe: Airframe | None = None
         self,
         bus: Bus,
         uavs: range,
         *,
         omega: float,
-        method: str = DYNAMICS,
+        method: str = AUTO,
         airframe: Airframe | None = None,
         separation: Separation | None = None,
     ) -> None:

@@ -1,6 +1,8 @@
 """One pretend aircraft: physics, sensors, autopilot and voice, stepped by whoever drives it."""
 
+from collections.abc import Mapping
 from math import pi, sin
+from types import MappingProxyType
 
 import numpy as np
 
@@ -8,6 +10,7 @@ from fleet import mission as legs_of
 from fleet.autopilots import laws
 from fleet.autopilots.arduplane import state as memory
 from fleet.autopilots.slots import W_E, W_N
+from fleet.contract import Item
 from fleet.frames import G, Origin, to_geodetic
 from fleet.pretend.jsbsim import Aircraft
 from fleet.pretend.mavlink import MOST_AIRCRAFT, TICK_HZ, Ground, Voice
@@ -38,6 +41,8 @@ class PretendUav:
         origin: Origin = HOME,
         autopilot: str = "ardupilot",
         aircraft: str = "small",
+        items: tuple[Item, ...] = (),
+        more: Mapping[str, float] = MappingProxyType({}),
     ):
         """Put one aircraft in the air.
 
@@ -49,6 +54,8 @@ class PretendUav:
             origin: home, where the NED frame touches the earth
             autopilot: whose law flies it and whose MAVLink it speaks, ardupilot or px4
             aircraft: name in `types.TYPES`
+            items: mission to fly instead of its own, which begins at the same place and item
+            more: autopilot parameters beside its own
         Raises:
             ValueError: when MAVLink has no system id for it.
         """
@@ -61,8 +68,9 @@ class PretendUav:
         self._kind = kind = TYPES[aircraft]
         self._law = _LAWS[autopilot]
         self._first = legs_of.FIRST.get(autopilot, 1)
-        self.items, start = mission(own, kind.cruise, origin, kind.field, autopilot)
-        self.params = tuned(own, autopilot, aircraft)
+        drawn, start = mission(own, kind.cruise, origin, kind.field, autopilot)
+        self.items = items or drawn
+        self.params = tuned(own, autopilot, aircraft) | dict(more)
         self.boot_s = float(rng.uniform(60, 600))  # on the ground before the world began [s]
         self.tick = 0
         self.down = False  # it hit the ground

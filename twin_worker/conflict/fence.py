@@ -62,18 +62,16 @@ def leaves(flight: Forecast, limit: Fence, home: Origin, until: float = np.inf) 
     centre = to_ned(flight.made.ned_origin(), *(np.array([x]) for x in home))[0]
     place = flight.draws(until) - centre
     away, height = np.hypot(place[..., 0], place[..., 1]), -place[..., 2]
-    out = np.stack([away > limit.radius, height > limit.ceiling, height < limit.floor])
-    ever = out.any(axis=0)  # (draws, instants)
-    hit = ever.any(axis=1)
+    out: np.ndarray = np.stack([away > limit.radius, height > limit.ceiling, height < limit.floor])
+    ever: np.ndarray = np.any(out, axis=0)  # (draws, instants)
+    hit: np.ndarray = np.any(ever, axis=1)
     p = float(hit.mean())
     if not p:
         return Finding(AlertKind.GEOFENCE, 0.0, "", _OVER)
-    k = int(np.median(ever[hit].argmax(axis=1)))
+    k = int(np.sort(ever[hit].argmax(axis=1))[hit.sum() // 2])
     which = int(out[:, :, k].sum(axis=1).argmax())
-    name = (f"circle of {limit.radius:.0f} m", f"ceiling of {limit.ceiling:.0f} m", f"floor of {limit.floor:.0f} m")[
-        which
-    ]
+    name = f"{('circle', 'ceiling', 'floor')[which]} of {limit[which]:.0f} m"
     at = float(flight.t[k])
     when = f"in {at - flight.made.t:.0f} s" if k else "now"
-    said = f"{p:.0%} that it leaves the geofence, {name} about home, {when}"
+    said = f"{p:.0%} chance that it leaves the geofence, {name} about home, {when}"
     return Finding(AlertKind.GEOFENCE, p, "; ".join(filter(None, (said, limit.unseen))), _OVER, -1, at, flight.place(k))

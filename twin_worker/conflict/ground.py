@@ -31,7 +31,7 @@ def sinks(flight: Forecast, home: Origin, margin: float, until: float = np.inf) 
     first = int(np.flatnonzero(z >= min(z.max(), 0.0))[0])  # where the mean goes below, else where it comes nearest
     at = float(flight.t[first])
     danger = (
-        f"{p:.0%} that it sinks below {margin:.0f} m above home (terrain unknown) in {max(at - flight.made.t, 0.0):.0f} s; "
-        f"lowest {height.min():.0f} m"
+        f"{p:.0%} chance that it sinks below {margin:.0f} m above home (terrain unknown) in "
+        f"{max(at - flight.made.t, 0.0):.0f} s; lowest {height.min():.0f} m"
     )
     return Finding(AlertKind.GROUND, p, danger, _OVER, -1, at, flight.place(first))

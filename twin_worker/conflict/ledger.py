@@ -65,7 +65,7 @@ class Ledger:
     _open: dict[About, _Open] = field(default_factory=dict)
 
     def judge(self, uav: int, now: float, finding: Finding) -> list[Alert]:
-        """Take a finding about `uav` at data time `now` [s since 1970]; give the alert it raises or withdraws, if any."""
+        """Take a finding at data time `now` [s since 1970]; give the alert it raises or withdraws, if any."""
         about = finding.kind, finding.other
         entry, rule = self._open.setdefault(about, _Open()), RULES[finding.kind]
         p = finding.probability if isfinite(finding.probability) else 0.0

@@ -1,4 +1,4 @@
-"""How probable is it that two aircraft come too close, at any time of their predictions?
+"""How probable it is that two aircraft come too close, at any time of their predictions.
 
 The errors of two aircraft are taken as independent, so the covariance of their distance is the sum of both. (Wind that
 both meet makes errors alike and the distance surer than this says.) With S(t) that sum, 2 x 2 horizontally:

@@ -81,10 +81,10 @@ class Traffic:
 
     def _finding(self, own: Forecast, other: int, p: float, met: np.ndarray) -> Finding:
         at, wide, high = float(met[2]) * STEP, float(met[3]), float(met[4])
-        name, limit = f"uav-{other}", self.separation
+        limit = self.separation
         danger = (
-            f"{p:.0%} that it and {name} lose separation ({limit.horizontal:.0f} m, {limit.vertical:.0f} m of height) in "
-            f"{max(at - own.made.t, 0.0):.0f} s; the mean paths come within {wide:.0f} m, {high:.0f} m of height"
+            f"{p:.0%} chance that it comes within {limit.horizontal:.0f} m and {limit.vertical:.0f} m of height of "
+            f"uav-{other} in {max(at - own.made.t, 0.0):.0f} s; the mean paths come within {wide:.0f} m and {high:.0f} m"
         )
         place = own.place(int(np.clip(round(met[2]) - own.first, 0, len(own.path) - 1)))
         return Finding(AlertKind.CONFLICT, p, danger, _KEPT.format(other), other, at, place)

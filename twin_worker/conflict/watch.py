@@ -15,7 +15,7 @@ from twin_worker.memory import Twin
 from twin_worker.rotor import RETURN_MODES
 
 _SHORT_S, _LONG_S = 10.0, 12.0  # confidence horizon below which an alert is raised, above which it is withdrawn [s]
-_TOLD = 16  # past predictions below which the 90 % horizon is the prior's word, not this aircraft's [-]
+_TOLD = 30  # past predictions below which the 90 % horizon is the prior's word, not this aircraft's [-]
 _TURNING_S = 15.0  # a turn rate alone says nothing of ground and fence farther ahead [s]
 _ACHIEVABLE_EVERY_S = 5.0
 _LANDING = (21, 85, 189)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND, DO_LAND_START
