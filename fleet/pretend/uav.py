@@ -70,7 +70,7 @@ class PretendUav:
         self._first = legs_of.FIRST.get(autopilot, 1)
         drawn, start = mission(own, kind.cruise, origin, kind.field, autopilot)
         self.items = items or drawn
-        self.params = tuned(own, autopilot, aircraft) | dict(more)
+        self.params = {**tuned(own, autopilot, aircraft), **more}
         self.boot_s = float(rng.uniform(60, 600))  # on the ground before the world began [s]
         self.tick = 0
         self.down = False  # it hit the ground

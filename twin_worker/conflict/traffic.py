@@ -84,7 +84,7 @@ class Traffic:
         limit = self.separation
         danger = (
             f"{p:.0%} chance that it comes within {limit.horizontal:.0f} m and {limit.vertical:.0f} m of height of "
-            f"uav-{other} in {max(at - own.made.t, 0.0):.0f} s; the mean paths come within {wide:.0f} m and {high:.0f} m"
+            f"uav-{other} in {max(at - own.made.t, 0.0):.0f} s; mean paths come within {wide:.0f} m and {high:.0f} m"
         )
         place = own.place(int(np.clip(round(met[2]) - own.first, 0, len(own.path) - 1)))
         return Finding(AlertKind.CONFLICT, p, danger, _KEPT.format(other), other, at, place)

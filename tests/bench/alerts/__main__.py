@@ -2,9 +2,9 @@
 
     python -m tests.bench.alerts --seed 7 --json alerts.json
 
-Of a chain of flights each odd one meets the one before it (nearer than 50 m and 20 m of height) and each even one passes
-it clear (at 150 to 230 m, or at 63 to 90 m of height); half sink below 30 m above home, half stay above 50 m; half leave
-their geofence, the others turn 40 to 80 m inside it. Every pair of the fleet is judged, also those that never come near.
+In a chain of flights each odd one meets the one before it (nearer than 50 m and 20 m of height) and each even one
+passes it clear (at 150 to 230 m, or at 63 to 90 m of height); half sink below 30 m above home, half stay above 50 m;
+half leave their geofence, the others turn 40 to 80 m inside it. All pairs are judged, also those that never come near.
 Warning time: from the alert to the closest approach, or to the first instant below the height or outside the fence.
 What must never raise an alert does not come to pass for two minutes after the twins' last sample either.
 """
