@@ -25,6 +25,7 @@ from fleet.telemetry.recordings import replay_messages
 from twin_worker.offline import run
 from twin_worker.warm import warm_up
 
+from .pairs import cost
 from .world import END_S, HIGH_M, SAFE_M, STEP_S, WIDE_M, Flight, apart, chain, is_clear, lost_at, make
 
 MUST_S = 30.0
@@ -137,6 +138,7 @@ def main() -> None:
     cost |= {"arranging_s": round(arranged - began, 1)}
     raises = sum(1 for a in alerts if a.active)
     told = {"seed": args.seed, "summary": summary(found), "cost": cost, "raised": raises}
+    told |= {"all_pairs_once_a_second": cost()}
     told |= {"withdrawn": len(alerts) - raises, "by_kind": _by_kind(alerts)}
     print(json.dumps(told, indent=1))
     if args.json:
