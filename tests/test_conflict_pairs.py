@@ -105,7 +105,7 @@ def remade(one: Prediction, **changes) -> Prediction:
     return msgspec.structs.replace(one, **changes)
 
 
-def judged(a: Prediction, b: Prediction, seconds: int = 4) -> list[Alert]:
+def judged(a: Prediction, b: Prediction, seconds: int = 9) -> list[Alert]:
     """What is raised when both predictions are repeated for a while."""
     traffic, out = Traffic(), []
     for one in (a, b):
@@ -177,7 +177,7 @@ def test_predictions_that_cease_withdraw_the_alert() -> None:
 
 def test_a_judge_that_is_asked_often_judges_once_a_second() -> None:
     traffic = Traffic()
-    for one in crossing(0.0, 0.0, 5.0):
+    for one in crossing(0.0, 0.0, 5.0, at=30.0):
         traffic.hear(one)
     assert [traffic.judge(1, T + 0.05 * k) for k in range(40)] == [[]] * 40  # 2 s, and it must last
     assert len(traffic.judge(1, T + 2.0)) == 1
@@ -216,7 +216,7 @@ def test_a_prediction_that_cannot_be_judged_raises_nothing_and_harms_nobody(chan
     traffic, out = Traffic(), []
     for one in (a, b, c):
         traffic.hear(one)
-    for k in range(4):
+    for k in range(9):
         out += traffic.judge(1, T + k) + traffic.judge(3, T + k)
     assert [(x.uav, x.other) for x in out] == [(1, 2)]
 

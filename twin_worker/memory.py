@@ -114,6 +114,7 @@ class Twin:
     checked_t: float = -np.inf  # hybrid last flown over what was held out
     spread_t: float = -np.inf  # ensemble last flown
     achievable_t: float = -np.inf  # mission last judged
+    turning_t: float = np.inf  # since when predictions are a turn rate alone
     lost: bool = False
     stood: Origin | None = None  # where it last stood disarmed
     aloft: bool = False  # it has been above the least height since it was disarmed

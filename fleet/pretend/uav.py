@@ -15,7 +15,7 @@ from fleet.frames import G, Origin, to_geodetic
 from fleet.pretend.jsbsim import Aircraft
 from fleet.pretend.mavlink import MOST_AIRCRAFT, TICK_HZ, Ground, Voice
 from fleet.pretend.mavlink_said import DIALECTS, Flight
-from fleet.pretend.missions import HOME, mission
+from fleet.pretend.missions import HOME, Start, mission
 from fleet.pretend.sensors import Estimate, Sensors, Servos, WindEstimate
 from fleet.pretend.tuning import tuned
 from fleet.pretend.types import TYPES
@@ -41,7 +41,7 @@ class PretendUav:
         origin: Origin = HOME,
         autopilot: str = "ardupilot",
         aircraft: str = "small",
-        items: tuple[Item, ...] = (),
+        plan: tuple[tuple[Item, ...], Start] | None = None,
         more: Mapping[str, float] = MappingProxyType({}),
     ):
         """Put one aircraft in the air.
@@ -54,7 +54,7 @@ class PretendUav:
             origin: home, where the NED frame touches the earth
             autopilot: whose law flies it and whose MAVLink it speaks, ardupilot or px4
             aircraft: name in `types.TYPES`
-            items: mission to fly instead of its own, which begins at the same place and item
+            plan: mission to fly instead of its own, and where on it the aircraft is found
             more: autopilot parameters beside its own
         Raises:
             ValueError: when MAVLink has no system id for it.
@@ -68,8 +68,7 @@ class PretendUav:
         self._kind = kind = TYPES[aircraft]
         self._law = _LAWS[autopilot]
         self._first = legs_of.FIRST.get(autopilot, 1)
-        drawn, start = mission(own, kind.cruise, origin, kind.field, autopilot)
-        self.items = items or drawn
+        self.items, start = plan or mission(own, kind.cruise, origin, kind.field, autopilot)
         self.params = {**tuned(own, autopilot, aircraft), **more}
         self.boot_s = float(rng.uniform(60, 600))  # on the ground before the world began [s]
         self.tick = 0

@@ -15,14 +15,16 @@ class Rule(NamedTuple):
     clear_below: float  # probability below which it is withdrawn
     after_s: float  # how long it must be probable without a break [s]
     ease_s: float  # how long it must be improbable without a break [s]
+    per_s: float = 0.0  # how much longer it must be probable for each second that it lies more than 30 s ahead [-]
 
 
+_NEAR_S = 30.0  # dangers nearer than this are told at once [s]
 RULES = {
     AlertKind.LINK_LOST: Rule(0.5, 0.5, 0.0, 0.0),
     AlertKind.SHORT_HORIZON: Rule(0.9, 0.1, 15.0, 5.0),
-    AlertKind.CONFLICT: Rule(0.25, 0.05, 2.0, 5.0),
-    AlertKind.GROUND: Rule(0.5, 0.2, 2.0, 5.0),
-    AlertKind.GEOFENCE: Rule(0.5, 0.2, 2.0, 5.0),
+    AlertKind.CONFLICT: Rule(0.25, 0.05, 2.0, 5.0, 0.15),
+    AlertKind.GROUND: Rule(0.5, 0.2, 2.0, 5.0, 0.15),
+    AlertKind.GEOFENCE: Rule(0.5, 0.2, 2.0, 5.0, 0.15),
     AlertKind.NOT_ACHIEVABLE: Rule(0.9, 0.5, 5.0, 5.0),
 }
 
@@ -77,7 +79,7 @@ class Ledger:
             return []
         if entry.since is None or now < entry.since:  # the clock may jump back
             entry.since = now
-        if now - entry.since < (rule.ease_s if entry.alert else rule.after_s):
+        if now - entry.since < (rule.ease_s if entry.alert else _patience(rule, finding, now)):
             return []
         if entry.alert:
             del self._open[about]
@@ -93,6 +95,12 @@ class Ledger:
     def active(self) -> list[Alert]:
         """Give the alerts in force, oldest first."""
         return [entry.alert for entry in tuple(self._open.values()) if entry.alert is not None]
+
+
+def _patience(rule: Rule, found: Finding, now: float) -> float:
+    """Give how long a danger must be probable before it is told [s]: what lies far ahead has time to be borne out."""
+    ahead = found.at - now if found.at is not None else 0.0
+    return rule.after_s + rule.per_s * max(ahead - _NEAR_S, 0.0)
 
 
 def _alert(uav: int, now: float, found: Finding, *, active: bool) -> Alert:

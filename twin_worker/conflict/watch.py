@@ -17,6 +17,7 @@ from twin_worker.rotor import RETURN_MODES
 _SHORT_S, _LONG_S = 10.0, 12.0  # confidence horizon below which an alert is raised, above which it is withdrawn [s]
 _TOLD = 30  # past predictions below which the 90 % horizon is the prior's word, not this aircraft's [-]
 _TURNING_S = 15.0  # a turn rate alone says nothing of ground and fence farther ahead [s]
+_BETTER_S = 20.0  # on a mission a turn rate is judged only where nothing better came for so long [s]
 _ACHIEVABLE_EVERY_S = 5.0
 _LANDING = (21, 85, 189)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND, DO_LAND_START
 _RETURN, _LAST_NAV = 20, 95  # MAV_CMD
@@ -33,9 +34,12 @@ def watch(twin: Twin, now: float, made: Prediction | None) -> list[Alert]:
     """Judge the newest prediction at data time `now`; None where none could be made."""
     flight = forecast(made) if made is not None else None
     _remember_ground(twin)
+    if flight is None or flight.made.method != "imm" or not now >= twin.turning_t:
+        twin.turning_t = now
     findings = [_unknown(kind) for kind in (AlertKind.GROUND, AlertKind.GEOFENCE)]
     if flight is not None:
-        findings = _dangers(twin, flight)
+        guess = flight.made.method == "imm" and not twin.why_no_route() and now - twin.turning_t < _BETTER_S
+        findings = [] if guess else _dangers(twin, flight)
     if not twin.lost:
         findings.append(_trust(made))
         if not twin.achievable_t <= now < twin.achievable_t + _ACHIEVABLE_EVERY_S:
@@ -115,8 +119,10 @@ def _mission(twin: Twin, now: float) -> Finding:
     if twin.vehicle not in WINGS or twin.why_no_route() or hangs(twin) or not len(position):
         return nothing
     assert twin.origin is not None and twin.mission is not None
+    if twin.mission.seq < 1:
+        return nothing
     p = to_ned(twin.origin, *position[-1:].T)[0]
-    way = route(twin.mission.items, seq=max(twin.mission.seq, 1), origin=twin.origin, params=_params(twin), limit=16)
+    way = route(twin.mission.items, seq=twin.mission.seq, origin=twin.origin, params=_params(twin), limit=16)
     wind = np.array([*twin.wind.wind[:2], twin.wind.sigma])
     return achievable(Now(now, p, twin.origin, wind, way), ability(_params(twin), position[-1, 2] * 1e-3))
 

@@ -25,15 +25,15 @@ from fleet.telemetry.recordings import replay_messages
 from twin_worker.offline import run
 from twin_worker.warm import warm_up
 
-from .pairs import cost
 from .world import END_S, HIGH_M, SAFE_M, STEP_S, WIDE_M, Flight, apart, chain, is_clear, lost_at, make
 
 MUST_S = 30.0
+KNOWN_S = 60.0  # what happens before so much was heard is listed apart [s]
 
 
 def heard(flights: list[Flight], seed: int, loss: float) -> tuple[list[Alert], dict[str, Any]]:
     """Fly all into one recording, and let the twins hear it: their alerts, and what that cost."""
-    uavs = [make(one.told, seed, one.items, one.origin, one.radius) for one in flights]
+    uavs = [make(one.told, one.plan, one.radius) for one in flights]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "fleet.tlog"
         to_tlog(path, uavs, seconds=END_S, loss=loss, seed=seed)
@@ -106,6 +106,8 @@ def summary(found: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for name, rows in found.items():
         if name in ("met", "sank", "left"):
+            early = [one for one in rows if one["event_s"] < KNOWN_S]
+            rows = [one for one in rows if one["event_s"] >= KNOWN_S]
             warned = [one["warning_s"] or 0.0 for one in rows]
             out[name] = {
                 "cases": len(rows),
@@ -113,11 +115,14 @@ def summary(found: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
                 "least_s": min(warned, default=None),
                 "median_s": float(np.median(warned)) if warned else None,
                 "alerts": sum(len(one["alerts_s"]) for one in rows),
+                "before_60_s": len(early),
             }
         else:
             out[name] = {"cases": len(rows), "alerted": sum(bool(one["alerts_s"]) for one in rows)}
-    near = [one for one in found["clear"] if one["arranged"]]
-    out["clear_arranged"] = {"cases": len(near), "alerted": sum(bool(one["alerts_s"]) for one in near)}
+    for name in found.keys() & {"met", "clear"}:
+        near = {name: [one for one in found[name] if one["arranged"]]}
+        if len(near[name]) < len(found[name]):
+            out[f"{name}_arranged"] = summary(near)[name]
     return out
 
 
