@@ -62,6 +62,14 @@ class Bus(AbstractContextManager, Protocol):
             ConnectionError: when the session is closed; join the router again.
         """
 
+    def inquire(self, kind: type[M], who: int, payload: bytes, timeout_s: float = 5.0) -> tuple[M, Stamp | None] | None:
+        """Ask about one aircraft with a payload; None where nobody answers.
+
+        Raises:
+            ValueError: when every answer is a refusal; in the words of the one who refused.
+            ConnectionError: when the session is closed; join the router again.
+        """
+
     def present(self, name: str) -> None:
         """Say that this process lives, until it does not: a liveliness token at `parauav/@live/{name}`."""
 
@@ -144,6 +152,12 @@ class MemoryBus(AbstractContextManager):
                 continue  # a refusal; on Zenoh it travels as an error reply, which `ask` leaves out
             found += [(decode(kind, encode(message), encoding(kind)), stamp) for message, stamp in answers]
         return newest(found)
+
+    def inquire(self, kind: type[M], who: int, payload: bytes, timeout_s: float = 5.0) -> tuple[M, Stamp | None] | None:
+        """Ask about one aircraft with a payload; a refusal is raised as it is."""
+        answers = [pair for reply in self._reply.get(kind, []) for pair in asked_for(who, reply(who, {}, payload))]
+        found = newest([(decode(kind, encode(message), encoding(kind)), stamp) for message, stamp in answers])
+        return found[0] if found else None
 
     def present(self, name: str) -> None:
         """Need nothing: a process knows that it lives."""
@@ -229,17 +243,33 @@ class ZenohBus(AbstractContextManager):
 
     def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
         """Ask everyone for a class; the highest epoch per aircraft is kept."""
+        return self._answers(kind, self._replies(key(kind, who), timeout_s))
+
+    def inquire(self, kind: type[M], who: int, payload: bytes, timeout_s: float = 5.0) -> tuple[M, Stamp | None] | None:
+        """Ask about one aircraft with a payload; a refusal that nobody contradicts is raised."""
+        replies = self._replies(key(kind, who), timeout_s, payload)
+        found = self._answers(kind, replies)
+        refused = [reply.err.payload.to_bytes().decode(errors="replace") for reply in replies if reply.err is not None]
+        if not found and refused:
+            raise ValueError(refused[0])
+        return found[0] if found else None
+
+    def _replies(self, name: str, timeout_s: float, payload: bytes | None = None) -> list[zenoh.Reply]:
         try:
             replies = self._session.get(
-                key(kind, who),
+                name,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,
+                payload=payload,
             )
+            return list(replies)
         except zenoh.ZError as error:
             raise ConnectionError(
-                f"bus: asking on {key(kind, who)} failed ({error}), expected an open session; join the router again"
+                f"bus: asking on {name} failed ({error}), expected an open session; join the router again"
             ) from None
+
+    def _answers(self, kind: type[M], replies: list[zenoh.Reply]) -> list[tuple[M, Stamp | None]]:
         pairs = [self._read(kind, reply.ok) for reply in replies if reply.ok is not None]
         return newest([pair for pair in pairs if pair is not None])
 

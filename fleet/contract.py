@@ -281,6 +281,55 @@ class State(StrEnum):
     LINK_LOST = "link_lost"
 
 
+class Controller(msgspec.Struct, frozen=True, kw_only=True):
+    """The law a prediction is flown by and the parameters that matter to it, apart by how each is known.
+
+    Names and units are the autopilot's.
+    """
+
+    law: Annotated[str, Meta(description="e.g. arduplane: L1 + TECS")]
+    received: Annotated[dict[str, float], Meta(description="told by the autopilot")] = {}
+    identified: Annotated[dict[str, float], Meta(description="not told; learnt from flight")] = {}
+    default: Annotated[dict[str, float], Meta(description="not told, not learnt; the autopilot's default assumed")] = {}
+    asked: Annotated[dict[str, float], Meta(description="what-if only: as the question has it")] = {}
+
+
+class Event(StrEnum):
+    """What began the present prediction anew, or what it coasts through; `Prediction.event_said` has the details."""
+
+    MODE = "mode"
+    MISSION = "mission"
+    PARAMETERS = "parameters"
+    TAKE_OFF = "take_off"
+    LANDING = "landing"
+    TOUCH_DOWN = "touch_down"
+    LINK_LOST = "link_lost"
+    LINK_BACK = "link_back"
+    HORIZON_OVER = "horizon_over"
+    TELEMETRY_BROKEN = "telemetry_broken"
+    TELEMETRY_WHOLE = "telemetry_whole"
+    CLOCK = "clock"
+    ORIGIN = "origin"
+
+
+SENTENCES: dict[Event, str] = {
+    Event.MODE: "another flight mode: what was predicted before is void",
+    Event.MISSION: "another mission on board: what was predicted before is void",
+    Event.PARAMETERS: "the autopilot flies with other parameters: what was predicted before is void",
+    Event.TAKE_OFF: "it has taken off: predictions on the route begin",
+    Event.LANDING: "it is landing: flare and touch-down are not predicted",
+    Event.TOUCH_DOWN: "it is on the ground: predictions on the route end",
+    Event.LINK_LOST: "the link is lost: the twin flies on from the last good state",
+    Event.LINK_BACK: "the link is back: the twin flies from telemetry again",
+    Event.HORIZON_OVER: "the confidence horizon is over: nothing more is claimed until telemetry returns",
+    Event.TELEMETRY_BROKEN: "positions have stopped while other telemetry comes: the twin flies on from the last one",
+    Event.TELEMETRY_WHOLE: "positions come again: the twin flies from telemetry again",
+    Event.CLOCK: "the aircraft's clock has jumped: what was learnt on the old time is forgotten",
+    Event.ORIGIN: "the origin of the local frame has moved to the aircraft",
+}
+"""One sentence for each event."""
+
+
 class Prediction(Message, frozen=True, kw_only=True):
     """Where one aircraft will be, and how far to trust that."""
 
@@ -314,10 +363,44 @@ class Prediction(Message, frozen=True, kw_only=True):
     coast_s: Annotated[float, Meta(description="time flown by the twin alone since the last sample [s]")] = 0.0
     seq: Annotated[int, Meta(description="mission item the prediction starts on; -1 none")] = -1
     sentence: Annotated[str, Meta(description="what limits this prediction, or empty")] = ""
+    event: Annotated[Event | None, Meta(description="what last made it begin anew, or what it coasts through")] = None
+    event_t: Annotated[float, Meta(description="when that was; 0 never [s since 1970]")] = 0.0
+    event_said: Annotated[str, Meta(description="the event's sentence, with its particulars")] = ""
+    controller: Annotated[
+        Controller | None,
+        Meta(description="law and parameters in force; null: as last told. Told on change, every 10 s, to queries"),
+    ] = None
 
     def ned_origin(self) -> Origin:
         """Give the origin as a named tuple."""
         return Origin(*self.origin)
+
+
+class WhatIfStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where a what-if begins; heading and speed stay as they are where they are not given."""
+
+    lat_e7: Annotated[int, Meta(description="[1e-7 deg]")]
+    lon_e7: Annotated[int, Meta(description="[1e-7 deg]")]
+    alt_mm: Annotated[int, Meta(description="[mm above mean sea level]")]
+    heading: Annotated[float | None, Meta(description="of the nose, clockwise from north [rad]")] = None
+    speed: Annotated[float | None, Meta(description="through the air; of a multirotor over ground [m/s]")] = None
+
+
+class WhatIf(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Payload of a query on `parauav/{uav}/prediction`: what to fly otherwise from now on. Changes no aircraft."""
+
+    items: Annotated[
+        tuple[Item, ...] | None, Meta(description="another mission, numbered as the autopilot does, at most 1,000")
+    ] = None
+    seq: Annotated[
+        int | None, Meta(description="item to fly to first; null: the first of `items`, or the one in force")
+    ] = None
+    speed: Annotated[
+        float | None, Meta(description="airspeed wherever the mission commands none else or one [m/s]")
+    ] = None
+    start: WhatIfStart | None = None
+    wind: Annotated[tuple[float, float] | None, Meta(description="north, east, where it blows to [m/s]")] = None
+    params: Annotated[dict[str, float], Meta(description="parameters, in the autopilot's names and units")] = {}
 
 
 class Mismatch(Message, frozen=True, kw_only=True):
@@ -423,4 +506,5 @@ class Account(msgspec.Struct, frozen=True, kw_only=True):
 
 PER_UAV: tuple[type[Message], ...] = (Sample, Status, Mission, Params, Model, Prediction, Mismatch, Alert)
 CONTROL: tuple[type, ...] = (FleetState, Account)
+QUERIES: dict[type, type] = {Prediction: WhatIf}  # what a query on a key may carry
 TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}  # type: ignore[attr-defined]

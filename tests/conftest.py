@@ -10,9 +10,10 @@ from pathlib import Path
 import flights
 import pytest
 
-from fleet.bus import open_router
+from fleet.bus import MemoryBus, open_router
 from fleet.contract import Message
 from twin_worker.twin import Twin
+from twin_worker.worker import Held, Worker
 
 ROOT = Path(__file__).resolve().parent.parent
 LONG_FILES = pytest.StashKey[list[str]]()
@@ -89,3 +90,20 @@ def flown(tmp_path_factory) -> tuple[Twin, list[Message]]:
 def twin(flown) -> Twin:
     """A copy of that twin, to do anything with."""
     return copy.deepcopy(flown[0])
+
+
+@pytest.fixture(params=["dynamics", "greybox"])
+def winged(request, twin) -> Twin:
+    """The same, with its model and without."""
+    if request.param == "greybox":
+        twin.plant = None
+    return twin
+
+
+@pytest.fixture
+def holder(twin) -> Worker:
+    """A worker that holds that twin, on a bus in memory."""
+    worker = Worker(MemoryBus(), range(1, 5), omega=0.0)
+    worker.listen()
+    worker._held[1] = Held(twin, epoch=9)
+    return worker

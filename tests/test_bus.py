@@ -153,6 +153,20 @@ def test_a_refusal_does_not_silence_the_others(pair: Pair) -> None:
     assert asked(pair.here, Prediction, "*") == [(about(4), STAMP)]
 
 
+def test_a_question_with_a_payload_is_answered_or_refused_in_words(pair: Pair) -> None:
+    def reply(uav: int | None, _: dict[str, str], payload: bytes) -> list[tuple[Prediction, Stamp | None]]:
+        if payload == b"odd":
+            raise ValueError("what if: found odd, expected even; correct it")
+        return [(about(uav or 0), STAMP)] if payload == b"even" else []
+
+    pair.there.answer(Prediction, reply)
+    heard: SimpleQueue = SimpleQueue()
+    assert told(heard, lambda: heard.put(found) if (found := pair.here.inquire(Prediction, 4, b"even")) else None)
+    with pytest.raises(ValueError, match="^what if: found odd, expected even; correct it$"):
+        pair.here.inquire(Prediction, 4, b"odd")
+    assert pair.here.inquire(Prediction, 4, b"nobody knows") is None
+
+
 def test_control_messages_are_answered_by_every_process(pair: Pair) -> None:
     pair.there.answer(FleetState, lambda *_: [(EXAMPLES[FleetState], None)])
     pair.here.answer(FleetState, lambda *_: [(EXAMPLES[FleetState], None)])

@@ -14,20 +14,21 @@ import pytest
 from conftest import ROOT, unused_port
 
 from fleet import cli
-from fleet.bus import ROUTER, connect, open_router
+from fleet.bus import ROUTER, Answer, MemoryBus, connect, open_router
 from fleet.codec import Stamp
 from fleet.contract import Array, Prediction, State
 from gateway import __main__ as gateway
 from twin_worker import __main__ as twin_worker
+from twin_worker.worker import Worker
 from viewer import __main__ as viewer
 
 README = (ROOT / "README.md").read_text()
 MAINS = {"fleet": cli.main, "gateway": gateway.main, "twin_worker": twin_worker.main, "viewer": viewer.main}
 
 
-def tool() -> str:
-    (code,) = re.findall(r"^```python\n(.*?)^```", README, re.M | re.S)
-    return code
+def tools() -> list[str]:
+    """The foreign tools: who will be where, and what if."""
+    return re.findall(r"^```python\n(.*?)^```", README, re.M | re.S)
 
 
 def answers(*_: object) -> Iterator[tuple[Prediction, Stamp]]:
@@ -48,34 +49,50 @@ def answers(*_: object) -> Iterator[tuple[Prediction, Stamp]]:
         yield prediction, Stamp(epoch, 1)
 
 
-def test_the_foreign_tool_prints_where_everyone_will_be(tmp_path: Path) -> None:
+def run_tool(code: str, folder: Path, reply: Answer) -> list[str]:
+    """Run a foreign tool against a bus where predictions are answered by `reply`; give what it prints."""
     where = f"tcp/127.0.0.1:{unused_port()}"
-    script = tmp_path / "tool.py"
-    assert ROUTER in tool()
-    script.write_text(tool().replace(ROUTER, where))
+    script = folder / "tool.py"
+    assert ROUTER in code
+    script.write_text(code.replace(ROUTER, where))
     router = open_router(where)
     try:
         with connect(where) as bus:
-            bus.answer(Prediction, answers)
+            bus.answer(Prediction, reply)
             env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
             command = [sys.executable, "-I", "-W", "error", str(script)]
-            done = subprocess.run(
-                command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60, check=False
-            )
+            done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=60, check=False)
     finally:
         router.close()
-    origin = "above [470000000, 80000000, 500000]"
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.splitlines() == [
+    return done.stdout.splitlines()
+
+
+def test_the_foreign_tool_prints_where_everyone_will_be(tmp_path: Path) -> None:
+    origin = "above [470000000, 80000000, 500000]"
+    assert run_tool(tools()[0], tmp_path, answers) == [
         f"uav 3: 600.0 m north, 0.0 m east, 130.0 m {origin}; horizon 13.0 s",
         f"uav 7: 0.0 m north, 450.0 m east, 100.0 m {origin}; horizon 17.0 s",
     ]
 
 
-def test_the_foreign_tool_needs_two_packages_and_ten_lines() -> None:
-    imported = re.findall(r"^import (.*)", tool(), re.M)
-    assert imported == ["struct, msgpack, zenoh"]
-    assert len(tool().splitlines()) <= 10
+def test_a_foreign_tool_asks_what_if(tmp_path: Path, holder: Worker) -> None:
+    seven = Worker(MemoryBus(), range(7, 8), omega=0.0)
+    (held,) = holder.holding()
+    held.twin.uav = 7
+    seven._held[7] = held
+    (line,) = run_tool(tools()[1], tmp_path, seven._predictions)
+    assert line.startswith("what if it flew at 18 m/s, the wind blew 3 m/s north and -1 east, NAVL1_PERIOD were 25")
+    assert line.endswith("{'NAVL1_PERIOD': 25.0, 'AIRSPEED_CRUISE': 18.0}")
+    (refused,) = run_tool(tools()[1].replace("18.0", "-18.0"), tmp_path, seven._predictions)
+    assert refused == "what if: speed: found -18.0 m/s, expected above 0 to 300; correct it"
+
+
+def test_the_foreign_tools_need_two_packages_and_ten_lines() -> None:
+    assert len(tools()) == 2
+    for code in tools():
+        assert re.findall(r"^import (.*)", code, re.M) == ["struct, msgpack, zenoh"]
+        assert len(code.splitlines()) <= 10
 
 
 def commands() -> list[str]:

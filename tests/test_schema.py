@@ -7,7 +7,7 @@ import pytest
 
 from fleet import cli
 from fleet.commands import doctor
-from fleet.contract import COLUMNS, TOPICS, Prediction
+from fleet.contract import COLUMNS, TOPICS, Prediction, WhatIf
 
 
 def shown(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
@@ -45,6 +45,8 @@ def test_json_is_strict_and_complete(capsys: pytest.CaptureFixture[str]) -> None
     prediction = described["prediction"]
     assert prediction["key"] == "parauav/{uav}/prediction" and "epoch u64" in prediction["attachment"]
     assert set(prediction["components"]["Prediction"]["properties"]) == set(Prediction.__struct_fields__)
+    assert prediction["query"] == {"$ref": "#/$defs/WhatIf"} and described["model"]["query"] is None
+    assert set(prediction["components"]["WhatIf"]["properties"]) == set(WhatIf.__struct_fields__)
     assert list(described["sample"]["columns"]) == list(COLUMNS) and described["sample"]["attachment"] is None
 
 

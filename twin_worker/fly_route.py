@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from fleet.autopilots import arduplane
 from fleet.window import Window
 from twin_worker.horizon import AHEAD
 from twin_worker.hybrid import ensemble
@@ -39,7 +38,7 @@ def fly_route(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
     _spread(twin, (now, start))
     chosen = twin.contest.best(tuple(paths))
     sentence = " ".join(filter(None, (twin.contest.said(chosen), start.sentence)))
-    return Flight(paths[chosen], chosen, arduplane.LAW, start.seq, sentence)
+    return Flight(paths[chosen], chosen, start.law.law, start.seq, sentence, start.law)
 
 
 def _paths(
@@ -77,7 +76,8 @@ def _lengthened(path: np.ndarray, further: np.ndarray) -> np.ndarray:
 def _spread(twin: Twin, begin: tuple[Situation, Start]) -> None:
     """Fly the ensemble where it is due."""
     t = float(begin[1].good.t[-1])
-    if twin.hybrid is None or twin.spread_t <= t < twin.spread_t + _SPREAD_S:
+    known = twin.spread_t <= t < twin.spread_t + _SPREAD_S and twin.instead is None
+    if twin.hybrid is None or known:
         return
     rng = np.random.default_rng((twin.uav, int(t)))
     twin.spread, twin.spread_t = ensemble.spread(*begin, twin.hybrid, AHEAD, rng), t

@@ -6,8 +6,9 @@ import msgspec
 import numpy as np
 
 from fleet.autopilots import arduplane
-from fleet.contract import Array, Message, Prediction, State
+from fleet.contract import Array, Controller, Message, Prediction, State
 from twin_worker.calibration.groups import airframe_class, group_of
+from twin_worker.control import Control
 from twin_worker.fly_route import fly_route, in_force
 from twin_worker.horizon import AHEAD, QUANTILE, Made, Trust
 from twin_worker.imm import turn_on
@@ -18,6 +19,7 @@ from twin_worker.track import Track
 
 _LOOK_BACK_S = 62.0  # telemetry a prediction starts from [s]
 _COAST_S = 120.0  # the twin flies on alone for as long; then its last prediction ages [s]
+_TELL_S = 10.0  # between laws and parameters that are no news [s]
 _STALE_S = 3.0  # positions older than other telemetry by more say nothing of now [s]
 _MISSED = 2  # autopilot parameters that may be lacking where they count as known [-]
 _IMM_LAW = "none: turn rate only"
@@ -48,10 +50,26 @@ def foresee(twin: Twin, now: float) -> list[Message]:
     trust = twin.record.trust(guess)
     prediction = _trusted(twin, guess, trust)
     said = " ".join(part for part in (f"link lost {coast:.0f} s ago" if twin.lost else "", made.sentence) if part)
-    twin.prediction = msgspec.structs.replace(prediction, seq=made.seq, sentence=said, coast_s=coast, law=made.law)
+    twin.prediction = msgspec.structs.replace(
+        prediction,
+        seq=made.seq,
+        sentence=said,
+        coast_s=coast,
+        law=made.law,
+        controller=_controller(twin, made, now),
+    )
     if not twin.lost:
         twin.record.keep(guess, trust)
     return [twin.prediction]
+
+
+def _controller(twin: Twin, made: Flight, now: float) -> Controller | None:
+    """Give the law and parameters in force where they are news, or were told long ago."""
+    control = made.control or Control(made.law)
+    if control == twin.control and twin.control_t <= now < twin.control_t + _TELL_S:
+        return None
+    twin.control, twin.control_t = control, now
+    return control.wire()
 
 
 def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:

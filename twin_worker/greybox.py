@@ -15,8 +15,10 @@ from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.shadow import shadow
 from fleet.contract import Item
 from fleet.frames import G, Origin
-from fleet.mission import KIND, TAKEOFF, VA_C, route
+from fleet.mission import KIND, TAKEOFF, VA_C, Route, route
+from twin_worker.control import Control, on_wings
 from twin_worker.track import STEP, Track
+from twin_worker.whatif.instead import Instead, gone_over
 
 LEAST_S = 5.0  # shortest track on this route [s]
 _SYNC_S = 60.0  # flight the guidance is synchronised on [s]
@@ -25,6 +27,7 @@ _PERIODS = (9.0, 12.0, 16.0, 20.0, 26.0)  # NAVL1_PERIOD tried where it is not k
 _LAGS = (0.4, 0.8, 1.4)  # bank lags tried [s]
 _SPEED_S = 20.0  # airspeed is the mean over as much [s]
 _SLOWEST = 5.0  # a wing flies no slower [m/s]
+CRUISE = "AIRSPEED_CRUISE"
 _RIDGE = 5.0  # usual wind, before it is seen [m/s]
 
 
@@ -37,6 +40,11 @@ class Grey:
     miss: float = float("nan")
     starts: int = 0
 
+    @property
+    def identified(self) -> dict[str, float]:
+        """Give what flight has told, by the autopilot's names."""
+        return {"NAVL1_PERIOD": self.period} if self.period > 0 else {}
+
 
 @dataclass(frozen=True)
 class Board:
@@ -47,6 +55,7 @@ class Board:
     since: float
     origin: Origin
     wind: np.ndarray | None  # NED, (3,) [m/s]; None: no airspeed was ever received
+    instead: Instead | None = None  # what a what-if flies from the start on
 
 
 @dataclass(frozen=True)
@@ -56,6 +65,7 @@ class Ahead:
     path: np.ndarray | None
     seq: int
     sentence: str
+    law: Control | None = None
 
 
 def air_of(track: Track, wind: np.ndarray | None) -> tuple[np.ndarray, float]:
@@ -98,9 +108,8 @@ def fly(track: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
 
 
 def _fly(seen: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarray) -> Ahead:
-    par, absent = arduplane.parameters(board.params, board.origin.alt_mm * 1e-3 - float(seen.p[-1, 2]))
-    if grey.period > 0:
-        par[P.PERIOD] = grey.period
+    law_now = on_wings(board.params, grey.identified, law=law.LAW)
+    par = law_now.par(_altitude(seen, board))
     way = route(board.items, seq=int(seq[0]), origin=board.origin, params=board.params)
     if not len(way.legs):
         return Ahead(None, int(seq[-1]), " ".join(way.sentences) or "the mission has no legs to fly")
@@ -109,13 +118,48 @@ def _fly(seen: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
         return Ahead(None, int(seq[-1]), "too slow to fly on wings")
     start = way.start if np.isfinite(way.start).all() else seen.p[0]
     ctl = _synchronised(seen, seq, (par, way.legs, start), w)
-    now = int(ctl[arduplane.LEG])
-    if int(way.legs[now, KIND]) == TAKEOFF:
+    lags = _lags(seen, way.legs[int(ctl[arduplane.LEG])], par, law_now.absent, (grey, V))
+    flown = _Course(ctl, par, way, lags, law_now)
+    if board.instead is not None:
+        flown = _otherwise(flown, seen, board, grey, board.instead)
+    if not len(flown.way.legs):
+        return Ahead(None, int(seq[-1]), " ".join(flown.way.sentences) or "the mission has no legs to fly")
+    if int(flown.way.legs[int(flown.ctl[arduplane.LEG]), KIND]) == TAKEOFF:
         return Ahead(None, int(seq[-1]), "take-off is not modelled: no route-aware prediction")
-    out = np.empty((int(ahead[-1] / STEP) + 2, 3))
-    law.follow(ctl, par, way.legs, _lags(seen, way.legs[now], par, absent, (grey, V)), _state(seen, w), w, STEP, out)
+    state, out = _state(seen, w), np.empty((int(ahead[-1] / STEP) + 2, 3))
+    if board.instead is not None and board.instead.speed is not None:
+        state[3] = board.instead.speed
+    law.follow(flown.ctl, flown.par, flown.way.legs, flown.lags, state, w, STEP, out)
     path = np.column_stack([np.interp(ahead, STEP * np.arange(len(out)), column) for column in out.T])
-    return Ahead(path, int(seq[-1]), " ".join(way.sentences))
+    seq_now = int(seq[-1]) if board.instead is None else board.instead.seq
+    return Ahead(path, seq_now, " ".join(flown.way.sentences), flown.law)
+
+
+@dataclass(frozen=True)
+class _Course:
+    """What is flown ahead: state and parameters of the guidance, route, lags, and the law they are of."""
+
+    ctl: np.ndarray
+    par: np.ndarray
+    way: Route
+    lags: np.ndarray
+    law: Control
+
+
+def _altitude(seen: Track, board: Board) -> float:
+    return board.origin.alt_mm * 1e-3 - float(seen.p[-1, 2])
+
+
+def _otherwise(now: _Course, seen: Track, board: Board, grey: Grey, instead: Instead) -> _Course:
+    """Let the synchronised guidance go over to what a what-if flies; its lags and shares stay."""
+    control = on_wings(board.params, grey.identified, instead.asked, law.LAW)
+    way, par, lags = instead.way(board.origin, board.params), control.par(_altitude(seen, board)), now.lags.copy()
+    if CRUISE in instead.asked:
+        lags[law.CRUISE] = par[P.VA_CRUISE] * lags[law.SHARE]
+    ctl = now.ctl
+    if len(way.legs):
+        ctl = gone_over(ctl, now.way.legs, par, way.legs, (instead.anew, seen.p[-1]))
+    return _Course(ctl, par, way, lags, control)
 
 
 def _synchronised(seen: Track, seq: np.ndarray, way: tuple[np.ndarray, ...], w: np.ndarray) -> np.ndarray:
@@ -151,7 +195,7 @@ def _lags(
 ) -> np.ndarray:
     """Give the numbers of the law: lags, and the speeds that were flown of late."""
     grey, V = told
-    known = "AIRSPEED_CRUISE" not in absent
+    known = CRUISE not in absent
     commanded = leg[VA_C] if leg[VA_C] > 0 else par[P.VA_CRUISE] if known else 0.0
     share = V / commanded if commanded > 0 and 0.7 < V / commanded < 1.5 else par[P.EAS2TAS]
     cruise = par[P.VA_CRUISE] * share if known else V

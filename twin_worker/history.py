@@ -69,6 +69,10 @@ class History:
         t, first = np.unique(t, return_index=True)
         return t, x[first]
 
+    def put(self, name: str, t: np.ndarray, x: np.ndarray) -> None:
+        """Have these rows, (n,) and (n, k), instead of all of their kind."""
+        self._chunks[name] = [(t, x, float(t[-1]))] if len(t) else []
+
     def clear(self) -> None:
         """Forget everything, as after a jump of the clock."""
         for chunks in self._chunks.values():

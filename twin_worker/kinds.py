@@ -1,21 +1,25 @@
 """Which kind of twin an aircraft has now, and the route flown by those that need no identified model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleet.autopilots import copter, greybox
+from fleet.contract import Mission
 from twin_worker import greybox as wing
 from twin_worker import rotor, rotor_fit
+from twin_worker.control import Control, on_rotors
 from twin_worker.lift import SETTLE_S, lifted
 from twin_worker.memory import ROUTE_MODES, Twin
 from twin_worker.track import Track, track
+from twin_worker.whatif.instead import Instead
 
 NO_WINGS = ("multirotor", "helicopter")
 QUADPLANE = "quadplane"
 WINGS = ("fixed_wing", QUADPLANE)
 _BACK_S = 130.0  # flight the twin's numbers come from [s]
 _VTOL = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
+_RECENT = 11  # rows that tell a rotor's velocity and acceleration
 _STEERED_S = 6.0  # a multirotor told to hold that still moves after so long is steered by hand [s]
 
 
@@ -28,6 +32,7 @@ class Flight:
         method, law: as in `Prediction`
         seq: mission item it starts on, -1 none
         sentence: what it rests on, or why there is none
+        control: the controller twin it was flown by
     """
 
     path: np.ndarray | None
@@ -35,6 +40,7 @@ class Flight:
     law: str
     seq: int
     sentence: str
+    control: Control | None = None
 
 
 def nothing(sentence: str, seq: int = -1) -> Flight:
@@ -56,7 +62,7 @@ def hangs(twin: Twin) -> bool:
         return False
     now = twin.history.newest
     at = np.linspace(now - SETTLE_S, now, 7)
-    if lifted(at, twin.history, _params(twin), twin.modes).any():
+    if lifted(at, twin.history, twin.received, twin.modes).any():
         return True
     item = _items_now(twin)
     return twin.status is not None and twin.status.mode in ROUTE_MODES and item in _VTOL
@@ -69,22 +75,24 @@ def _items_now(twin: Twin) -> int:
     return next((item.command for item in items if item.seq == seq), 0)
 
 
-def _params(twin: Twin) -> dict[str, float]:
-    return twin.params.values if twin.params else {}
+def _board(twin: Twin, flown: Track, instead: Instead | None = None) -> rotor.Onboard:
+    params, mission, autopilot = twin.received, twin.mission, twin.status.autopilot if twin.status else ""
+    if instead is not None:
+        params = params | dict(instead.asked)
+        mission = Mission(uav=twin.uav, t=twin.history.newest, items=instead.items, seq=instead.seq)
+    board = rotor.onboard(mission, params, autopilot, twin.since, origin=twin.origin, flown=flown, prefix=_prefix(twin))
+    return rotor.with_wings(board) if _prefix(twin) else board
 
 
-def _board(twin: Twin, flown: Track) -> rotor.Onboard:
-    params, autopilot = _params(twin), twin.status.autopilot if twin.status else ""
-    prefix = "Q_" if twin.vehicle == QUADPLANE else ""
-    board = rotor.onboard(twin.mission, params, autopilot, twin.since, origin=twin.origin, flown=flown, prefix=prefix)
-    return rotor.with_wings(board) if prefix else board
+def _prefix(twin: Twin) -> str:
+    return "Q_" if twin.vehicle == QUADPLANE else ""
 
 
 def _wing_board(twin: Twin) -> wing.Board:
     assert twin.origin is not None
     items = twin.mission.items if twin.mission else ()
     wind = twin.wind.wind if np.isfinite(twin.wind.t) else None
-    return wing.Board(items, _params(twin), twin.since, twin.origin, wind)
+    return wing.Board(items, twin.received, twin.since, twin.origin, wind, twin.instead)
 
 
 def compare_with_flight(twin: Twin) -> None:
@@ -113,36 +121,52 @@ def fly_kind(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
     if why := twin.why_no_route():
         return nothing(why)
     if twin.vehicle == QUADPLANE:
-        hung = np.flatnonzero(lifted(whole.t, twin.history, _params(twin), twin.modes))
+        hung = np.flatnonzero(lifted(whole.t, twin.history, twin.received, twin.modes))
         whole = whole.part(int(hung[-1]) + 1 if len(hung) else 0, len(whole))
     seq = rotor.items_in_force(whole.t, twin.history.rows("leg"), twin.mission)
     made = wing.fly(whole, seq, _wing_board(twin), twin.grey, ahead)
     if made.path is None:
         return nothing(made.sentence, made.seq)
-    return Flight(made.path, "greybox", greybox.LAW, made.seq, f"{wing.said(twin.grey)}. {made.sentence}".strip(". "))
+    said = f"{wing.said(twin.grey)}. {made.sentence}".strip(". ")
+    return Flight(made.path, "greybox", greybox.LAW, made.seq, said, made.law)
+
+
+def _at_speed(flown: Track, instead: Instead) -> Track:
+    """Let it have moved of late at the speed that is asked for."""
+    if instead.speed is None:
+        return flown
+    v = flown.v.copy()
+    v[-_RECENT:] = instead.at_speed(v[-1], float(np.nan_to_num(flown.euler[-1, 2])))
+    return replace(flown, v=v)
 
 
 def _fly_rotor(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
     mode = twin.status.mode if twin.status else ""
-    board = _board(twin, flown)
+    board = _board(twin, flown, twin.instead)
+    asked = twin.instead.asked if twin.instead else {}
+    control = on_rotors(twin.received, _prefix(twin), board.limit, asked)
     if twin.status is None or not twin.status.armed:
         return nothing("it is not armed")
     if mode in rotor.HOLD_MODES:
         if twin.history.newest - twin.since > _STEERED_S and np.linalg.norm(flown.v[-20:].mean(axis=0)) > 1.0:
             return nothing(f"mode {mode}, but it is steered by hand")
         still = rotor.hold_still(flown, board, twin.rotor, ahead)
-        return Flight(still, "copter", copter.LAW, -1, f"mode {mode} holds its place")
+        return Flight(still, "copter", copter.LAW, -1, f"mode {mode} holds its place", control)
     if mode in rotor.RETURN_MODES and twin.vehicle in NO_WINGS:
         path = rotor.fly_home(flown, board, twin.rotor, ahead)
         said = f"returns to launch; {rotor.said(board, twin.rotor)}"
-        return Flight(path, "copter", copter.LAW, -1, said) if path is not None else nothing("home is not known")
+        if path is None:
+            return nothing("home is not known")
+        return Flight(path, "copter", copter.LAW, -1, said, control)
     if why := twin.why_no_route():
         return nothing(why)
     seq = rotor.items_in_force(flown.t, twin.history.rows("leg"), twin.mission)
+    if twin.instead is not None:
+        seq[-1], flown = twin.instead.seq, _at_speed(flown, twin.instead)
     if not np.isfinite(seq[-1]):
         return nothing("the mission item in force is not reported (MISSION_CURRENT)")
     path = rotor.fly_route(flown, seq, board, twin.rotor, ahead)
     if path is None:
         return nothing("the mission has nothing to fly", int(seq[-1]))
     hung = "it hangs on its rotors; " if twin.vehicle == QUADPLANE else ""
-    return Flight(path, "copter", copter.LAW, int(seq[-1]), hung + rotor.said(board, twin.rotor))
+    return Flight(path, "copter", copter.LAW, int(seq[-1]), hung + rotor.said(board, twin.rotor), control)

@@ -13,6 +13,7 @@ from fleet.frames import Origin
 from fleet.window import Window
 from twin_worker.conflict.ledger import Ledger
 from twin_worker.contest import Contest
+from twin_worker.control import Control
 from twin_worker.coupled import Coupled
 from twin_worker.earned import Earned
 from twin_worker.greybox import Grey
@@ -24,6 +25,7 @@ from twin_worker.predict import Onboard, Situation
 from twin_worker.preprocess import Grid
 from twin_worker.rotor import Rotor
 from twin_worker.verify import OMEGA
+from twin_worker.whatif.instead import Instead
 from twin_worker.wind import WindFilter
 
 AUTO = "auto"  # every way of flying ahead, the best of them used
@@ -85,6 +87,8 @@ class Twin:
     mission: Mission | None = None
     params: Params | None = None
     servos: ServoMap = field(default_factory=lambda: servo_map({}))
+    identified: dict[str, float] = field(default_factory=dict)  # autopilot parameters learnt from flight
+    instead: Instead | None = None  # what a copy of this twin flies to answer a what-if
     plant: Plant | None = None  # the model in force
     near: Coupled | None = None  # newest coupled model, believed or not: the next search begins there
     last: Coupled | None = None  # newest coupled model believed: it holds the parameters of the next
@@ -99,6 +103,8 @@ class Twin:
     in_force: Verdict | None = None  # the verdict `plant` was believed on
     model: Model | None = None
     prediction: Prediction | None = None
+    control: Control | None = None  # the controller twin that flew it
+    control_t: float = -np.inf  # and when that was last told
     state: State = State.WAITING
     tries: int = 0
     since: float = -np.inf  # last change of mode, mission or parameters
@@ -133,6 +139,11 @@ class Twin:
         return f"{self.in_force.sentence}; newest try: {self.verdict.outcome.value.replace('_', ' ')}"
 
     @property
+    def received(self) -> dict[str, float]:
+        """Give the autopilot parameters received, in its own names and units."""
+        return self.params.values if self.params else {}
+
+    @property
     def vehicle(self) -> str:
         """Give the kind of vehicle its heartbeat names, e.g. fixed_wing."""
         return self.status.vehicle if self.status else "unknown"
@@ -147,7 +158,7 @@ class Twin:
         """Give what a prediction from the end of `window` starts from."""
         assert self.origin is not None
         items = self.mission.items if self.mission else ()
-        onboard = Onboard(items, self.params.values if self.params else {}, self.since)
+        onboard = Onboard(items, self.received, self.since, self.identified, self.instead)
         return Situation(window, self.history, onboard, self.wind, self.origin)
 
     def why_no_route(self) -> str:

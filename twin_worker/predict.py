@@ -4,7 +4,7 @@ Source: Huang 2021, section 3.4 (identical controller, same route, identified mo
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,9 +16,11 @@ from fleet.frames import Origin, wrap
 from fleet.mission import KIND, LAND, TAKEOFF, route
 from fleet.simulate import N_STATE, simulate
 from fleet.window import Window
+from twin_worker.control import Control, on_wings
 from twin_worker.history import History
 from twin_worker.plant import Plant, acting, settled
 from twin_worker.speed import aimed_at, as_told
+from twin_worker.whatif.instead import Instead, gone_over
 from twin_worker.wind import WindFilter
 
 LEAST_AHEAD_S = 60.0  # a flight ahead that ends before is none [s]
@@ -36,12 +38,14 @@ class Flown:
         seq: mission item it starts on
         sentence: what limits it, or empty
         diverged: the twin left its flight envelope
+        law: the controller twin it was flown by
     """
 
     path: np.ndarray | None
     seq: int
     sentence: str
     diverged: bool = False
+    law: Control | None = None
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,7 @@ class Start:
         state: state, commands and inputs in force, and air, as `fleet.simulate` takes them
         seq: mission item in force
         sentence: what limits the flights, or empty
+        law: the controller twin
     """
 
     good: Window
@@ -61,6 +66,7 @@ class Start:
     state: tuple[np.ndarray, np.ndarray, np.ndarray]
     seq: int
     sentence: str
+    law: Control
 
 
 @dataclass(frozen=True)
@@ -68,8 +74,10 @@ class Onboard:
     """What is known of the autopilot: its route and its parameters."""
 
     items: tuple[Item, ...]
-    params: Mapping[str, float]
+    params: Mapping[str, float]  # received
     since: float  # when route, mode and parameters last changed [s since 1970]
+    identified: Mapping[str, float] = field(default_factory=dict)  # learnt from flight; counts where none was received
+    instead: Instead | None = None  # what a what-if flies from the start on
 
 
 @dataclass(frozen=True)
@@ -123,7 +131,8 @@ def set_out(now: Situation) -> Start | Flown:
     if not np.isfinite(seq[-1]):
         return Flown(None, -1, "the mission item in force is not reported (MISSION_CURRENT)")
     seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
-    par, absent = arduplane.parameters(now.onboard.params, now.origin.alt_mm * 1e-3 - float(good.p[-1, 2]))
+    law = on_wings(now.onboard.params, now.onboard.identified)
+    par = law.par(_altitude(now, good))
     way = route(now.onboard.items, seq=int(seq[0]), origin=now.origin, params=now.onboard.params)
     if not len(way.legs):
         return Flown(None, int(seq[-1]), " ".join(way.sentences) or "the mission has no legs to fly")
@@ -131,13 +140,46 @@ def set_out(now: Situation) -> Start | Flown:
     legs = as_told(way.legs, float(seq[-1]), float(par[VA_CRUISE]), told)
     start = way.start if np.isfinite(way.start).all() else good.p[0]
     ctl, _ = shadow(par, legs, start, *_telemetry(good, at, now.history), seq)  # type: ignore[call-arg]
+    begun = Start(good, (ctl, par, legs), _start(now, good), int(seq[-1]), " ".join(way.sentences), law)
+    if now.onboard.instead is not None:
+        begun = _otherwise(now, begun, now.onboard.instead)
+    return _refused(begun) or replace(begun, sentence=" ".join(filter(None, (begun.sentence, _assumed(begun.law)))))
+
+
+def _altitude(now: Situation, good: Window) -> float:
+    return now.origin.alt_mm * 1e-3 - float(good.p[-1, 2])
+
+
+def _otherwise(now: Situation, begun: Start, instead: Instead) -> Start:
+    """Let the synchronised controller go over to what a what-if flies."""
+    law = on_wings(now.onboard.params, now.onboard.identified, instead.asked)
+    way, par = instead.way(now.origin, now.onboard.params), law.par(_altitude(now, begun.good))
+    ctl, _, legs = begun.control
+    if len(way.legs):
+        ctl = gone_over(ctl, legs, par, way.legs, (instead.anew, begun.good.p[-1]))
+    state = begun.state[0].copy()
+    state[3:6] = instead.at_speed(state[3:6])
+    said = " ".join(way.sentences)
+    begun = replace(begun, state=(state, *begun.state[1:]), control=(ctl, par, way.legs))
+    return replace(begun, seq=instead.seq, sentence=said, law=law)
+
+
+def _refused(begun: Start) -> Flown | None:
+    """Say why this is not flown; None where it is."""
+    ctl, _, legs = begun.control
+    if not len(legs):
+        return Flown(None, begun.seq, begun.sentence or "the mission has no legs to fly")
     kind = int(legs[int(ctl[arduplane.LEG]), KIND])
-    if kind in _REFUSED:
-        return Flown(None, int(seq[-1]), f"{_REFUSED[kind]} is not modelled: no route-aware prediction")
-    said = list(way.sentences)
-    if absent:
-        said.append(f"{len(absent)} autopilot parameters not received, defaults assumed ({', '.join(absent[:3])} …)")
-    return Start(good, (ctl, par, legs), _start(now, good), int(seq[-1]), " ".join(said))
+    if kind not in _REFUSED:
+        return None
+    return Flown(None, begun.seq, f"{_REFUSED[kind]} is not modelled: no route-aware prediction")
+
+
+def _assumed(law: Control) -> str:
+    """Say which parameters are the autopilot's defaults because nothing better is known; empty where none is."""
+    absent = law.absent
+    few = f"({', '.join(absent[:3])} …)"
+    return f"{len(absent)} autopilot parameters not received, defaults assumed {few}" if absent else ""
 
 
 def fly_from(start: Start, plant: Plant, ahead: np.ndarray) -> Flown:
@@ -151,7 +193,7 @@ def fly_from(start: Start, plant: Plant, ahead: np.ndarray) -> Flown:
     path = np.column_stack(
         [np.interp(ahead, dt * np.arange(done), column, right=np.nan) for column in out[:done, :3].T]
     )
-    return Flown(path, start.seq, start.sentence)
+    return Flown(path, start.seq, start.sentence, law=start.law)
 
 
 def _on_this_route(window: Window, since: float) -> Window:

@@ -54,6 +54,11 @@ class WindFilter:
         if self._rows < 50 or surprise < _GATE:
             filt.update(ground[:2], H=H)
 
+    def blow(self, t: float, wind: np.ndarray) -> None:
+        """Believe this wind at time `t` [s since 1970], NED, (3,) [m/s]."""
+        self.t = t
+        self._filter.x[2:] = [*wind[:2], *np.zeros(4)]
+
     @property
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Give a, b, mean, drift and gust, north before east, (8,) [-, m/s], and their covariance, (8, 8)."""

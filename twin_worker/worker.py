@@ -1,5 +1,6 @@
 """The live driver: messages from the bus to the twins this worker holds, results back, one line per UAV."""
 
+import copy
 import logging
 import threading
 import time
@@ -15,12 +16,14 @@ from scipy.interpolate import CubicSpline
 from fleet.airframes import GENERIC, Airframe, load
 from fleet.bus import Bus
 from fleet.codec import Stamp
-from fleet.contract import Alert, Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, Status
+from fleet.contract import Alert, Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, Status, WhatIf
 from twin_worker.conflict.separation import Separation
 from twin_worker.conflict.traffic import Traffic
 from twin_worker.horizon import AHEAD
 from twin_worker.memory import AUTO
 from twin_worker.twin import Twin, advance, fleet_row
+from twin_worker.whatif import question
+from twin_worker.whatif.answer import answer
 
 _log = logging.getLogger(__name__)
 _INBOX = 4096  # messages waiting per UAV; the oldest go first and are counted
@@ -38,6 +41,7 @@ class Held:
     arrived: float = float("nan")  # wall time of the newest sample [s, monotonic]
     shed: int = 0
     failed: str = ""  # what went wrong last, a defect of ours
+    lock: threading.Lock = field(default_factory=threading.Lock)  # held while the twin changes, or is copied
 
 
 class Worker:
@@ -141,16 +145,54 @@ class Worker:
                 due = time.monotonic() + _STATE_S
                 self.bus.publish(self.state())
 
-    def _predictions(self, uav: int | None, asked: dict[str, str], _: bytes) -> Iterator[tuple[Prediction, Stamp]]:
+    def _predictions(self, uav: int | None, asked: dict[str, str], payload: bytes) -> Iterator[tuple[Any, Stamp]]:
         grid = wanted(asked)
-        found = ((held, held.twin.prediction) for held in self._asked(uav))
+        if payload:
+            supposed = self._supposed(uav, question.read(payload))
+            return self._stamped((held, resample(made, grid)) for held, made in supposed)
+        found = ((held, told(held.twin)) for held in self._asked(uav))
         return self._stamped((held, made and resample(made, grid)) for held, made in found)
+
+    def _supposed(self, uav: int | None, asked: WhatIf) -> list[tuple[Held, Prediction]]:
+        """Let a copy of one twin fly what a query supposes.
+
+        Raises:
+            ValueError: when it names no single aircraft, or this one cannot be flown so.
+        """
+        if uav is None:
+            raise ValueError("what if: found a query for every aircraft, expected one; ask e.g. parauav/7/prediction")
+        return [(held, suppose(held, asked)) for held in self._asked(uav)]
 
     def _asked(self, uav: int | None) -> list[Held]:
         return [held for held in self.holding() if uav in (None, held.twin.uav)]
 
     def _stamped(self, pairs: Iterable[tuple[Held, Any]]) -> Iterator[tuple[Any, Stamp]]:
         return ((message, Stamp(held.epoch, self.bus.writer)) for held, message in pairs if message is not None)
+
+
+def suppose(held: Held, asked: WhatIf) -> Prediction:
+    """Copy the twin between two messages and let the copy answer, on the asker's thread.
+
+    Raises:
+        ValueError: when it cannot answer; the sentence says why.
+    """
+    with held.lock:
+        twin = copy.deepcopy(held.twin)
+    try:
+        return answer(twin, asked)
+    except ValueError:
+        raise
+    except Exception as error:  # a defect met by a question must not stop the answers
+        _log.exception("%s: a what-if failed", twin.name)
+        raise ValueError(f"what if: {twin.name} met a defect ({error}), expected a prediction; report it") from None
+
+
+def told(twin: Twin) -> Prediction | None:
+    """Give the newest prediction with the law and parameters it was flown by; None before any."""
+    made, control = twin.prediction, twin.control
+    if made is None or control is None or made.controller is not None:
+        return made
+    return msgspec.structs.replace(made, controller=control.wire())
 
 
 def data_time(held: Held) -> float:
@@ -164,11 +206,13 @@ def _advance_all(held: Held, messages: list[Message], traffic: Traffic) -> Itera
     """Turn the loop after every message, as offline; the wall clock turns it on where data have fallen silent."""
     twin = held.twin
     for message in messages:
-        results = advance(twin, (message,))
+        with held.lock:
+            results = advance(twin, (message,))
         yield from traffic.after(twin.uav, twin.turned_t, results)
     now = data_time(held)
     if not messages and now > twin.history.newest:  # a worker that is late hears no silence
-        results = advance(twin, (), now)
+        with held.lock:
+            results = advance(twin, (), now)
         yield from traffic.after(twin.uav, twin.turned_t, results)
 
 

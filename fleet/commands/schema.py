@@ -13,7 +13,7 @@ import msgspec
 
 from fleet.bus import key
 from fleet.codec import encoding
-from fleet.contract import COLUMNS, PER_UAV, TOPICS, Sample
+from fleet.contract import COLUMNS, PER_UAV, QUERIES, TOPICS, Sample
 
 EXAMPLES = """
   fleet schema                        every key in one table
@@ -61,11 +61,13 @@ def summary(kind: type) -> str:
 
 def as_json(kind: type) -> dict[str, Any]:
     """Describe a class for a machine: how to find it, how to read it, what is in it."""
-    (schema,), components = msgspec.json.schema_components([kind])
+    payload = QUERIES.get(kind)
+    (schema, *asked), components = msgspec.json.schema_components([kind, *filter(None, [payload])])
     described = {
         "key": wire_key(kind),
         "encoding": encoding(kind),
         "attachment": ATTACHMENT if topic_of(kind) in STAMPED else None,
+        "query": asked[0] if asked else None,
         "schema": schema,
         "components": components,
     }
@@ -79,6 +81,8 @@ def as_text(kind: type) -> str:
     lines = [f"{wire_key(kind)}   {summary(kind)}", f"  encoding    {encoding(kind)}"]
     if topic_of(kind) in STAMPED:
         lines.append(f"  attachment  {ATTACHMENT}")
+    if kind in QUERIES:
+        lines.append(f"  query       may carry a {QUERIES[kind].__name__}, a msgpack map")
     lines += fields_of(kind)
     for part in parts_of(kind):
         lines += ["", f"  {part.__name__}: {summary(part)}"]
@@ -142,4 +146,5 @@ def parts_of(kind: type) -> list[type]:
                     walk(inner)
 
     walk(kind)
+    walk(QUERIES.get(kind))
     return found[1:]

@@ -17,6 +17,7 @@ from twin_worker.twin import Twin, advance, silence
 
 STAND_IN = "imm"  # predicts where another method cannot
 _LOOK_BACK_S = 62.0  # telemetry the simpler methods see [s]
+_SAME_S = 0.01  # what begins farther apart are two predictions [s]
 
 
 @dataclass(frozen=True)
@@ -157,6 +158,7 @@ def _start(one: Examined, made: Prediction, plan: Plan) -> None:
             path = None if fallback is None else Told(fallback, STAND_IN)
         if path is not None:
             told[name] = path
+    group, spread = _kept(twin, made, ahead)
     one.asked.append(
         Asked(
             flight=one.flight,
@@ -167,9 +169,9 @@ def _start(one: Examined, made: Prediction, plan: Plan) -> None:
             origin=twin.origin,
             speed=float(np.linalg.norm(flown.v[-1])),
             follows=twin.why_no_route(),
-            group=_group(twin, made),
+            group=group,
             told=told,
-            spread=_spread(twin, made, ahead),
+            spread=spread,
         )
     )
 
@@ -200,16 +202,11 @@ def _paper(one: Examined, made: Prediction, ahead: np.ndarray) -> Told | None:
     return _told(found[-1], ahead, made.t) if found else None
 
 
-def _group(twin: Twin, made: Prediction) -> str:
-    """Name what shares a calibration: method / law / vehicle / parameters."""
-    known = "known" if twin.params is not None and twin.params.values else "absent"
-    return "/".join((made.method, made.law.partition(":")[0] or "none", twin.vehicle, known))
-
-
-def _spread(twin: Twin, made: Prediction, ahead: np.ndarray) -> np.ndarray:
-    """Give the ensemble's standard deviations where the twin keeps any, (k, 3) [m]; else nan."""
-    for one in reversed(twin.record.waiting):
-        spread = getattr(one, "spread", None)
-        if spread is not None and len(spread) == len(ahead) and abs(one.t + made.coast_s - made.t) < 0.01:
-            return np.asarray(spread, float)
-    return np.full((len(ahead), 3), np.nan)
+def _kept(twin: Twin, made: Prediction, ahead: np.ndarray) -> tuple[str, np.ndarray]:
+    """Give what shares the calibration of a prediction, and its ensemble's standard deviations, (k, 3) [m] or nan."""
+    latest = twin.record.latest
+    if latest is None or abs(latest[0].t + latest[0].ahead[0] - made.t) > _SAME_S:
+        return made.method, np.full((len(ahead), 3), np.nan)
+    guess = latest[0]
+    none = guess.spread is None or len(guess.spread) != len(ahead)
+    return guess.group, np.full((len(ahead), 3), np.nan) if none else np.asarray(guess.spread, float)

@@ -81,10 +81,12 @@ def fly_hybrid(now: Situation, start: Start, found: Hybrid, ahead: np.ndarray) -
     """
     ctl, par, legs = start.control
     state, air = begin(now, start.good)
+    if now.onboard.instead is not None and now.onboard.instead.speed is not None:
+        state[H.V] = now.onboard.instead.speed
     out = np.empty((int(ahead[-1] / H.STEP) + 2, 3))
     done = H.fly(ctl.copy(), par, legs, found.body, air, state, _NO_CHANCE, H.STEP, out)
     if done <= min(ahead[-1], ahead[0] + LEAST_AHEAD_S) / H.STEP:
         return Flown(None, start.seq, f"the twin leaves its envelope {done * H.STEP:.0f} s ahead", True)
     t = H.STEP * np.arange(done)
     path = np.column_stack([np.interp(ahead, t, column, right=np.nan) for column in out[:done].T])
-    return Flown(path, start.seq, start.sentence)
+    return Flown(path, start.seq, start.sentence, law=start.law)

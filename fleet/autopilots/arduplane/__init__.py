@@ -20,22 +20,28 @@ Source: Park, Deyst & How (2004) for L1; Lambregts (1983) for TECS; ArduPlane 4.
 from fleet.autopilots.arduplane.attitude import stabilise
 from fleet.autopilots.arduplane.guide import guide, init
 from fleet.autopilots.arduplane.legs import set_leg
-from fleet.autopilots.arduplane.params import DEFAULTS, N_PAR, NAMES, eas2tas, parameters
-from fleet.autopilots.arduplane.state import LEG, N_CTL
+from fleet.autopilots.arduplane.params import DEFAULTS, N_PAR, NAMES, TABLE, eas2tas, parameters, read, vector
+from fleet.autopilots.arduplane.state import FROM, LEG, N_CTL, N_LEG, TURN
 
 LAW = "arduplane: L1 + TECS"
 
 __all__ = [
     "DEFAULTS",
+    "FROM",
     "LAW",
     "LEG",
     "NAMES",
     "N_CTL",
+    "N_LEG",
     "N_PAR",
+    "TABLE",
+    "TURN",
     "eas2tas",
     "guide",
     "init",
     "parameters",
+    "read",
     "set_leg",
     "stabilise",
+    "vector",
 ]

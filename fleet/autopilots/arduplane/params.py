@@ -109,17 +109,30 @@ def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np
         par: SI and rad, throttles 0..1, (N_PAR,)
         absent: names that were missing, not finite or absurd; their defaults are in `par`
     """
+    found, absent = read(values)
+    return vector(found, altitude_m), absent
+
+
+def read(values: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Give every parameter of the law under its current name, in the autopilot's units, and which are defaults."""
     given = {**_old_gains(values), **{k: float(v) for k, v in values.items()}}
-    par, absent = np.empty(N_PAR), []
-    for i, row in enumerate(TABLE):
+    found, absent = {}, []
+    for row in TABLE:
         value = find(row, given)
         if value is None:
             absent.append(row.name)
-        par[i] = (row.default if value is None else value) * row.factor
-    absent += _order(par)
+        found[row.name] = float(row.default) if value is None else value
+    absent += [name for name in _order(found) if name not in absent]
+    return found, tuple(absent)
+
+
+def vector(found: Mapping[str, float], altitude_m: float = 0.0) -> np.ndarray:
+    """Turn what `read` found into SI, with true over equivalent airspeed at a height [m], (N_PAR,)."""
+    par = np.empty(N_PAR)
+    par[:EAS2TAS] = [found[row.name] * row.factor for row in TABLE]
     par[THR_MIN] = max(par[THR_MIN], 0.0)  # reverse thrust is not modelled
     par[EAS2TAS] = eas2tas(altitude_m)
-    return par, tuple(absent)
+    return par
 
 
 def eas2tas(altitude_m: float) -> float:
@@ -137,16 +150,15 @@ def find(row: Row, given: Mapping[str, float]) -> float | None:
     return None
 
 
-def _order(par: np.ndarray) -> list[str]:
+def _order(found: dict[str, float]) -> list[str]:
     """Put back to defaults what contradicts itself: a lower limit at or above its upper one."""
-    wrong = []
-    if not par[VA_MIN] < par[VA_MAX]:
-        wrong += [VA_CRUISE, VA_MIN, VA_MAX]
-    if not par[THR_MIN] < par[THR_MAX]:
-        wrong += [THR_TRIM, THR_MIN, THR_MAX]
-    for i in wrong:
-        par[i] = TABLE[i].default * TABLE[i].factor
-    return [TABLE[i].name for i in wrong]
+    wrong: list[str] = []
+    if not found["AIRSPEED_MIN"] < found["AIRSPEED_MAX"]:
+        wrong += ["AIRSPEED_CRUISE", "AIRSPEED_MIN", "AIRSPEED_MAX"]
+    if not found["THR_MIN"] < found["THR_MAX"]:
+        wrong += ["TRIM_THROTTLE", "THR_MIN", "THR_MAX"]
+    found.update({name: DEFAULTS[name] for name in wrong})
+    return wrong
 
 
 def _old_gains(values: Mapping[str, float]) -> dict[str, float]:

@@ -10,6 +10,7 @@ kernel = nb.njit(cache=True, error_model="numpy")  # no fastmath: nan means "no 
 # the leg
 LEG = 0  # index of the current leg
 PREV_N, PREV_E, PREV_D = 1, 2, 3  # where its line begins, NED [m]
+FROM = slice(1, 4)  # the same
 TURN = 4  # size of the turn at its end [rad]
 ANGLE, BEARING = 5, 6  # angle flown on the circle, last bearing to its centre [rad]
 ON, AROUND = 7, 8  # 1: the circle was reached; 1: flying on the circle now

@@ -1,0 +1,61 @@
+"""Mission files as ground stations write them, `QGC WPL 110`: a line an item, twelve columns apart by tabs or blanks.
+
+    seq  current  frame  command  param1  param2  param3  param4  latitude  longitude  altitude  autocontinue
+
+Source: MAVLink developer guide, "Mission plain-text file format".
+"""
+
+from math import isfinite
+from pathlib import Path
+
+from fleet.contract import MAX_ITEMS, Item
+
+_HEAD = "QGC WPL 110"
+_COLUMNS = 12
+_MOST_BYTES = 1 << 20
+
+
+def read_waypoints(path: Path) -> tuple[Item, ...]:
+    """Read a mission file.
+
+    Raises:
+        ValueError: when it is none, or a line of it does not fit; the sentence names the line.
+    """
+    with path.open("rb") as file:
+        text = file.read(_MOST_BYTES + 1).decode(errors="replace")
+    lines = [line.strip() for line in text.splitlines()]
+    if not lines or " ".join(lines[0].lstrip("\ufeff").split()) != _HEAD:
+        found = lines[0][:40] if lines else "nothing"
+        raise ValueError(f"{path.name}: found {found!r} in the first line, expected {_HEAD!r}; save it as waypoints")
+    items = tuple(
+        _item(path.name, number, line) for number, line in enumerate(lines[1:], start=2) if line and line[0] != "#"
+    )
+    if not items or len(items) > MAX_ITEMS:
+        raise ValueError(f"{path.name}: found {len(items):,} items, expected 1 to {MAX_ITEMS:,}; save another mission")
+    return items
+
+
+def _item(name: str, number: int, line: str) -> Item:
+    columns = line.split()
+    try:
+        seq, _, frame, command, *numbers = columns
+        p1, p2, p3, p4, lat, lon, alt, _ = map(float, numbers)
+        whole = int(seq), int(frame), int(float(command))
+    except (ValueError, OverflowError):
+        raise ValueError(
+            f"{name} line {number}: found {line[:60]!r}, expected {_COLUMNS} numbers; save the mission again"
+        ) from None
+    if not (abs(lat) <= 90 and abs(lon) <= 180 and isfinite(alt)):
+        raise ValueError(f"{name} line {number}: found {lat}, {lon} at {alt} m, expected a place on earth; correct it")
+    return Item(
+        seq=whole[0],
+        frame=whole[1],
+        command=whole[2],
+        param1=p1,
+        param2=p2,
+        param3=p3,
+        param4=p4,
+        lat_e7=round(lat * 1e7),
+        lon_e7=round(lon * 1e7),
+        alt_m=alt,
+    )

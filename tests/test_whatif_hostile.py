@@ -1,0 +1,89 @@
+"""What if, asked by those who should not: one sentence each, and the next question is answered."""
+
+import flights as f
+import msgpack
+import msgspec
+import numpy as np
+import pytest
+from flights import item
+
+from fleet.contract import MAX_ITEMS, Item, Prediction, WhatIf
+from twin_worker.memory import Twin
+from twin_worker.whatif.answer import answer
+from twin_worker.whatif.question import MOST_BYTES
+
+NAN, INF = float("nan"), float("inf")
+PLACE = {"lat_e7": 470_000_000, "lon_e7": 80_000_000, "alt_mm": 500_000}
+MANY = [{"seq": k, "command": 16} for k in range(MAX_ITEMS + 1)]
+REFUSED = {
+    "not msgpack": (b"\xc1", "no msgpack map"),
+    "no map": (b"\x93\x01\x02\x03", "Expected `object`"),
+    "too deep": (b"\x91" * 5000 + b"\xc0", "does not fit"),
+    "too long": (bytes(MOST_BYTES + 1), "bytes, expected at most"),
+    "a slip of the pen": ({"sped": 18}, "unknown field `sped`"),
+    "text for a number": ({"speed": "fast"}, r"Expected `float \| null`"),
+    "too many items": ({"items": MANY}, "1,001 mission items, expected at most 1,000; shorten"),
+    "items twice": ({"items": [{"seq": 1, "command": 16}] * 2}, "each of 0..999 once"),
+    "items below nought": ({"items": [{"seq": -1, "command": 16}]}, "each of 0..999 once"),
+    "an item of another mission": ({"items": MANY[:3], "seq": 7}, "one of the 3 items"),
+    "an item that is not on board": ({"seq": 99}, "found seq 99 for uav-1"),
+    "speed nan": ({"speed": NAN}, "speed: found nan"),
+    "speed below nought": ({"speed": -3.0}, "speed: found -3"),
+    "speed of light": ({"speed": 3e8}, "speed: found"),
+    "wind nan": ({"wind": [NAN, 0.0]}, "wind: found"),
+    "wind inf": ({"wind": [0.0, INF]}, "wind: found"),
+    "wind in one dimension": ({"wind": [1.0]}, "Expected `array` of length 2"),
+    "off this earth": ({"start": PLACE | {"lat_e7": 2**40}}, "start: found"),
+    "out in space": ({"start": PLACE | {"alt_mm": 10**12}}, "start: found an altitude"),
+    "heading nan": ({"start": PLACE | {"heading": NAN}}, "start: found heading"),
+    "heading in degrees": ({"start": PLACE | {"heading": 270.0}}, "give radians"),
+    "start speed inf": ({"start": PLACE | {"speed": INF}}, "start: found speed"),
+    "a start without a place": ({"start": {}}, "missing required field `lat_e7`"),
+    "parameter nan": ({"params": {"NAVL1_PERIOD": NAN}}, "NAVL1_PERIOD nan"),
+    "parameter out of range": ({"params": {"NAVL1_PERIOD": 1e9}}, "expected 1..100"),
+    "parameters without end": ({"params": {f"P{k}": 1.0 for k in range(2001)}}, "2,001"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_hostile_question_is_refused_in_one_sentence(holder, name):
+    payload, words = REFUSED[name]
+    payload = payload if isinstance(payload, bytes) else msgpack.packb(payload)
+    with pytest.raises(ValueError, match=words) as refused:
+        holder.bus.inquire(Prediction, 1, payload)
+    said = str(refused.value)
+    assert said.startswith("what if: ") and "expected" in said and "\n" not in said and len(said) < 300
+    assert holder.bus.ask(Prediction, 1) != []
+
+
+def test_a_question_for_everybody_is_refused(holder):
+    (reply,) = holder.bus._reply[Prediction]
+    with pytest.raises(ValueError, match="every aircraft, expected one"):
+        reply(None, {}, msgspec.msgpack.encode(WhatIf()))
+
+
+def test_a_twin_that_has_heard_nothing_says_so():
+    with pytest.raises(ValueError, match="uav-4 has told no position yet"):
+        answer(Twin(4), WhatIf(speed=10.0))
+    early = Twin(4)
+    f.drive(early, f.messages(f.turn(0.5), uav=4))
+    with pytest.raises(ValueError, match="too few positions"):
+        answer(early, WhatIf(speed=10.0))
+
+
+ODD = {
+    "empty": (),
+    "home": (item(0),),
+    "jumps for ever": (item(0), item(1, 177, param1=2.0, param2=-1.0), item(2, 177, param1=1.0, param2=-1.0)),
+    "no length": (item(0), *(item(k, north=100.0) for k in range(1, 9))),
+    "nan": (item(0), item(1, param1=NAN, param2=INF, param3=NAN, param4=NAN, alt_m=NAN)),
+    "huge": (item(0), Item(seq=1, lat_e7=2**62, lon_e7=-(2**62), command=16, frame=2**60)),
+    "no command": (item(0), item(1, 2**60)),
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_an_odd_mission_is_flown_or_refused_in_a_sentence(winged, name):
+    made = answer(winged, WhatIf(items=ODD[name]))
+    assert np.isfinite(made.path.numpy()).all()
+    assert made.method != "imm" or "mission" in made.sentence or "item" in made.sentence

@@ -1,0 +1,112 @@
+"""The controller twin in force: its law, its parameters, and how each of them is known.
+
+Made in one place, so that what is published is what was flown. A parameter that the autopilot does not tell is the one
+learnt from flight, where one was, and else the autopilot's default, which is said.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fleet.autopilots import arduplane, copter
+from fleet.contract import Controller
+
+RECEIVED, IDENTIFIED, DEFAULT, ASKED = "received", "identified", "default", "asked"
+TOLD_OF = (  # of ArduPlane's parameters, those that shape a path; the others are flown with all the same
+    "NAVL1_PERIOD", "NAVL1_DAMPING", "WP_RADIUS", "WP_LOITER_RAD", "ROLL_LIMIT_DEG", "AIRSPEED_CRUISE", "AIRSPEED_MIN",
+    "AIRSPEED_MAX", "TECS_TIME_CONST", "TECS_CLMB_MAX", "TECS_SINK_MIN", "TECS_SINK_MAX", "TECS_HDEM_TCONST",
+    "TECS_SPDWEIGHT", "TECS_PITCH_MAX", "TECS_PITCH_MIN", "PTCH_LIM_MAX_DEG", "PTCH_LIM_MIN_DEG", "TRIM_THROTTLE",
+)  # fmt: skip
+TOLD_OF_GUIDANCE = (*TOLD_OF[:5], "AIRSPEED_CRUISE", "TECS_CLMB_MAX", "TECS_SINK_MAX")
+CRUISE = ("AIRSPEED_CRUISE", "WP_SPD", "FW_AIRSPD_TRIM", "MPC_XY_CRUISE", "Q_WP_SPD")  # what a wished speed overrides
+
+
+def why_unusable(name: str, value: float) -> str:
+    """Say why a law would not take this value of a parameter of its own; empty where it would, or knows no such."""
+    row = next((row for row in arduplane.TABLE if row.name == name), None)
+    if row is None or row.low <= value <= row.high:
+        return ""
+    return f"{name}: found {value:g}, expected {row.low:g}..{row.high:g}"
+
+
+@dataclass(frozen=True)
+class Control:
+    """A controller twin's law and parameters.
+
+    Attributes:
+        law: as in `Prediction`
+        values: parameters in the autopilot's names and units
+        known: how each of them is known
+        told: those worth telling
+    """
+
+    law: str
+    values: Mapping[str, float] = field(default_factory=dict)
+    known: Mapping[str, str] = field(default_factory=dict)
+    told: tuple[str, ...] = ()
+
+    def par(self, altitude_m: float) -> np.ndarray:
+        """Give ArduPlane's vector at a height above mean sea level [m]."""
+        return arduplane.vector(self.values, altitude_m)
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Give the names of those at their defaults."""
+        return tuple(name for name, how in self.known.items() if how == DEFAULT)
+
+    def wire(self) -> Controller:
+        """Give it as it is published."""
+        parts: dict[str, dict[str, float]] = {RECEIVED: {}, IDENTIFIED: {}, DEFAULT: {}, ASKED: {}}
+        for name in self.told:
+            parts[self.known[name]][name] = round(float(self.values[name]), 4)
+        return Controller(law=self.law, **parts)
+
+
+def on_wings(
+    received: Mapping[str, float],
+    identified: Mapping[str, float] | None = None,
+    asked: Mapping[str, float] | None = None,
+    law: str = arduplane.LAW,
+) -> Control:
+    """Give ArduPlane's controller twin.
+
+    Args:
+        received: parameters as the autopilot names and scales them, current or older names
+        identified: learnt from flight, current names; they count only where none was received
+        asked: what a what-if has instead of either
+        law: as in `Prediction`
+    """
+    asked = asked or {}
+    _, missing = arduplane.read({**received, **asked})
+    learnt = {name: value for name, value in (identified or {}).items() if name in missing}
+    values, absent = arduplane.read({**received, **learnt, **asked})
+    known = dict.fromkeys(values, RECEIVED)
+    known |= dict.fromkeys(learnt, IDENTIFIED) | dict.fromkeys(set(asked) & set(values), ASKED)
+    known |= dict.fromkeys(absent, DEFAULT)
+    return Control(law, values, known, TOLD_OF if law == arduplane.LAW else TOLD_OF_GUIDANCE)
+
+
+def on_rotors(
+    received: Mapping[str, float], prefix: str, limit: copter.Limits, asked: Mapping[str, float] | None = None
+) -> Control:
+    """Give the controller twin of what hovers.
+
+    Args:
+        received: parameters as the autopilot names and scales them
+        prefix: `Q_` for the rotors of a quadplane
+        limit: what it flies with, SI; a limit that no parameter gave and no default is was seen in flight
+        asked: what a what-if has instead
+    """
+    asked = asked or {}
+    given = {**received, **asked}
+    usual, absent = copter.limits(given, prefix)
+    values, known = {}, {}
+    for name, row in copter.TABLE.items():
+        names = [(prefix + known_as, unit) for known_as, unit in row.names]
+        called, factor = next((pair for pair in names if pair[0] in given), names[0])
+        values[called] = getattr(limit, name) / factor
+        seen = getattr(limit, name) != getattr(usual, name)
+        told = ASKED if called in asked else RECEIVED
+        known[called] = IDENTIFIED if seen else DEFAULT if name in absent else told
+    return Control(copter.LAW, values, known, tuple(values))
