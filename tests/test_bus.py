@@ -162,7 +162,7 @@ def test_a_question_with_a_payload_is_answered_or_refused_in_words(pair: Pair) -
     pair.there.answer(Prediction, reply)
     heard: SimpleQueue = SimpleQueue()
     assert told(heard, lambda: heard.put(found) if (found := pair.here.inquire(Prediction, 4, b"even")) else None)
-    with pytest.raises(ValueError, match="^what if: found odd, expected even; correct it$"):
+    with pytest.raises(ValueError, match=r"^what if: found odd, expected even; correct it$"):
         pair.here.inquire(Prediction, 4, b"odd")
     assert pair.here.inquire(Prediction, 4, b"nobody knows") is None
 

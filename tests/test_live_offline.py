@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fleet.bus import MemoryBus
-from fleet.contract import Alert, Message, Model, Prediction, Sample
+from fleet.contract import Alert, Event, Message, Model, Prediction, Sample
 from fleet.telemetry.recordings import replay_messages
 from twin_worker import worker as live
 from twin_worker.offline import run
@@ -97,7 +97,8 @@ def test_a_silence_in_the_data_is_met_on_the_same_beat(heard):
     offline = list(run(gap, {}))
     _, made = same(lived(gap, 7), offline, 1)
     coasting = [m for m in offline if isinstance(m, Prediction) and m.coast_s]
-    assert made and 7 <= len(coasting) <= 12
+    assert made and 3 <= len(coasting) <= 12
+    assert all(p.t + p.horizon_s > p.event_t for p in coasting[:-1]) and coasting[-1].event is Event.HORIZON_OVER
     assert [m.active for m in offline if isinstance(m, Alert)] == [True, False]
 
 
@@ -118,6 +119,7 @@ def test_a_worker_whose_data_fall_silent_coasts_and_finds_its_beat_again(heard, 
                 worker.turn()
         bus.publish(message)
     worker.turn()
-    assert max(p.coast_s for p in told) > 15.0
+    (over,) = [p for p in told if p.event is Event.HORIZON_OVER]
+    assert over.coast_s > 3.0 and over.horizon_s == 0.0
     late = [p for p in told if not p.coast_s and p.t > start + 9.0]
     assert len(late) >= 5 and all("link lost" not in p.sentence for p in late)

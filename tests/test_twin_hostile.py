@@ -6,34 +6,43 @@ import numpy as np
 import pytest
 from flights import HERE, drive, item, predictions, published, shifted, status
 
-from fleet.contract import Alert, AlertKind, Link, Mission, Sample, State
+from fleet.contract import SENTENCES, Alert, AlertKind, Event, Link, Mission, Sample, State
 from tests.flights import ROUTE
 from twin_worker.twin import Twin, advance, fleet_row
 
 # --- the link --------------------------------------------------------------------------------------------------------
 
 
-def test_a_lost_link_coasts_says_its_age_and_comes_back(twin, heard):
-    end = twin.history.newest
+def test_a_lost_link_coasts_up_to_the_horizon_says_its_age_and_comes_back(twin, heard):
+    end, horizon = twin.history.newest, twin.prediction.t + twin.prediction.horizon_s - twin.history.newest
+    assert 4.5 < horizon < 60.0  # else this test means nothing
     results = []
-    for k in range(1, 16):
+    for k in range(1, int(horizon) + 6):
         results += published(advance(twin, (), end + k))
     (alert,) = [r for r in results if isinstance(r, Alert)]
     assert alert.kind is AlertKind.LINK_LOST and alert.active and alert.sentence.startswith("uav-1: no sample for")
-    coasting = [p for p in predictions(results) if p.coast_s]
-    assert len(coasting) >= 10 and all(p.state is State.LINK_LOST for p in coasting)
+    *coasting, last = [p for p in predictions(results) if p.coast_s]
+    assert int(horizon) - 5 <= len(coasting) <= int(horizon)
+    assert all(p.state is State.LINK_LOST and p.event is Event.LINK_LOST and p.event_t > end for p in coasting)
     ages = [p.coast_s for p in coasting]
-    assert ages == sorted(ages) and ages[-1] == pytest.approx(15.0, abs=1.5)
+    assert ages == sorted(ages) and ages[-1] == pytest.approx(horizon, abs=1.5)
     assert f"link lost {ages[-1]:.0f} s ago" in coasting[-1].sentence
-    assert coasting[-1].t == pytest.approx(end + 15.0, abs=1.5)  # it flies on
+    assert coasting[-1].t == pytest.approx(end + ages[-1], abs=1.0)  # it flies on
+    assert all(0.0 < p.horizon_s <= horizon for p in coasting)
     tubes = [p.tube.numpy() for p in coasting if p.method == coasting[-1].method]
     assert (tubes[-1] >= tubes[0]).all() and (tubes[-1][0] > tubes[0][0]).any()
     assert fleet_row(twin, end + 15.0).state is State.LINK_LOST
 
+    assert last.event is Event.HORIZON_OVER and last.horizon_s == 0.0 and last.state is State.LINK_LOST
+    assert "the confidence horizon is over" in last.sentence and last.coast_s == pytest.approx(horizon, abs=1.5)
+    assert last.event_said.startswith(SENTENCES[Event.HORIZON_OVER])
+
     results = drive(twin, shifted(heard, end + 15.0 - f.T0, 3.0))
     (alert,) = [r for r in results if isinstance(r, Alert)]
     assert not alert.active and "link back" in alert.sentence
-    assert predictions(results)[-1].coast_s == 0.0 and twin.state is not State.LINK_LOST
+    back = predictions(results)[-1]
+    assert back.coast_s == 0.0 and twin.state is not State.LINK_LOST
+    assert back.event is Event.LINK_BACK and SENTENCES[Event.LINK_BACK] in back.event_said
 
 
 def test_the_gateway_may_know_first(twin):
@@ -52,7 +61,9 @@ def test_a_link_lost_before_anything_was_learnt_is_lost_all_the_same():
 def test_a_link_lost_for_a_day_is_not_flown_for_a_day(twin):
     end = twin.history.newest
     results = published(advance(twin, (), end + 86_400.0))
-    assert not predictions(results) and [r for r in results if isinstance(r, Alert)]
+    assert [r for r in results if isinstance(r, Alert)]
+    assert [(p.event, p.horizon_s) for p in predictions(results)] == [(Event.HORIZON_OVER, 0.0)]
+    assert not published(advance(twin, (), end + 2 * 86_400.0))
     row = fleet_row(twin, end + 86_400.0)
     assert row.state is State.LINK_LOST and row.prediction_age_s > 80_000
 

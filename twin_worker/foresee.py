@@ -1,14 +1,16 @@
 """One prediction: the route flown by the best twin the aircraft has, else a turn-rate guess; tube and horizon."""
 
 from dataclasses import replace
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from fleet.autopilots import arduplane
-from fleet.contract import Array, Controller, Message, Prediction, State
+from fleet.contract import SENTENCES, Array, Controller, Event, Message, Prediction, State
 from twin_worker.calibration.groups import airframe_class, group_of
 from twin_worker.control import Control
+from twin_worker.events.note import note
 from twin_worker.fly_route import fly_route, in_force
 from twin_worker.horizon import AHEAD, QUANTILE, Made, Trust
 from twin_worker.imm import turn_on
@@ -18,20 +20,27 @@ from twin_worker.predict import LEAST_AHEAD_S
 from twin_worker.track import Track
 
 _LOOK_BACK_S = 62.0  # telemetry a prediction starts from [s]
-_COAST_S = 120.0  # the twin flies on alone for as long; then its last prediction ages [s]
 _TELL_S = 10.0  # between laws and parameters that are no news [s]
 _STALE_S = 3.0  # positions older than other telemetry by more say nothing of now [s]
 _MISSED = 2  # autopilot parameters that may be lacking where they count as known [-]
-_IMM_LAW = "none: turn rate only"
+_IMM_LAW, _NO_LAW = "none: turn rate only", "none: on the ground"
 
 
 def foresee(twin: Twin, now: float) -> list[Message]:
-    """Predict from the newest telemetry, as of data time `now`; nothing while there is too little."""
+    """Predict from the newest telemetry, as of data time `now`; nothing while there is too little.
+
+    Without positions it coasts: the twin flies on from the last good state until its confidence horizon is over.
+    """
     assert twin.origin is not None
-    coast = max(now - twin.history.newest, 0.0) if twin.lost else 0.0
-    ahead = AHEAD + round(coast)
     flown = seen(twin, _LOOK_BACK_S)
-    if coast > _COAST_S or flown is None or not flown.ok[-1] or twin.history.newest - flown.t[-1] > _STALE_S:
+    if flown is None:
+        return []
+    coast = _coasts(twin, flown, now)
+    if coast and (twin.over or _is_over(twin, coast, now)):
+        return _close(twin, coast, now)
+    twin.over = False
+    ahead = AHEAD + round(coast)
+    if not flown.ok[-1] or (not coast and twin.history.newest - flown.t[-1] > _STALE_S):
         return []
     made, t0 = _best(twin, flown, ahead)
     n = _whole(made.path)
@@ -49,18 +58,64 @@ def foresee(twin: Twin, now: float) -> list[Message]:
     )
     trust = twin.record.trust(guess)
     prediction = _trusted(twin, guess, trust)
-    said = " ".join(part for part in (f"link lost {coast:.0f} s ago" if twin.lost else "", made.sentence) if part)
     twin.prediction = msgspec.structs.replace(
         prediction,
         seq=made.seq,
-        sentence=said,
+        sentence=" ".join(part for part in (_ago(twin, coast), made.sentence) if part),
         coast_s=coast,
         law=made.law,
         controller=_controller(twin, made, now),
+        **_event(twin),
     )
-    if not twin.lost:
+    if not coast:
         twin.record.keep(guess, trust)
     return [twin.prediction]
+
+
+def _coasts(twin: Twin, flown: Track, now: float) -> float:
+    """Give the time flown by the twin alone [s]; 0 with telemetry. Positions alone may stop: that is an event."""
+    broken = not twin.lost and twin.history.newest - max(float(flown.t[-1]), twin.back_t) > _STALE_S
+    if broken != twin.broken and not twin.lost:
+        note(twin, Event.TELEMETRY_BROKEN if broken else Event.TELEMETRY_WHOLE, now)
+    twin.broken, twin.predict_t = broken, now
+    if twin.lost or twin.broken:
+        return max(now - (float(flown.t[-1]) if twin.broken else twin.history.newest), 0.0)
+    return 0.0
+
+
+def _is_over(twin: Twin, coast: float, now: float) -> bool:
+    """Tell whether coasting has used up the confidence horizon of the last prediction."""
+    last = twin.prediction
+    return coast > AHEAD[-1] or (last is not None and now >= last.t + last.horizon_s)
+
+
+def _close(twin: Twin, coast: float, now: float) -> list[Message]:
+    """Say once that the horizon is over; after that nothing, until telemetry returns."""
+    if twin.over or twin.prediction is None:
+        return []
+    twin.over = True
+    note(twin, Event.HORIZON_OVER, now, f"{_ago(twin, coast)}")
+    twin.state, twin.predict_t = _state(twin, twin.state), now
+    twin.prediction = msgspec.structs.replace(
+        twin.prediction,
+        state=twin.state,
+        horizon_s=0.0,
+        horizon_open=False,
+        coast_s=coast,
+        sentence=f"{_ago(twin, coast)}: the confidence horizon is over, where it is now is not known",
+        **_event(twin),
+    )
+    return [twin.prediction]
+
+
+def _ago(twin: Twin, coast: float) -> str:
+    return f"{'link lost' if twin.lost else 'positions stopped'} {coast:.0f} s ago" if coast or twin.lost else ""
+
+
+def _event(twin: Twin) -> dict[str, Any]:
+    """Give what the newest event tells, by the fields of a prediction."""
+    told = twin.noted
+    return {} if told is None else {"event": told.event, "event_t": told.t, "event_said": told.said}
 
 
 def _controller(twin: Twin, made: Flight, now: float) -> Controller | None:
@@ -77,6 +132,10 @@ def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
     window = twin.window(_LOOK_BACK_S)
     whole = window is not None and bool(window.ok[-1])
     why = twin.verdict.sentence
+    if twin.ground.landed and twin.instead is None:
+        twin.state = _state(twin, State.VERIFIED if twin.plant else State.WAITING)
+        still = np.tile(flown.p[-1], (len(ahead), 1))
+        return Flight(still, "imm", _NO_LAW, -1, SENTENCES[Event.TOUCH_DOWN]), float(flown.t[-1])
     if (twin.plant is not None or twin.hybrid is not None) and not hangs(twin):
         first = nothing(twin.why_no_route() or "telemetry is broken: the model has nothing to start from")
         if window is not None and whole and not twin.why_no_route():

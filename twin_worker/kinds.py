@@ -64,11 +64,11 @@ def hangs(twin: Twin) -> bool:
     at = np.linspace(now - SETTLE_S, now, 7)
     if lifted(at, twin.history, twin.received, twin.modes).any():
         return True
-    item = _items_now(twin)
+    item = command_in_force(twin)
     return twin.status is not None and twin.status.mode in ROUTE_MODES and item in _VTOL
 
 
-def _items_now(twin: Twin) -> int:
+def command_in_force(twin: Twin) -> int:
     """Give the command of the mission item in force; 0 unknown."""
     seq = rotor.items_in_force(np.array([twin.history.newest]), twin.history.rows("leg"), twin.mission)[0]
     items = twin.mission.items if twin.mission else ()

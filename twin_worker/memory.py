@@ -7,8 +7,7 @@ import numpy as np
 
 from fleet.airframe import ServoMap, servo_map
 from fleet.airframes import GENERIC, Airframe, load
-from fleet.autopilots import arduplane
-from fleet.contract import Message, Mission, Model, Outcome, Params, Prediction, Sample, State, Status, Verdict
+from fleet.contract import Event, Message, Mission, Model, Outcome, Params, Prediction, Sample, State, Status, Verdict
 from fleet.frames import Origin
 from fleet.window import Window
 from twin_worker.conflict.ledger import Ledger
@@ -16,6 +15,9 @@ from twin_worker.contest import Contest
 from twin_worker.control import Control
 from twin_worker.coupled import Coupled
 from twin_worker.earned import Earned
+from twin_worker.events.heard import changed, mission_said, parameters_said
+from twin_worker.events.note import Note, void
+from twin_worker.events.watch import Ground
 from twin_worker.greybox import Grey
 from twin_worker.history import History
 from twin_worker.horizon import Record
@@ -107,6 +109,8 @@ class Twin:
     control_t: float = -np.inf  # and when that was last told
     state: State = State.WAITING
     tries: int = 0
+    ground: Ground = field(default_factory=Ground)
+    noted: Note | None = None  # the newest event
     since: float = -np.inf  # last change of mode, mission or parameters
     data_t: float = -np.inf  # newest time in any message
     turned_t: float = -np.inf  # data time of the last turn of the loop
@@ -121,9 +125,12 @@ class Twin:
     spread_t: float = -np.inf  # ensemble last flown
     achievable_t: float = -np.inf  # mission last judged
     turning_t: float = np.inf  # since when predictions are a turn rate alone
-    lost: bool = False
     stood: Origin | None = None  # where it last stood disarmed
     aloft: bool = False  # it has been above the least height since it was disarmed
+    lost: bool = False  # nothing is heard
+    back_t: float = -np.inf  # link last back
+    broken: bool = False  # much is heard, but no positions
+    over: bool = False  # it has coasted up to its horizon
     bad: int = 0
 
     @property
@@ -181,11 +188,13 @@ def hear(twin: Twin, message: Message) -> None:
         _hear_status(twin, message)
     elif isinstance(message, Mission):
         if twin.mission is None or twin.mission.items != message.items:
-            _event(twin, message.t)
+            void(twin, Event.MISSION, message.t, mission_said(twin.mission, message))
         twin.mission = message
     elif isinstance(message, Params):
-        if twin.params is None or _control_changed(twin.params, message):
-            _event(twin, message.t)
+        names = changed(twin.received, message.values)
+        if names or twin.params is None:
+            said = parameters_said(names, twin.received, message.values)
+            void(twin, Event.PARAMETERS if names else None, message.t, said)
         twin.params, twin.servos = message, servo_map(message.values)
 
 
@@ -195,11 +204,6 @@ def _first_place(history: History) -> Origin | None:
         if abs(lat) <= 9e8 and abs(lon) <= 1.8e9 and abs(alt) <= 1e8:
             return Origin(int(lat), int(lon), int(alt))
     return None
-
-
-def _control_changed(before: Params, after: Params) -> bool:
-    """Tell whether any parameter of the controller twin changed, not just arrived."""
-    return any(before.values.get(n, v) != v for n, v in after.values.items() if n in arduplane.DEFAULTS)
 
 
 def _hear_status(twin: Twin, status: Status) -> None:
@@ -213,17 +217,10 @@ def _hear_status(twin: Twin, status: Status) -> None:
         twin.history.clear()
         twin.grid.clear()
         twin.wind.t = twin.wind_t = twin.identify_t = twin.score_t = -np.inf  # the new time may lie before
-        twin.flown_t = twin.told_t = twin.hybrid_t = twin.checked_t = -np.inf
+        twin.flown_t = twin.told_t = twin.back_t = twin.hybrid_t = twin.checked_t = -np.inf
         twin.near = twin.last = None
         twin.data_t = twin.turned_t = -np.inf
-        _event(twin, status.t)
+        twin.ground = Ground()
+        void(twin, Event.CLOCK, status.t)
     elif status.mode != before.mode:
-        _event(twin, status.t)
-
-
-def _event(twin: Twin, t: float) -> None:
-    """Invalidate the running prediction: mode, mission, parameters or clock changed."""
-    twin.since = t
-    twin.predict_t = twin.spread_t = -np.inf
-    twin.record.forget()
-    twin.contest.forget()
+        void(twin, Event.MODE if before.mode else None, status.t, f"{status.mode[:20]}, before {before.mode[:20]}")

@@ -4,11 +4,13 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from fleet.contract import Alert, FleetRow, Link, Message, Sample, State
+from fleet.contract import Alert, Event, FleetRow, Link, Message, Sample, State
 from fleet.frames import to_ned
 from twin_worker import contest
 from twin_worker.conflict.watch import link, watch
+from twin_worker.events.note import note
 from twin_worker.foresee import foresee
+from twin_worker.kinds import command_in_force
 from twin_worker.learn import learn
 from twin_worker.memory import Twin, hear
 
@@ -72,6 +74,7 @@ def _turn(twin: Twin, now: float) -> list[Message]:
     _blow(twin)
     if _due(now, twin.score_t, _TICK_S):
         twin.score_t = now
+        watch_events(twin, command_in_force(twin))
         _score(twin)
     if not twin.lost and _due(now, twin.identify_t, HOP_S):
         twin.identify_t = now
@@ -93,7 +96,9 @@ def _watch_link(twin: Twin, now: float) -> list[Message]:
     if lost == twin.lost:
         return []
     twin.lost, twin.predict_t = lost, -np.inf
+    twin.back_t = twin.back_t if lost else now
     twin.state = State.LINK_LOST if lost else State.WAITING if twin.plant is None else State.VERIFIED
+    note(twin, Event.LINK_LOST if lost else Event.LINK_BACK, now, f"no sample for {silent:.1f} s" if lost else "")
     return list(link(twin, now, silent))
 
 

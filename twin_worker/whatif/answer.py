@@ -45,6 +45,7 @@ def answer(twin: Twin, asked: WhatIf) -> Prediction:
         twin.instead = _instead(twin, asked)
         if not follows or asked.start is not None:
             _as_if_on_it(twin, twin.instead)
+    twin.prediction, twin.over = None, False  # the answer begins at the last good state, however old
     twin.control_t = -np.inf  # the answer tells law and parameters in any case
     made = [m for m in foresee(twin, twin.history.newest) if isinstance(m, Prediction)]
     if not made:

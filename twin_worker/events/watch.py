@@ -1,0 +1,98 @@
+"""Events that only the flight shows: take-off, landing, touch-down, and a local frame left far behind."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fleet.contract import Event
+from fleet.frames import Origin, to_ned
+from twin_worker.events.note import note, void
+
+if TYPE_CHECKING:
+    from twin_worker.memory import Twin
+
+NO_WINGS = ("multirotor", "helicopter")
+LANDINGS = (21, 85)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND
+_OVER_S = 3.0  # it stands or flies for as long before it is believed [s]
+_STANDS, _FLIES = 1.5, 8.0  # ground speed of a wing that stands, and of one that flies [m/s]
+_HOVERS, _LOW_M = 0.4, 1.5  # speed of rotors that stand [m/s]; height above the ground of those that fly [m]
+_FAR_M = 50_000.0  # a flat earth is good so far [m]
+
+
+@dataclass
+class Ground:
+    """Whether it flies, and on which ground it stood.
+
+    Attributes:
+        flies: None: not known yet
+        landed: it touched down, and was not armed anew since
+        landing: a landing item is in force
+        armed: as last told
+        height: down of the ground it last stood on, NED [m]; nan: never seen to stand
+    """
+
+    flies: bool | None = None
+    landed: bool = False
+    landing: bool = False
+    armed: bool = False
+    height: float = float("nan")
+
+
+def watch(twin: "Twin", command: int) -> None:
+    """Look once a second; `command` is the MAV_CMD of the mission item in force, 0 unknown."""
+    _frame(twin)
+    ground, now = twin.ground, twin.history.newest
+    armed = twin.status is not None and twin.status.armed
+    disarmed = ground.armed and not armed
+    if armed and not ground.armed:
+        ground.landed = False
+    ground.armed = armed
+    if command in LANDINGS and not ground.landing and ground.flies:
+        note(twin, Event.LANDING, now, "a landing item is in force")
+    ground.landing = command in LANDINGS
+    flies = False if disarmed else _flies(twin)
+    if flies is None or flies == ground.flies:
+        return
+    before, ground.flies = ground.flies, flies
+    ground.landed = before is not None and not flies
+    if before is not None:
+        event, why = (Event.TAKE_OFF, "") if flies else (Event.TOUCH_DOWN, "disarmed" if disarmed else "it stands")
+        void(twin, event, now, why)
+
+
+def _flies(twin: "Twin") -> bool | None:
+    """Judge by the last seconds of flight; None: cannot tell."""
+    assert twin.origin is not None
+    t, v = twin.history.rows("velocity", twin.history.newest - _OVER_S)
+    _, place = twin.history.rows("position", twin.history.newest - _OVER_S)
+    if len(t) < 3 or not len(place) or t[-1] - t[0] < 0.6 * _OVER_S:
+        return None
+    down = to_ned(twin.origin, *place.T)[:, 2]
+    level, speed = np.hypot(*v[:, :2].T), np.linalg.norm(v, axis=1)
+    if twin.vehicle in NO_WINGS:
+        high = twin.ground.height - down.max() > _LOW_M  # false for nan
+        stands = speed.max() < _HOVERS and not high and (not twin.ground.armed or not np.isnan(twin.ground.height))
+        flies = bool(high) or level.min() > 2.0
+    else:
+        _, air = twin.history.rows("air", twin.history.newest - _OVER_S)
+        still = not len(air) or air[:, 0].max() < _FLIES  # into the wind it may hang in the air
+        stands = level.max() < _STANDS and np.abs(v[:, 2]).max() < 0.5 and still
+        flies = level.min() > _FLIES
+    if stands:
+        twin.ground.height = float(down.mean())
+    return True if flies else False if stands else None
+
+
+def _frame(twin: "Twin") -> None:
+    """Move the origin of the local frame to an aircraft that has flown far from it."""
+    assert twin.origin is not None
+    _, place = twin.history.rows("position", twin.history.newest - 1.0)
+    if not len(place):
+        return
+    away = float(np.linalg.norm(to_ned(twin.origin, *place[-1:].T)[0, :2]))
+    if away > _FAR_M and abs(place[-1, 0]) <= 9e8 and abs(place[-1, 1]) <= 1.8e9:
+        twin.origin = Origin(*(int(x) for x in place[-1]))
+        twin.ground.height = float("nan")
+        twin.record.forget()
+        note(twin, Event.ORIGIN, twin.history.newest, f"it is {away * 1e-3:.0f} km from where it was first heard")
