@@ -317,7 +317,7 @@ SENTENCES: dict[Event, str] = {
     Event.MISSION: "another mission on board: what was predicted before is void",
     Event.PARAMETERS: "the autopilot flies with other parameters: what was predicted before is void",
     Event.TAKE_OFF: "it has taken off: predictions on the route begin",
-    Event.LANDING: "it is landing: flare and touch-down are not predicted",
+    Event.LANDING: "it is landing: what is predicted ends at the touch-down point",
     Event.TOUCH_DOWN: "it is on the ground: predictions on the route end",
     Event.LINK_LOST: "the link is lost: the twin flies on from the last good state",
     Event.LINK_BACK: "the link is back: the twin flies from telemetry again",

@@ -18,6 +18,8 @@ from fleet.contract import (
     Alert,
     AlertKind,
     Array,
+    Controller,
+    Event,
     FleetRow,
     FleetState,
     Item,
@@ -163,6 +165,15 @@ class PretendUav:
             coast_s=coast,
             seq=3,
             sentence=self.text,
+            event=Event.PARAMETERS,
+            event_t=t // 60 * 60,
+            event_said=self.text or "the autopilot flies with other parameters",
+            controller=Controller(
+                law=self.text or "arduplane: L1 + TECS",
+                received={self.text or "NAVL1_PERIOD": 17.0, "AIRSPEED_CRUISE": 22.0},
+                identified={"WP_RADIUS": 83.5},
+                default={"TECS_TIME_CONST": 5.0},
+            ),
         )
 
     def alert(self, t: float) -> Alert | None:

@@ -86,6 +86,15 @@ def test_take_off_and_landing_are_refused(command, word):
     assert got.path is None and got.sentence.startswith(word)
 
 
+def test_a_landing_ahead_ends_the_flight_where_it_touches_down():
+    end = level().p[-1, 0]
+    route = (item(0), item(1, north=end + 100.0), item(2, 21, north=end + 400.0, alt_m=60.0))
+    path = fly_ahead(situation(route), truth(), AHEAD).path
+    assert path is not None
+    assert path[-1, 0] == pytest.approx(end + 400.0, abs=5.0) and np.ptp(path[-5:], axis=0).max() == 0.0
+    assert path[12, 0] == pytest.approx(end + 12 * SPEED, abs=15.0)  # until then it flies
+
+
 def test_without_mission_current_it_says_so():
     got = fly_ahead(situation(lost=("leg",)), truth(), AHEAD)
     assert got.path is None and "MISSION_CURRENT" in got.sentence

@@ -9,6 +9,7 @@ from fleet.contract import (
     Alert,
     AlertKind,
     Array,
+    Controller,
     FleetRow,
     FleetState,
     Item,
@@ -26,7 +27,7 @@ from viewer.app import ROOM, near, outgrown
 from viewer.camera import FOV, frame
 from viewer.charts import band, scale
 from viewer.chronicle import listing
-from viewer.detail import about, facts, why
+from viewer.detail import about, facts, law, why
 from viewer.feed import Feed
 from viewer.palette import DARK, LIGHT, line_colour, rgb, shown_line
 from viewer.place import UNIT_M, Place, scene_quat
@@ -254,6 +255,15 @@ def test_who_has_no_prediction_is_told_why(clock: Clock) -> None:
 def test_the_panel_says_measured_coverage(clock: Clock) -> None:
     feed, _, _ = feed_of(clock, 1)
     assert "90 % tube held 91 %, n = 412" in facts(feed.vehicles[0], clock.now)
+
+
+def test_the_law_and_its_parameters_are_shown_by_how_each_is_known() -> None:
+    shown = law(Controller(law="L<1>", received={"NAVL1_PERIOD": 17.0}, default={"TECS_TIME_CONST": 5.0}))
+    assert "L&lt;1&gt;" in shown and "told by the autopilot" in shown and "NAVL1_PERIOD 17" in shown
+    assert shown.index("assumed: the autopilot&#x27;s default" if "&#x27;" in shown else "assumed") < shown.index(
+        "TECS"
+    )
+    assert "learnt from flight" not in shown and law(None) == ""
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 1e300])

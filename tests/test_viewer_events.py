@@ -13,11 +13,14 @@ from fleet.contract import (
     Mission,
     Model,
     Outcome,
+    Prediction,
     Rows,
     Sample,
+    State,
     Status,
     Verdict,
 )
+from fleet.contract import Event as Happened
 from viewer.chronicle import ROWS, listing
 from viewer.events import MAX_EVENTS, MAX_RAISED, MAX_STEPS, MAX_WORDS, Event, Kind, Known, closed, hear, merged
 from viewer.palette import DARK, LIGHT, MARK
@@ -48,6 +51,23 @@ def model(t: float, outcome: Outcome, *, in_force: bool) -> Model:
 def legs(*seqs: float) -> Sample:
     x = np.array(seqs, float)[:, None]
     return Sample(uav=7, t=T + len(x), leg=Rows(t=Array.of(T + np.arange(len(x)), "<f8"), x=Array.of(x)))
+
+
+def told_of(t: float, event: Happened | None, said: str = "", *, event_t: float | None = None) -> Prediction:
+    nothing = Array.of(np.zeros((0, 3)))
+    return Prediction(
+        uav=7,
+        t=T + t,
+        state=State.PREDICTING,
+        method="imm",
+        origin=(0, 0, 0),
+        ahead=Array.of([]),
+        path=nothing,
+        tube=nothing,
+        event=event,
+        event_t=T + (t if event_t is None else event_t) if event else 0.0,
+        event_said=said,
+    )
 
 
 def mission(t: float, *, alt_m: float = 60.0, frame: int = 3, complete: bool = True, home: float = 0.0) -> Mission:
@@ -112,6 +132,20 @@ STORIES = {
     "where the gateway has fallen silent the worker tells": (
         [status(0, "", armed=False), alert(3), alert(40, active=False)],
         [(3, Kind.LOST, "link lost"), (40, Kind.BACK, "link back")],
+    ),
+    "what a prediction tells is told once": (
+        [
+            told_of(1, None),
+            told_of(2, Happened.PARAMETERS, "L1"),
+            told_of(3, Happened.PARAMETERS, "L1", event_t=2),
+            told_of(9, Happened.TOUCH_DOWN, "down"),
+            told_of(12, Happened.HORIZON_OVER),
+        ],
+        [(2, Kind.PARAMETERS, "L1"), (9, Kind.GROUND, "down"), (12, Kind.BLIND, "horizon over")],
+    ),
+    "a prediction repeats nothing that others tell": (
+        [told_of(k, event) for k, event in enumerate((Happened.MODE, Happened.MISSION, Happened.LINK_LOST), 1)],
+        [],
     ),
     "home alone is no mission": ([Mission(uav=7, t=T, items=(Item(seq=0, command=16),), complete=True)], []),
     "an alert is raised once and withdrawn once": (

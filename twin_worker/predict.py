@@ -13,7 +13,7 @@ from fleet.autopilots.arduplane.params import VA_CRUISE
 from fleet.autopilots.shadow import shadow
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
-from fleet.mission import KIND, LAND, TAKEOFF, route
+from fleet.mission import KIND, LAND, P_D, P_N, TAKEOFF, route
 from fleet.simulate import N_STATE, simulate
 from fleet.window import Window
 from twin_worker.control import Control, on_wings
@@ -187,13 +187,26 @@ def fly_from(start: Start, plant: Plant, ahead: np.ndarray) -> Flown:
     ctl, par, legs = start.control
     dt = start.good.dt
     out = np.empty((int(ahead[-1] / dt) + 2, N_STATE))
-    done = simulate(ctl.copy(), par, legs, settled(plant, start.good), *start.state, dt, out)
+    ctl = ctl.copy()
+    done = simulate(ctl, par, legs, settled(plant, start.good), *start.state, dt, out)
     if done <= min(ahead[-1], ahead[0] + LEAST_AHEAD_S) / dt:
         return Flown(None, start.seq, f"the twin leaves its envelope {done * dt:.0f} s ahead", True)
-    path = np.column_stack(
-        [np.interp(ahead, dt * np.arange(done), column, right=np.nan) for column in out[:done, :3].T]
-    )
+    stay_down(out[:done, :3], ctl, legs)
+    t = dt * np.arange(done)
+    path = np.column_stack([np.interp(ahead, t, column, right=np.nan) for column in out[:done, :3].T])
     return Flown(path, start.seq, start.sentence, law=start.law)
+
+
+def stay_down(p: np.ndarray, ctl: np.ndarray, legs: np.ndarray) -> None:
+    """Hold a flight, NED (n, 3) [m], where its route ends on the ground; `ctl` is the controller's at its end."""
+    at = int(ctl[arduplane.LEG])
+    if int(legs[at, KIND]) != LAND:
+        return
+    begin = ctl[arduplane.FROM][:2]
+    line = legs[at, P_N:P_D] - begin
+    short = np.flatnonzero((p[:, :2] - begin) @ line < line @ line)
+    down = int(short[-1]) + 1 if len(short) else 0
+    p[down:] = p[min(down, len(p) - 1)]
 
 
 def _on_this_route(window: Window, since: float) -> Window:

@@ -9,6 +9,7 @@ from fleet.frames import to_ned
 from twin_worker import contest
 from twin_worker.conflict.watch import link, watch
 from twin_worker.events.note import note
+from twin_worker.events.watch import watch as watch_events
 from twin_worker.foresee import foresee
 from twin_worker.kinds import command_in_force
 from twin_worker.learn import learn

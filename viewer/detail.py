@@ -3,7 +3,7 @@
 from html import escape
 from math import isfinite
 
-from fleet.contract import Outcome, State
+from fleet.contract import Controller, Outcome, State
 from viewer.datatime import stamp, times
 from viewer.palette import Palette
 from viewer.vehicle import Vehicle
@@ -23,7 +23,7 @@ def about(vehicle: Vehicle, palette: Palette, now: float) -> str:
 
 def facts(vehicle: Vehicle, now: float) -> str:
     """List the figures behind it."""
-    return f'<div class="uav">{_fits(vehicle)}{_facts(vehicle, now)}</div>'
+    return f'<div class="uav">{_fits(vehicle)}{_facts(vehicle, now)}{law(vehicle.controller)}</div>'
 
 
 def _cards(vehicle: Vehicle) -> str:
@@ -121,6 +121,31 @@ def coverage(vehicle: Vehicle) -> str:
     if told is None or told.held_n <= 0 or not isfinite(told.held):
         return "not measured yet"
     return f"{told.quantile * 100:.0f} % tube held {told.held * 100:.0f} %, n = {told.held_n}"
+
+
+HOW = {
+    "received": "told by the autopilot",
+    "identified": "learnt from flight",
+    "default": "assumed: the autopilot's default",
+    "asked": "supposed",
+}
+MOST = 40  # parameters shown of each kind
+
+
+def law(controller: Controller | None) -> str:
+    """Show the law in force and the parameters it flies with, apart by how each is known."""
+    if controller is None:
+        return ""
+    parts = [(how, getattr(controller, how)) for how in HOW]
+    rows = "".join(
+        f'<tr><td class="soft key">{HOW[how]}</td><td class="value">'
+        + escape(", ".join(f"{name[:20]} {value:g}" for name, value in list(given.items())[:MOST]))
+        + "</td></tr>"
+        for how, given in parts
+        if given
+    )
+    head = f'<div class="soft">law in force: <b class="law">{escape(controller.law[:100])}</b></div>'
+    return f'{head}<table class="law">{rows}</table>'
 
 
 def _facts(vehicle: Vehicle, now: float) -> str:

@@ -10,7 +10,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fleet.contract import About, Alert, AlertKind, Item, Link, Mission, Model, Outcome, Sample, Status, Verdict
+from fleet.contract import (
+    About,
+    Alert,
+    AlertKind,
+    Item,
+    Link,
+    Mission,
+    Model,
+    Outcome,
+    Prediction,
+    Sample,
+    Status,
+    Verdict,
+)
+from fleet.contract import Event as Happened
 from viewer.routes import ITEM_NAMES
 
 MAX_EVENTS = 200  # kept of one UAV; the oldest go first
@@ -40,6 +54,13 @@ class Kind(StrEnum):
     SOUND = "sound"
     DOUBTED = "doubted"
     NO_MODEL = "no model"
+    PARAMETERS = "parameters"
+    TAKE_OFF = "take-off"
+    LANDING = "landing"
+    GROUND = "ground"
+    BLIND = "blind"
+    SIGHT = "sight"
+    FRAME = "frame"
     END = "end"
 
 
@@ -64,6 +85,7 @@ class Known(NamedTuple):
     verdict: str | None = None  # last told of: none (no model), sound or doubted; None before any
     sound_t: float = -np.inf  # when a try last was sound [s since 1970]
     raised: frozenset[About] = frozenset()  # alerts in force, by `Alert.about`
+    told_t: float = 0.0  # when the event was that predictions last told [s since 1970]
 
 
 Told = tuple[Known, list[Event]]
@@ -189,6 +211,28 @@ def _model(known: Known, model: Model) -> Told:
     return (known, []) if news == before else (known._replace(verdict=news), [event])
 
 
+_TOLD = {  # of what predictions tell; modes, missions and the link are told by others, and sooner
+    Happened.PARAMETERS: Kind.PARAMETERS,
+    Happened.TAKE_OFF: Kind.TAKE_OFF,
+    Happened.LANDING: Kind.LANDING,
+    Happened.TOUCH_DOWN: Kind.GROUND,
+    Happened.HORIZON_OVER: Kind.BLIND,
+    Happened.TELEMETRY_BROKEN: Kind.BLIND,
+    Happened.TELEMETRY_WHOLE: Kind.SIGHT,
+    Happened.CLOCK: Kind.FRAME,
+    Happened.ORIGIN: Kind.FRAME,
+}
+
+
+def _prediction(known: Known, prediction: Prediction) -> Told:
+    """Tell the event that began a prediction anew, once."""
+    if prediction.event is None or prediction.event_t == known.told_t:
+        return known, []
+    kind = _TOLD.get(prediction.event)
+    said = _clip(prediction.event_said) or prediction.event.value.replace("_", " ")
+    return known._replace(told_t=prediction.event_t), [Event(prediction.event_t, kind, said)] if kind else []
+
+
 def _outcome(verdict: Verdict) -> str:
     return verdict.outcome.value.replace("_", " ")
 
@@ -207,4 +251,5 @@ _TELLS: dict[type, Callable[[Known, Any], Told]] = {
     Mission: _mission,
     Sample: _sample,
     Model: _model,
+    Prediction: _prediction,
 }

@@ -189,6 +189,8 @@ class Feed:
             return
         if vehicle.prediction is not None and 0 < vehicle.prediction.t - message.t < JUMP_S:
             return  # delayed, and newer is here
+        vehicle.note(message, now)
+        vehicle.controller = message.controller or vehicle.controller
         if self.place is None and message.path.shape[0]:
             self.place = Place(_checked(message.ned_origin()))
         found = forecast(message, self.place, now) if self.place is not None else None

@@ -54,6 +54,11 @@ class Palette:
             Kind.SOUND: self.verified,
             Kind.DOUBTED: self.identifying,
             Kind.NO_MODEL: self.identifying,
+            Kind.PARAMETERS: self.route,
+            Kind.TAKE_OFF: self.ink,
+            Kind.LANDING: self.ink,
+            Kind.GROUND: self.ink,
+            Kind.FRAME: self.mismatch,
             Kind.END: self.ink,
         }.get(kind, self.lost)
 
@@ -122,6 +127,13 @@ MARK = {
     Kind.SOUND: "✓",
     Kind.DOUBTED: "◑",
     Kind.NO_MODEL: "◌",
+    Kind.PARAMETERS: "≈",
+    Kind.TAKE_OFF: "↗",
+    Kind.LANDING: "↘",
+    Kind.GROUND: "▁",
+    Kind.BLIND: "⊘",
+    Kind.SIGHT: "⊙",
+    Kind.FRAME: "⌖",
     Kind.END: "■",
 }
 WORD = {state: state.value.replace("_", " ") for state in State}

@@ -7,7 +7,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from fleet.contract import About, Alert, AlertKind, FleetRow, Link, Mission, Model, Prediction, Sample, State, Status
+from fleet.contract import (
+    About,
+    Alert,
+    AlertKind,
+    Controller,
+    FleetRow,
+    Link,
+    Mission,
+    Model,
+    Prediction,
+    Sample,
+    State,
+    Status,
+)
 from viewer.datatime import DataTime
 from viewer.events import Event, Known, closed, hear, merged
 from viewer.place import UNIT_M, Place
@@ -101,6 +114,7 @@ class Vehicle:
     mission: Mission | None = None
     model: Model | None = None
     prediction: Prediction | None = None
+    controller: Controller | None = None  # the law in force, as last told
     forecast: Forecast | None = None
     row: FleetRow | None = None
     time: DataTime = field(default_factory=DataTime)
@@ -227,5 +241,6 @@ class Vehicle:
         self.at, self.alerts, self.floor = None, {}, np.nan
         self.time, self.known, self.events = DataTime(), Known(), ()
         self.t, self.forecast, self.prediction, self.model, self.row = -np.inf, None, None, None, None
+        self.controller = None
         for history in (self.trail, self.past, self.fits, self.track):
             history.clear()

@@ -26,4 +26,9 @@ def parameters_said(names: list[str], before: Mapping[str, float], after: Mappin
 def mission_said(before: Mission | None, after: Mission) -> str:
     """Say what is on board now."""
     have = f"{len(after.items)} items" if after.items else "none"
-    return have if before is None else f"{have}, before {len(before.items)}"
+    if before is None:
+        return have
+    if len(before.items) != len(after.items):
+        return f"{have}, before {len(before.items)}"
+    others = sum(one != other for one, other in zip(before.items, after.items, strict=True))
+    return f"{have}, {others} of them others"

@@ -12,7 +12,7 @@ from twin_worker.events.note import note, void
 if TYPE_CHECKING:
     from twin_worker.memory import Twin
 
-NO_WINGS = ("multirotor", "helicopter")
+ROTORS = ("multirotor", "helicopter", "quadplane")
 LANDINGS = (21, 85)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND
 _OVER_S = 3.0  # it stands or flies for as long before it is believed [s]
 _STANDS, _FLIES = 1.5, 8.0  # ground speed of a wing that stands, and of one that flies [m/s]
@@ -70,7 +70,7 @@ def _flies(twin: "Twin") -> bool | None:
         return None
     down = to_ned(twin.origin, *place.T)[:, 2]
     level, speed = np.hypot(*v[:, :2].T), np.linalg.norm(v, axis=1)
-    if twin.vehicle in NO_WINGS:
+    if twin.vehicle in ROTORS:
         high = twin.ground.height - down.max() > _LOW_M  # false for nan
         stands = speed.max() < _HOVERS and not high and (not twin.ground.armed or not np.isnan(twin.ground.height))
         flies = bool(high) or level.min() > 2.0
