@@ -21,7 +21,7 @@ _TABLE = 10.0  # independent predictions the table counts as [-]
 _FADES_S = 400.0  # scores fade with age [s]
 _SHARE = np.minimum(1.0, EVERY_S / (0.5 * KNOTS))  # independent predictions one counts as: overlapping ones agree [-]
 _SHARE_HORIZON = EVERY_S / 30.0  # the same for a first passage [-]
-_TUBE_STEP, _HORIZON_STEP = 0.03, 0.02  # of the level, per independent miss [-]
+_TUBE_STEP, _HORIZON_STEP = 0.05, 0.02  # of the level, per independent miss [-]
 _LEAST_LEVEL, _MOST_LEVEL = 0.5, 0.99
 _COLUMN_OF = np.full(len(AHEAD), -1)
 _COLUMN_OF[COLUMN] = np.arange(len(KNOTS))
@@ -46,7 +46,8 @@ class Levels:
         failed = mine & ledger.claimed & ledger.passed & ~held
         ledger.claimed[held | failed] = False
         moved = failed.sum() * QUANTILE - held.sum() * (1.0 - QUANTILE)
-        self.horizon = float(np.clip(self.horizon + _HORIZON_STEP * moved, _LEAST_LEVEL, _MOST_LEVEL))
+        # never below: easy minutes, which hold whatever is claimed, must not pay for hard ones
+        self.horizon = float(np.clip(self.horizon + _HORIZON_STEP * moved, QUANTILE, _MOST_LEVEL))
 
 
 @dataclass(frozen=True)
@@ -92,8 +93,8 @@ def _join(atoms: np.ndarray, scores: np.ndarray, weight: np.ndarray, level: np.n
 def _horizon(ledger: Ledger, rows: np.ndarray, risks: np.ndarray, level: float) -> float:
     """Give the factor that keeps the wanted share of first passages behind the horizon."""
     followed, passed = ledger.followed[rows], ledger.passed[rows]
-    x, exact = critical(ledger.ratio[rows], followed, passed, AHEAD[np.maximum(ledger.size[rows] - 1, 0)])
+    x = critical(ledger.ratio[rows], followed)
     age = np.clip(ledger.until - ledger.t0[rows], 0.0, None)
     weight = np.where((followed > 0) | passed, _SHARE_HORIZON * np.exp(-age / _FADES_S), 0.0)
-    x, exact = np.append(risks, x), np.append(np.ones(ATOMS, bool), exact)
+    x, exact = np.append(risks, x), np.append(np.ones(ATOMS, bool), passed)
     return censored_quantile(x, np.append(np.full(ATOMS, _TABLE / ATOMS), weight), exact, level)

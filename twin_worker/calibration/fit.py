@@ -16,6 +16,8 @@ _NEAR = 1.2  # look-aheads within this factor of a knot speak for it [-]
 _SPEAKERS = 3  # as many of them, evenly: neighbours say much the same
 _NU = 4.0  # degrees of freedom of the errors: heavy tails
 _RIDGE = 0.05  # holds the scale near 1 where the spread never varies [-]
+_RIDGE_FLOOR = 0.02  # holds the floor near its usual share where the spread leaves it nothing [-]
+_USUAL_FLOOR = 0.3  # of the median error [-]
 _MOST_SPREAD = 3.0  # scale lies within exp of this, either way
 _FOLDS = 4  # most of them when a table is fitted; leaving one out is another matter
 _LEAST_M = 0.02  # smallest floor [m]
@@ -48,9 +50,10 @@ def _likeliest(s2: np.ndarray, e2: np.ndarray) -> tuple[float, float]:
     def cost(x: np.ndarray) -> float:
         sigma2 = np.exp(2 * x[0]) * s2 + np.exp(2 * x[1])
         fit = np.mean(np.log(sigma2) + (_NU + 1) * np.log1p(e2 / (_NU * sigma2)))
-        return float(fit + _RIDGE * x[0] ** 2)
+        return float(fit + _RIDGE * x[0] ** 2 + _RIDGE_FLOOR * (x[1] - usual) ** 2)
 
     typical = max(float(np.sqrt(np.median(e2))), _LEAST_M)
+    usual = np.log(_USUAL_FLOOR * typical)
     bounds = [(-_MOST_SPREAD, _MOST_SPREAD), (np.log(_LEAST_M), np.log(max(20 * typical, 10 * _LEAST_M)))]
     found = minimize(cost, [0.0, np.log(typical)], method="Nelder-Mead", bounds=bounds, options={"maxiter": 120})
     return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
@@ -104,7 +107,7 @@ def _with_risks(table: Table, scored: Scored, weight: np.ndarray) -> Table:
     ratio = growth(table.half_axes(scored.spread, AHEAD), scored.predicted_length)
     relative = scored.errors()[..., 3] / scored.length
     followed, censored = zip(*(first_passage(miss) for miss in relative), strict=True)
-    x, exact = critical(ratio, np.array(followed), ~np.array(censored), AHEAD[-1])
+    x, exact = critical(ratio, np.array(followed)), ~np.array(censored)
     n = len(x)
     risks = [censored_quantile(x, weight, exact, min(p * (n + 1) / n, 1.0)) for p in LEVELS]
     return Table(**{**vars(table), "risks": np.maximum.accumulate(risks)})

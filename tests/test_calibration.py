@@ -1,0 +1,275 @@
+"""Calibration tables: fitted, left out, written, read, chosen; coverage and horizons on errors of known law."""
+
+import json
+from dataclasses import fields, replace
+
+import made_up
+import numpy as np
+import pytest
+from made_up import GROUP, V
+
+from twin_worker.calibration.__main__ import main
+from twin_worker.calibration.check import claimed, figures, left_out
+from twin_worker.calibration.fit import fit, fit_sigma
+from twin_worker.calibration.groups import airframe_class, group_of, wider
+from twin_worker.calibration.miss import AHEAD, axes_error, first_passage, path_length, track_frame
+from twin_worker.calibration.quantile import censored_quantile, masses, median_passage, survival, weighted_quantile
+from twin_worker.calibration.scored import Scored
+from twin_worker.calibration.table import KNOTS, filled, law_of_growth, untaught
+from twin_worker.calibration.written import Source, Tables, load, read_tables, write
+
+
+@pytest.fixture(scope="module")
+def past() -> Scored:
+    return made_up.scored(10, 30, seed=1)
+
+
+@pytest.fixture(scope="module")
+def table(past):
+    return fit(past, GROUP)
+
+
+# --- misses ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_track_is_followed_across_the_change_of_step():
+    turn = AHEAD / 12.0
+    circle = 240.0 * np.column_stack([np.sin(turn), 1 - np.cos(turn), 0 * turn])
+    along = track_frame(circle)
+    tangent = np.column_stack([np.cos(turn), np.sin(turn)])
+    assert np.min(np.sum(along * tangent, axis=1)[1:-1]) > 0.999
+    many = axes_error(np.stack([circle, circle]), np.stack([circle, circle + np.array([0.0, 0.0, 2.0])]))
+    assert many.shape == (2, 91, 4) and np.allclose(many[1, :, 2], 2.0) and not many[0].any()
+
+
+def test_a_flight_that_was_not_followed_to_the_end_is_censored_where_it_was_lost():
+    relative = np.full(91, 0.05)
+    relative[40:] = np.nan
+    assert first_passage(relative) == (39.0, True)
+    assert first_passage(np.full(91, np.nan)) == (0.0, True)
+    relative[20:30] = 0.15
+    assert first_passage(relative) == (pytest.approx(19.5), False)
+
+
+def test_a_path_that_begins_later_has_a_length_behind_it():
+    assert path_length(made_up.LINE, V, before=500.0)[0] == 500.0
+    assert path_length(made_up.LINE, V)[-1] == pytest.approx(180 * V)
+
+
+# --- quantiles -------------------------------------------------------------------------------------------------------
+
+
+def test_weighted_quantiles_are_quantiles_and_heed_the_weights():
+    x = np.random.default_rng(0).standard_normal((2, 4000))
+    even = weighted_quantile(x, np.ones_like(x), np.array([0.9, 0.5]))
+    assert even == pytest.approx([np.quantile(x[0], 0.9), np.quantile(x[1], 0.5)], abs=1e-3)
+    heavy = np.where(x > 1.0, 10.0, 1.0)
+    assert weighted_quantile(x, heavy, np.array([0.5, 0.5]))[0] > 0.9
+    some = np.array([[np.nan, 1.0, 2.0, np.nan]])
+    assert 1.0 <= weighted_quantile(some, np.array([[0.0, 1.0, 1.0, 0.0]]), np.array([0.9]))[0] <= 2.0
+    assert weighted_quantile(np.array([[3.0]]), np.ones((1, 1)), np.array([0.1]))[0] == 3.0
+
+
+def test_bounds_from_above_give_their_weight_to_what_lies_below():
+    x = np.array([4.0, 3.0, 2.0, 1.0])
+    assert masses(x, np.ones(4), np.ones(4, bool)) == pytest.approx([0.25] * 4)
+    assert masses(x, np.ones(4), np.array([True, False, True, True])) == pytest.approx([0.25, 0.0, 0.375, 0.375])
+    assert censored_quantile(x, np.ones(4), np.zeros(4, bool), 0.9) == 0.0
+
+
+def test_survival_by_hand():
+    passages = [(10.0, False), (20.0, True), (30.0, False), (40.0, True)]  # 3/4, then one of two
+    assert [survival(passages, t) for t in (5.0, 10.0, 11.0, 30.0, 31.0)] == [1.0, 1.0, 0.75, 0.75, 0.375]
+    assert median_passage(passages) == 30.0
+    assert median_passage([(10.0, False), (60.0, True), (50.0, True)]) == 60.0  # half never pass: the longest
+    assert np.isnan(survival([], 10.0))
+
+
+# --- fitting ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_fit_finds_how_much_wider_errors_are_than_the_ensemble(past):
+    scale, _ = fit_sigma(past.spread, past.errors()[..., :3])
+    assert np.median(scale[4:, 0]) == pytest.approx(0.8 * 2.0, rel=0.15)  # heavy tails take a normal law for narrower
+
+
+def test_nine_of_ten_are_held_at_every_look_ahead(table):
+    fresh = made_up.scored(40, 50, seed=2)  # 2,000 predictions it has not seen
+    got = figures(fresh, claimed(table, fresh))
+    assert got["coverage"] == pytest.approx(0.9, abs=0.03)
+    for at in (5, 16, 30, 60, 120):
+        assert got[f"coverage_{at}"] == pytest.approx(0.9, abs=0.04)
+    assert 1.5 * 2 < got["along_60_m"] / np.interp(60, AHEAD, made_up.GROWTH[:, 0]) < 2.6 * 2  # 2.1 sigma hold 90 %
+
+
+def test_what_is_left_out_says_the_same(past):
+    got = figures(past, left_out(past, GROUP))
+    assert got["coverage"] == pytest.approx(0.9, abs=0.04)
+
+
+def test_a_table_is_not_honest_of_errors_twice_as_large(table):
+    fresh = made_up.scored(10, 30, seed=3, loud=2.0)
+    assert figures(fresh, claimed(table, fresh))["coverage"] < 0.75
+
+
+def test_horizons_hold_and_tell_easy_minutes_from_hard_ones(table):
+    fresh = made_up.scored(40, 50, seed=4)
+    got = figures(fresh, claimed(table, fresh))
+    assert 0.9 <= got["hit_rate"] <= 0.99
+    assert got["rank_correlation"] >= 0.5
+    horizon = claimed(table, fresh)[1]
+    assert np.mean(horizon > 60) > 0.5 and np.mean(horizon < 60) > 0.1
+    hard = fresh.spread[:, 40, 0] > np.quantile(fresh.spread[:, 40, 0], 0.8)
+    assert figures(fresh.part(hard), claimed(table, fresh.part(hard)))["hit_rate"] >= 0.82  # the hard ones hold too
+
+
+def test_without_an_ensemble_the_law_of_growth_is_calibrated_instead(past):
+    bare = replace(past, spread=np.array([filled(None, "hybrid", AHEAD)] * len(past)))
+    fresh = replace(made_up.scored(20, 30, seed=5), spread=np.array([filled(None, "hybrid", AHEAD)] * 600))
+    assert figures(fresh, claimed(fit(bare, GROUP), fresh))["coverage"] == pytest.approx(0.9, abs=0.03)
+
+
+def test_nobody_followed_beyond_a_minute(past):
+    flown, length = past.flown.copy(), past.length.copy()
+    flown[:, 61:], length[:, 61:] = np.nan, np.nan
+    short = fit(replace(past, flown=flown, length=length), GROUP)
+    for part in (short.scale, short.floor, short.factor, short.scores, short.risks):
+        assert np.isfinite(part).all()
+    assert short.half_axes(past.spread[0], AHEAD)[-1, 0] > 0
+
+
+def test_a_wider_table_is_left_out_by_groups(past):
+    other = replace(made_up.scored(4, 30, seed=6, loud=3.0), group=np.full(120, "hybrid/arduplane/c172p/known"))
+    both = Scored(**{f.name: np.concatenate([getattr(past, f.name), getattr(other, f.name)]) for f in fields(Scored)})
+    wide = both.folds("hybrid/arduplane/*/known")
+    assert wide.max() == 1 and both.folds(GROUP).max() == 13
+    assert (fit(both, "hybrid/arduplane/*/known").half_axes(past.spread[0], AHEAD)[30] > 10.0).any()
+
+
+# --- groups and tables -----------------------------------------------------------------------------------------------
+
+
+def test_the_chain_of_groups_keeps_parameters_longer_than_the_airframe():
+    chain = ["a/b/c/known", "a/b/*/known", "a/b/*/*", "a/*/*/*"]
+    assert list(wider("a/b/c/known")) == chain
+    assert list(wider("a")) == ["a/*/*/*"] * 4
+    assert group_of("hybrid", "arduplane: L1 + TECS", "fixed_wing", "known") == GROUP
+    assert group_of("imm", "", "", "a/b") == "imm/none/none/a b"
+    assert [airframe_class("fixed_wing", v) for v in (22.0, 50.0)] == ["fixed_wing", "fixed_wing_fast"]
+    assert airframe_class("multirotor", 50.0) == "multirotor"
+
+
+def test_the_narrowest_table_is_chosen_and_said(table):
+    names = [GROUP, "hybrid/arduplane/*/known", "hybrid/*/*/*"]
+    tables = Tables({name: replace(table, group=name) for name in names})
+    for group, chosen in (
+        (GROUP, names[0]),
+        ("hybrid/arduplane/c172p/known", names[1]),
+        ("hybrid/arduplane/c172p/absent", names[2]),
+        ("hybrid/px4/fixed_wing/known", names[2]),
+    ):
+        found, said = tables.choose(group)
+        assert found.group == chosen and chosen in said and "300 predictions of 10 flights" in said
+        assert (f"none for {group}" in said) == (group != chosen)
+    found, said = tables.choose("dynamics/arduplane/fixed_wing/known")
+    assert found.starts == 0 and "not calibrated: no table for dynamics/" in said
+
+
+@pytest.mark.parametrize("method", ["dynamics", "hybrid", "paper", "copter", "greybox", "imm", "unheard of"])
+def test_an_untaught_table_is_never_narrower_than_the_law_of_growth(method):
+    ahead = np.concatenate([AHEAD, [200.0, 300.0]])
+    law = law_of_growth(method, ahead)
+    for spread in (None, np.zeros((93, 3)), np.full((93, 3), 5.0)):
+        axes = untaught(method).half_axes(filled(spread, method, ahead), ahead)
+        assert np.isfinite(axes).all() and (axes >= law * 0.99)[1:91].all() and (axes[-1] > axes[-2]).all()
+
+
+@pytest.mark.parametrize("noise", [np.nan, np.inf, -np.inf, -1.0, 1e30])
+def test_a_spread_that_is_nonsense_is_replaced_where_it_is(noise):
+    spread = np.ones((91, 3))
+    spread[30:40, 1] = noise
+    got = filled(spread, "hybrid", AHEAD)
+    assert np.isfinite(got).all() and got[29, 1] == 1.0
+    assert np.allclose(got[30:40, 1], law_of_growth("hybrid", AHEAD)[30:40, 1])
+
+
+def test_tables_are_written_and_read_back(tmp_path, table):
+    path = tmp_path / "a.json"
+    write(path, [table], [Source("p.npz", 300, ("seed-1",))], "2024-05-01", "fit p.npz")
+    back = read_tables(path).by_group[GROUP]
+    for name in ("scale", "floor", "factor", "scores", "risks"):
+        assert np.allclose(getattr(back, name), getattr(table, name), rtol=1e-3)
+    assert json.loads(path.read_text())["sources"] == [{"file": "p.npz", "starts": 300, "flights": ["seed-1"]}]
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda text: "",
+        lambda text: text[:200],
+        lambda text: "[]",
+        lambda text: text.replace('"format": 1', '"format": 9'),
+        lambda text: text.replace('"factor": [', '"factor": [1.0, '),
+        lambda text: text.replace('"floor": [\n    [', '"floor": [\n    [-1.0, '),
+        lambda text: text.replace('"factor": [', '"factor": [1e9, ', 1).replace(", ", "", 1),
+    ],
+)
+def test_a_broken_file_of_tables_is_a_sentence(tmp_path, table, spoil):
+    write(tmp_path / "good.json", [table], [], "", "")
+    text = (tmp_path / "good.json").read_text()
+    (tmp_path / "bad.json").write_text(spoil(text))
+    with pytest.raises(ValueError, match=r"^calibration bad.json: found .*; fit it again$"):
+        read_tables(tmp_path / "bad.json")
+    tables = load(tmp_path)
+    assert list(tables.by_group) == [GROUP] and tables.sentence.startswith("calibration bad.json: found")
+    assert tables.sentence in tables.choose("imm/none/fixed_wing/known")[1]
+
+
+def test_a_folder_without_tables_is_no_trouble(tmp_path):
+    assert load(tmp_path / "nowhere").by_group == {}
+
+
+def test_the_tables_that_come_along_are_whole():
+    tables = load()
+    assert not tables.sentence
+    for name, table in tables.by_group.items():
+        assert name == table.group and table.flights >= 3 and (np.diff(table.risks) >= 0).all()
+        assert 0.8 <= table.held_out["coverage"] <= 1.0
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+def as_npz(path, scored: Scored) -> None:
+    np.savez(path, ahead=AHEAD, **{f.name: getattr(scored, f.name) for f in fields(Scored)})
+
+
+def test_the_command_fits_and_checks(tmp_path, capsys, past):
+    as_npz(tmp_path / "p.npz", past.part(np.arange(150)))
+    as_npz(tmp_path / "few.npz", made_up.scored(2, 12, seed=7, group="imm/none/fixed_wing/known"))
+    out = tmp_path / "t.json"
+    assert main(["fit", str(tmp_path / "p.npz"), str(tmp_path / "few.npz"), "--out", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert f"{GROUP}: 150 predictions of 5 flights; flights left out: coverage" in told
+    assert "imm/none/fixed_wing/known: no table from 24 predictions of 2 flights" in told
+    sheet = json.loads(out.read_text())
+    assert sheet["command"].endswith("fit p.npz few.npz") and str(tmp_path) not in out.read_text()
+    assert {t["group"] for t in sheet["tables"]} == set(wider(GROUP))
+    assert main(["check", str(tmp_path / "p.npz"), "--with", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "table alone: coverage" in told and "adapted in flight: coverage" in told
+    assert KNOTS.tolist() == sheet["knots_s"]
+
+
+def test_the_command_says_what_is_wrong(tmp_path, capsys, past):
+    bad = tmp_path / "bad.npz"
+    bad.write_bytes(b"nothing")
+    out = ["--out", str(tmp_path / "t.json")]
+    assert main(["fit", str(bad), *out]) == 2
+    assert "bad.npz: found no scored predictions" in capsys.readouterr().err
+    np.savez(bad, ahead=np.arange(61.0), **{f.name: getattr(past, f.name) for f in fields(Scored)})
+    assert main(["fit", str(bad), *out]) == 2 and "another look-ahead grid" in capsys.readouterr().err
+    as_npz(bad, replace(past, flown=past.flown[:, :61]))
+    assert main(["fit", str(bad), *out]) == 2 and "found flown of shape" in capsys.readouterr().err
+    as_npz(bad, past.part(np.arange(3)))
+    assert main(["fit", str(bad), *out]) == 2 and "give more flights" in capsys.readouterr().err
