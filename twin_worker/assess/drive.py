@@ -9,7 +9,8 @@ from fleet.contract import Message, Params, Prediction, Status
 from twin_worker.assess.case import OURS, Asked, Case, Told
 from twin_worker.assess.log import Log
 from twin_worker.assess.methods import BASELINES, Now
-from twin_worker.assess.truth import FIRST_S, answer
+from twin_worker.assess.truth import FIRST_S, WHOLE_S, answer
+from twin_worker.horizon import AHEAD
 from twin_worker.kinds import seen
 from twin_worker.memory import hear
 from twin_worker.plant import DYNAMICS, PAPER
@@ -148,7 +149,7 @@ def _start(one: Examined, made: Prediction, plan: Plan) -> None:
     if flown is None or twin.origin is None:
         return
     flown = flown.whole()
-    ahead = made.ahead.numpy().astype(float)
+    ahead = AHEAD
     now = Now(twin, flown, ahead + (made.t - flown.t[-1]))
     told = {OURS: _told(made, ahead, made.t)}
     for name in plan.methods:
@@ -181,14 +182,15 @@ def _path(name: str, now: Now, ours: Told) -> Told | None:
     if name == DYNAMICS and ours.made_by == DYNAMICS:
         return Told(ours.path, DYNAMICS)
     path = BASELINES[name](now)
-    return None if path is None or not np.isfinite(path).all() else Told(path, name)
+    near = now.ahead <= WHOLE_S
+    return None if path is None or not np.isfinite(path[near]).all() else Told(path, name)
 
 
 def _told(made: Prediction, ahead: np.ndarray, t: float) -> Told:
     """Read a prediction at look-aheads from `t`, which lies within a step of its own time."""
     own = made.t + made.ahead.numpy().astype(float)
     path, tube = (
-        np.column_stack([np.interp(t + ahead, own, column) for column in rows.numpy().astype(float).T])
+        np.column_stack([np.interp(t + ahead, own, column, right=np.nan) for column in rows.numpy().astype(float).T])
         for rows in (made.path, made.tube)
     )
     return Told(path, made.method, tube, made.horizon_s)
@@ -205,8 +207,9 @@ def _paper(one: Examined, made: Prediction, ahead: np.ndarray) -> Told | None:
 def _kept(twin: Twin, made: Prediction, ahead: np.ndarray) -> tuple[str, np.ndarray]:
     """Give what shares the calibration of a prediction, and its ensemble's standard deviations, (k, 3) [m] or nan."""
     latest = twin.record.latest
+    spread = np.full((len(ahead), 3), np.nan)
     if latest is None or abs(latest[0].t + latest[0].ahead[0] - made.t) > _SAME_S:
-        return made.method, np.full((len(ahead), 3), np.nan)
-    guess = latest[0]
-    none = guess.spread is None or len(guess.spread) != len(ahead)
-    return guess.group, np.full((len(ahead), 3), np.nan) if none else np.asarray(guess.spread, float)
+        return made.method, spread
+    if latest[0].spread is not None:
+        spread[: len(latest[0].spread)] = latest[0].spread
+    return latest[0].group, spread
