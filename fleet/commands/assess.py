@@ -12,7 +12,7 @@ EXAMPLES = """
   fleet assess monday/*.tlog.xz --out monday --json monday.json --jobs 2
   fleet assess flight.tlog --methods route_wind --without-params     ours against one, autopilot parameters withheld
 """
-OWN = ("auto", "dynamics", "paper")
+OWN = ("auto", "dynamics", "hybrid", "paper")
 METHODS = ("cv", "ct", "imm", "route", "route_wind", "paper", "dynamics")
 
 

@@ -9,13 +9,12 @@ from typing import Any
 from rich.console import Console
 
 from fleet.cli import guarded, parser_for
-from fleet.commands.assess import EXAMPLES, OWN, arguments, check, chosen
+from fleet.commands.assess import EXAMPLES, arguments, check, chosen
 from twin_worker.assess.case import Case
 from twin_worker.assess.drive import Plan
 from twin_worker.assess.share import Found, assess
 from twin_worker.assess.summary import summary
 from twin_worker.assess.table import table
-from twin_worker.plant import DYNAMICS
 
 _WIDE = 150  # columns of the table where the output is no terminal
 
@@ -30,8 +29,7 @@ def _run(args: argparse.Namespace) -> int:
     from twin_worker.warm import warm_up  # numba is slow to import: say what happens first
 
     warm_up()
-    method = DYNAMICS if args.method == OWN[0] else args.method
-    plan = Plan(args.every, method, chosen(args.methods), args.without_params)
+    plan = Plan(args.every, args.method, chosen(args.methods), args.without_params)
     found = assess(args.file, plan, jobs=args.jobs, offset=args.offset, say=_say)
     told = summary(found.cases) | {"run": _about(args, plan, found)}
     console = Console()

@@ -12,7 +12,7 @@ from twin_worker.assess.methods import BASELINES, Now
 from twin_worker.assess.truth import FIRST_S, WHOLE_S, answer
 from twin_worker.horizon import AHEAD
 from twin_worker.kinds import seen
-from twin_worker.memory import hear
+from twin_worker.memory import AUTO, hear
 from twin_worker.plant import DYNAMICS, PAPER
 from twin_worker.twin import Twin, advance, silence
 
@@ -33,7 +33,7 @@ class Plan:
     """
 
     every_s: float = 5.0
-    method: str = DYNAMICS
+    method: str = AUTO
     methods: tuple[str, ...] = (*BASELINES, PAPER)
     without_params: bool = False
 
