@@ -9,22 +9,31 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleet.autopilots import arduplane, copter
+from fleet.autopilots import copter, laws
 from fleet.contract import Controller
 
 RECEIVED, IDENTIFIED, DEFAULT, ASKED = "received", "identified", "default", "asked"
-TOLD_OF = (  # of ArduPlane's parameters, those that shape a path; the others are flown with all the same
+_ARDUPLANE = (
     "NAVL1_PERIOD", "NAVL1_DAMPING", "WP_RADIUS", "WP_LOITER_RAD", "ROLL_LIMIT_DEG", "AIRSPEED_CRUISE", "AIRSPEED_MIN",
     "AIRSPEED_MAX", "TECS_TIME_CONST", "TECS_CLMB_MAX", "TECS_SINK_MIN", "TECS_SINK_MAX", "TECS_HDEM_TCONST",
     "TECS_SPDWEIGHT", "TECS_PITCH_MAX", "TECS_PITCH_MIN", "PTCH_LIM_MAX_DEG", "PTCH_LIM_MIN_DEG", "TRIM_THROTTLE",
 )  # fmt: skip
-TOLD_OF_GUIDANCE = (*TOLD_OF[:5], "AIRSPEED_CRUISE", "TECS_CLMB_MAX", "TECS_SINK_MAX")
+_PX4 = (
+    "NPFG_PERIOD", "NPFG_DAMPING", "NPFG_SW_DST_MLT", "FW_R_LIM", "NAV_ACC_RAD", "NAV_LOITER_RAD", "FW_AIRSPD_TRIM",
+    "FW_AIRSPD_MIN", "FW_AIRSPD_MAX", "FW_T_CLMB_MAX", "FW_T_SINK_MIN", "FW_T_SINK_MAX", "FW_T_CLMB_R_SP",
+    "FW_T_SINK_R_SP", "FW_T_ALT_TC", "FW_T_TAS_TC", "FW_THR_TRIM", "FW_P_LIM_MAX", "FW_P_LIM_MIN",
+)  # fmt: skip
+_TEXTBOOK = ("chi_inf", "k_path", "k_orbit", "R_fillet", "R_orbit", "phi_max", "Va_c", "climb_max", "sink_max")
+TOLD_OF = {"arduplane": _ARDUPLANE, "px4": _PX4, "textbook": _TEXTBOOK}
+"""Parameters that shape a path, by law; the others are flown with all the same."""
+TOLD_OF_GUIDANCE = (*_ARDUPLANE[:5], "AIRSPEED_CRUISE", "TECS_CLMB_MAX", "TECS_SINK_MAX")
+CRUISE_OF = {"arduplane": "AIRSPEED_CRUISE", "px4": "FW_AIRSPD_TRIM", "textbook": "Va_c"}
 CRUISE = ("AIRSPEED_CRUISE", "WP_SPD", "FW_AIRSPD_TRIM", "MPC_XY_CRUISE", "Q_WP_SPD")  # what a wished speed overrides
 
 
 def why_unusable(name: str, value: float) -> str:
     """Say why a law would not take this value of a parameter of its own; empty where it would, or knows no such."""
-    row = next((row for row in arduplane.TABLE if row.name == name), None)
+    row = next((row for law in laws.LAWS.values() for row in law.table if row.name == name), None)
     if row is None or row.low <= value <= row.high:
         return ""
     return f"{name}: found {value:g}, expected {row.low:g}..{row.high:g}"
@@ -39,16 +48,18 @@ class Control:
         values: parameters in the autopilot's names and units
         known: how each of them is known
         told: those worth telling
+        name: of the law in `laws.LAWS`
     """
 
     law: str
     values: Mapping[str, float] = field(default_factory=dict)
     known: Mapping[str, str] = field(default_factory=dict)
     told: tuple[str, ...] = ()
+    name: str = "arduplane"
 
     def par(self, altitude_m: float) -> np.ndarray:
-        """Give ArduPlane's vector at a height above mean sea level [m]."""
-        return arduplane.vector(self.values, altitude_m)
+        """Give the vector the law's kernels read, at a height above mean sea level [m]."""
+        return laws.parameters(self.name, self.values, altitude_m)[0]
 
     @property
     def absent(self) -> tuple[str, ...]:
@@ -67,24 +78,27 @@ def on_wings(
     received: Mapping[str, float],
     identified: Mapping[str, float] | None = None,
     asked: Mapping[str, float] | None = None,
-    law: str = arduplane.LAW,
+    law: str = "arduplane",
+    sentence: str = "",
 ) -> Control:
-    """Give ArduPlane's controller twin.
+    """Give the controller twin of a fixed wing.
 
     Args:
         received: parameters as the autopilot names and scales them, current or older names
         identified: learnt from flight, current names; they count only where none was received
         asked: what a what-if has instead of either
-        law: as in `Prediction`
+        law: name in `laws.LAWS`
+        sentence: of the law as in `Prediction`, where it is flown by its guidance alone
     """
     asked = asked or {}
-    _, missing = arduplane.read({**received, **asked})
+    _, missing = laws.read(law, {**received, **asked})
     learnt = {name: value for name, value in (identified or {}).items() if name in missing}
-    values, absent = arduplane.read({**received, **learnt, **asked})
+    values, absent = laws.read(law, {**received, **learnt, **asked})
     known = dict.fromkeys(values, RECEIVED)
     known |= dict.fromkeys(learnt, IDENTIFIED) | dict.fromkeys(set(asked) & set(values), ASKED)
     known |= dict.fromkeys(absent, DEFAULT)
-    return Control(law, values, known, TOLD_OF if law == arduplane.LAW else TOLD_OF_GUIDANCE)
+    told = TOLD_OF_GUIDANCE if sentence else TOLD_OF[law]
+    return Control(sentence or laws.LAWS[law].sentence, values, known, told, law)
 
 
 def on_rotors(

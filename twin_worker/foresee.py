@@ -6,10 +6,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fleet.autopilots import arduplane
 from fleet.contract import SENTENCES, Array, Controller, Event, Message, Prediction, State
 from twin_worker.calibration.groups import airframe_class, group_of
-from twin_worker.control import Control
+from twin_worker.control import IDENTIFIED, Control
 from twin_worker.events.note import note
 from twin_worker.fly_route import fly_route, in_force
 from twin_worker.horizon import AHEAD, QUANTILE, Made, Trust
@@ -142,8 +141,7 @@ def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
             first = fly_route(twin, window, ahead)
         if _good(first):
             twin.state = _state(twin, State.PREDICTING)
-            sentence = " ".join(filter(None, (_strange_law(twin), first.sentence)))
-            return replace(first, sentence=sentence), float(window.t[-1])  # type: ignore[union-attr]
+            return first, float(window.t[-1])  # type: ignore[union-attr]
         why = first.sentence
     second = fly_kind(twin, flown, ahead)
     if _good(second):
@@ -171,16 +169,11 @@ def _whole(path: np.ndarray | None) -> int:
 
 def _group(twin: Twin, flight: Flight, speed: float) -> str:
     """Name the calibration group of a flight ahead."""
-    values = twin.params.values if twin.params else {}
-    absent = sum(name not in values for name in arduplane.DEFAULTS)
-    known = "known" if absent <= _MISSED or (twin.params is not None and twin.params.complete) else "absent"
+    control = flight.control
+    known = "known"
+    if control is not None and len(control.absent) > _MISSED:
+        known = "identified" if IDENTIFIED in control.known.values() else "absent"
     return group_of(flight.method, flight.law, airframe_class(twin.vehicle, speed), known)
-
-
-def _strange_law(twin: Twin) -> str:
-    """Say where the controller twin is not the autopilot's own."""
-    autopilot = twin.status.autopilot if twin.status else "unknown"
-    return "" if autopilot == "ardupilot" else f"autopilot {autopilot} is flown by ArduPlane's law, not its own"
 
 
 def _state(twin: Twin, otherwise: State) -> State:

@@ -108,7 +108,7 @@ def fly(track: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
 
 
 def _fly(seen: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarray) -> Ahead:
-    law_now = on_wings(board.params, grey.identified, law=law.LAW)
+    law_now = on_wings(board.params, grey.identified, sentence=law.LAW)
     par = law_now.par(_altitude(seen, board))
     way = route(board.items, seq=int(seq[0]), origin=board.origin, params=board.params)
     if not len(way.legs):
@@ -152,7 +152,7 @@ def _altitude(seen: Track, board: Board) -> float:
 
 def _otherwise(now: _Course, seen: Track, board: Board, grey: Grey, instead: Instead) -> _Course:
     """Let the synchronised guidance go over to what a what-if flies; its lags and shares stay."""
-    control = on_wings(board.params, grey.identified, instead.asked, law.LAW)
+    control = on_wings(board.params, grey.identified, instead.asked, sentence=law.LAW)
     way, par, lags = instead.way(board.origin, board.params), control.par(_altitude(seen, board)), now.lags.copy()
     if CRUISE in instead.asked:
         lags[law.CRUISE] = par[P.VA_CRUISE] * lags[law.SHARE]

@@ -36,7 +36,7 @@ _TELL_S = 5.0  # between models that say nothing new [s]
 def learn(twin: Twin) -> list[Message]:
     """Identify and verify once; give the model with its verdict where it is news, nothing while data are starved."""
     compare_with_flight(twin)
-    if twin.vehicle in WINGS and twin.method != PAPER:
+    if twin.vehicle in WINGS:
         renew(twin)
     window = _on_wings(twin, twin.window(_stretch_s(twin) + _held_most(twin)))
     why_not = _why_not(twin, window)

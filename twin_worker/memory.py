@@ -22,6 +22,7 @@ from twin_worker.greybox import Grey
 from twin_worker.history import History
 from twin_worker.horizon import Record
 from twin_worker.hybrid.fit import Hybrid
+from twin_worker.learn_law import OWN, Learnt
 from twin_worker.plant import Plant
 from twin_worker.predict import Onboard, Situation
 from twin_worker.preprocess import Grid
@@ -89,7 +90,7 @@ class Twin:
     mission: Mission | None = None
     params: Params | None = None
     servos: ServoMap = field(default_factory=lambda: servo_map({}))
-    identified: dict[str, float] = field(default_factory=dict)  # autopilot parameters learnt from flight
+    learnt: Learnt = field(default_factory=Learnt)  # of the autopilot, from flight
     instead: Instead | None = None  # what a copy of this twin flies to answer a what-if
     plant: Plant | None = None  # the model in force
     near: Coupled | None = None  # newest coupled model, believed or not: the next search begins there
@@ -146,6 +147,11 @@ class Twin:
         return f"{self.in_force.sentence}; newest try: {self.verdict.outcome.value.replace('_', ' ')}"
 
     @property
+    def autopilot(self) -> str:
+        """Give what its heartbeat calls the autopilot, e.g. px4."""
+        return self.status.autopilot if self.status else "unknown"
+
+    @property
     def received(self) -> dict[str, float]:
         """Give the autopilot parameters received, in its own names and units."""
         return self.params.values if self.params else {}
@@ -165,7 +171,10 @@ class Twin:
         """Give what a prediction from the end of `window` starts from."""
         assert self.origin is not None
         items = self.mission.items if self.mission else ()
-        onboard = Onboard(items, self.received, self.since, self.identified, self.instead)
+        law = OWN.get(self.autopilot, self.learnt.law)
+        onboard = Onboard(
+            items, self.received, self.since, self.learnt.values, self.instead, self.autopilot, law, self.learnt.said
+        )
         return Situation(window, self.history, onboard, self.wind, self.origin)
 
     def why_no_route(self) -> str:

@@ -8,15 +8,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fleet.autopilots import arduplane
-from fleet.autopilots.arduplane.params import VA_CRUISE
+from fleet.autopilots import arduplane, laws
 from fleet.autopilots.shadow import shadow
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
-from fleet.mission import KIND, LAND, P_D, P_N, TAKEOFF, route
+from fleet.mission import FIRST, KIND, LAND, P_D, P_N, TAKEOFF, route
 from fleet.simulate import N_STATE, simulate
 from fleet.window import Window
-from twin_worker.control import Control, on_wings
+from twin_worker.control import CRUISE_OF, Control, on_wings
 from twin_worker.history import History
 from twin_worker.plant import Plant, acting, settled
 from twin_worker.speed import aimed_at, as_told
@@ -25,6 +24,7 @@ from twin_worker.wind import WindFilter
 
 LEAST_AHEAD_S = 60.0  # a flight ahead that ends before is none [s]
 SHADOW_S = 60.0  # telemetry the controller twin is synchronised on [s]
+_WIND_S = 10.0  # the autopilot's own wind is believed for as long [s]
 _SHADOW_STEP = 2  # window rows per shadow step
 _REFUSED = {TAKEOFF: "take-off", LAND: "landing"}
 
@@ -78,6 +78,51 @@ class Onboard:
     since: float  # when route, mode and parameters last changed [s since 1970]
     identified: Mapping[str, float] = field(default_factory=dict)  # learnt from flight; counts where none was received
     instead: Instead | None = None  # what a what-if flies from the start on
+    autopilot: str = "ardupilot"  # what it calls itself
+    law: str = "arduplane"  # name in `laws.LAWS`; empty: none is believed
+    why: str = ""  # how the law was chosen, or why there is none
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What was flown on the present route, as a law is replayed on it.
+
+    Attributes:
+        good: telemetry, unbroken
+        legs, start: route from the item in force at its beginning, and the point before
+        rows: t p v euler rates Va phi_c theta_c delta, as `shadow` takes them
+        seq: mission item in force at each
+        altitude_m: above mean sea level, at the end [m]
+        sentence: what is wrong with the route, or empty
+    """
+
+    good: Window
+    legs: np.ndarray
+    start: np.ndarray
+    rows: tuple[np.ndarray, ...]
+    seq: np.ndarray
+    altitude_m: float
+    sentence: str
+
+    @property
+    def t(self) -> np.ndarray:
+        """Give times from the first, (n,) [s]."""
+        return self.rows[0]
+
+    @property
+    def p(self) -> np.ndarray:
+        """Give positions, NED, (n, 3) [m]."""
+        return self.rows[1]
+
+    @property
+    def Va(self) -> np.ndarray:
+        """Give reported airspeeds, (n,) [m/s]."""
+        return self.rows[5]
+
+    @property
+    def phi_c(self) -> np.ndarray:
+        """Give the banks asked for, (n,) [rad]."""
+        return self.rows[6]
 
 
 @dataclass(frozen=True)
@@ -121,8 +166,8 @@ def fly_ahead(now: Situation, plant: Plant, ahead: np.ndarray) -> Flown:
     return start if isinstance(start, Flown) else fly_from(start, plant, ahead)
 
 
-def set_out(now: Situation) -> Start | Flown:
-    """Synchronise the controller twin on what was flown; give where any model starts, or why none can."""
+def heard(now: Situation) -> Heard | Flown:
+    """Lay what was flown on the present route for a replay, or say why it cannot be."""
     good = _on_this_route(now.window, now.onboard.since)
     if len(good) < 5.0 / good.dt:
         return Flown(None, -1, f"{good.seconds:.0f} s on this route, 5 s are needed; wait")
@@ -131,18 +176,41 @@ def set_out(now: Situation) -> Start | Flown:
     if not np.isfinite(seq[-1]):
         return Flown(None, -1, "the mission item in force is not reported (MISSION_CURRENT)")
     seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
-    law = on_wings(now.onboard.params, now.onboard.identified)
-    par = law.par(_altitude(now, good))
-    way = route(now.onboard.items, seq=int(seq[0]), origin=now.origin, params=now.onboard.params)
+    board = now.onboard
+    first = FIRST.get(board.autopilot, 1)
+    way = route(board.items, seq=int(seq[0]), origin=now.origin, params=board.params, first=first)
+    said = " ".join(way.sentences)
     if not len(way.legs):
-        return Flown(None, int(seq[-1]), " ".join(way.sentences) or "the mission has no legs to fly")
-    told = aimed_at(now.history, float(good.t[-1]))
-    legs = as_told(way.legs, float(seq[-1]), float(par[VA_CRUISE]), told)
+        return Flown(None, int(seq[-1]), said or "the mission has no legs to fly")
     start = way.start if np.isfinite(way.start).all() else good.p[0]
-    ctl, _ = shadow(par, legs, start, *_telemetry(good, at, now.history), seq)  # type: ignore[call-arg]
-    begun = Start(good, (ctl, par, legs), _start(now, good), int(seq[-1]), " ".join(way.sentences), law)
-    if now.onboard.instead is not None:
-        begun = _otherwise(now, begun, now.onboard.instead)
+    altitude = now.origin.alt_mm * 1e-3 - float(good.p[-1, 2])
+    return Heard(good, way.legs, start, _telemetry(good, at, now.history), seq, altitude, said)
+
+
+def known_wind(now: Situation, good: Window) -> tuple[float, float]:
+    """Give the wind the autopilot believes in: its own where it tells it, else the twin's, NED [m/s]."""
+    reported = held(*now.history.rows("wind"), good.t[-1:], _WIND_S)[0]
+    w_n, w_e = reported if np.isfinite(reported).all() else now.wind.wind[:2]
+    return float(w_n), float(w_e)
+
+
+def set_out(now: Situation) -> Start | Flown:
+    """Synchronise the controller twin on what was flown; give where any model starts, or why none can."""
+    seen, board = heard(now), now.onboard
+    if isinstance(seen, Flown):
+        return seen
+    seq = int(seen.seq[-1])
+    if not board.law:
+        return Flown(None, seq, board.why or "the control law is not known yet")
+    law = on_wings(board.params, board.identified, law=board.law)
+    par = laws.blown(law.par(seen.altitude_m), *known_wind(now, seen.good))
+    told = aimed_at(now.history, float(seen.good.t[-1]))
+    legs = as_told(seen.legs, float(seq), float(law.values[CRUISE_OF[board.law]]), told)
+    ctl, _ = shadow(par, legs, seen.start, *seen.rows, seen.seq)  # type: ignore[call-arg]
+    said = " ".join(filter(None, (board.why, seen.sentence)))
+    begun = Start(seen.good, (ctl, par, legs), _start(now, seen.good), seq, said, law)
+    if board.instead is not None:
+        begun = _otherwise(now, begun, board.instead)
     return _refused(begun) or replace(begun, sentence=" ".join(filter(None, (begun.sentence, _assumed(begun.law)))))
 
 
@@ -152,8 +220,9 @@ def _altitude(now: Situation, good: Window) -> float:
 
 def _otherwise(now: Situation, begun: Start, instead: Instead) -> Start:
     """Let the synchronised controller go over to what a what-if flies."""
-    law = on_wings(now.onboard.params, now.onboard.identified, instead.asked)
-    way, par = instead.way(now.origin, now.onboard.params), law.par(_altitude(now, begun.good))
+    law = on_wings(now.onboard.params, now.onboard.identified, instead.asked, now.onboard.law)
+    way = instead.way(now.origin, now.onboard.params)
+    par = laws.blown(law.par(_altitude(now, begun.good)), *known_wind(now, begun.good))
     ctl, _, legs = begun.control
     if len(way.legs):
         ctl = gone_over(ctl, legs, par, way.legs, (instead.anew, begun.good.p[-1]))

@@ -21,6 +21,7 @@ from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane.guide import fly as fly_arduplane
 from fleet.autopilots.arduplane.guide import settle
 from fleet.autopilots.arduplane.guide import shift as shift_arduplane
+from fleet.autopilots.arduplane.params import Row, find
 from fleet.autopilots.arduplane.state import LEG, kernel
 from fleet.autopilots.slots import ARDUPLANE, LAW, PX4, TEXTBOOK, W_E, W_N, padded
 
@@ -28,19 +29,27 @@ inlined = nb.njit(cache=True, error_model="numpy", inline="always")
 
 
 class Law(NamedTuple):
-    """One law: what it is called in sentences, its mark in `par`, its parameters by name."""
+    """One law: what it is called in sentences, its mark in `par`, its parameters by name, and the table of them."""
 
     sentence: str
     mark: float
     parameters: Callable[[Mapping[str, float], float], tuple[np.ndarray, tuple[str, ...]]]
     names: tuple[str, ...]
+    table: tuple[Row, ...]
+
+    @property
+    def defaults(self) -> dict[str, float]:
+        """Give the defaults by name, in the autopilot's units."""
+        return {row.name: float(row.default) for row in self.table}
 
 
 LAWS = {
-    "arduplane": Law(arduplane.LAW, ARDUPLANE, arduplane.parameters, arduplane.NAMES),
-    "px4": Law(px4_fixedwing.LAW, PX4, px4_fixedwing.parameters, px4_fixedwing.NAMES),
-    "textbook": Law(textbook.LAW, TEXTBOOK, textbook.parameters, textbook.NAMES),
+    "arduplane": Law(arduplane.LAW, ARDUPLANE, arduplane.parameters, arduplane.NAMES, arduplane.TABLE),
+    "px4": Law(px4_fixedwing.LAW, PX4, px4_fixedwing.parameters, px4_fixedwing.NAMES, px4_fixedwing.TABLE),
+    "textbook": Law(textbook.LAW, TEXTBOOK, textbook.parameters, textbook.NAMES, textbook.TABLE),
 }
+NAMES = frozenset(name for law in LAWS.values() for name in law.names)
+"""Parameters that any law reads."""
 
 
 def parameters(law: str, values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -56,6 +65,15 @@ def parameters(law: str, values: Mapping[str, float], altitude_m: float = 0.0) -
     """
     par, absent = LAWS[law].parameters(values, altitude_m)
     return (padded(par, ARDUPLANE) if law == "arduplane" else par), absent
+
+
+def read(law: str, values: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Give every parameter of a law under its current name, in the autopilot's units, and which are defaults."""
+    if law == "arduplane":
+        return arduplane.read(values)
+    found = {row.name: find(row, values) for row in LAWS[law].table}
+    absent = tuple(name for name, value in found.items() if value is None)
+    return {**LAWS[law].defaults, **{name: value for name, value in found.items() if value is not None}}, absent
 
 
 def blown(par: np.ndarray, w_n: float, w_e: float) -> np.ndarray:

@@ -5,7 +5,10 @@ import numpy as np
 from fleet.window import Window
 from twin_worker.hybrid.fit import LEAST_S, SEEN_S, identify
 from twin_worker.hybrid.fly import fly_hybrid
+from twin_worker.learn_law import EVERY_S as LEARN_S
+from twin_worker.learn_law import learn_law
 from twin_worker.memory import Twin
+from twin_worker.plant import PAPER
 from twin_worker.predict import Flown, set_out
 
 EVERY_S = 5.0  # between identifications [s]
@@ -21,8 +24,10 @@ def renew(twin: Twin) -> None:
     if twin.why_no_route() or twin.hybrid_t <= newest < twin.hybrid_t + EVERY_S:
         return
     window = twin.window(SEEN_S + _HELD_S)
+    if window is not None and not twin.learnt.t <= newest < twin.learnt.t + LEARN_S:
+        learn_law(twin.learnt, twin.autopilot, twin.situation(window))
     good = window and _whole(window)
-    if good is None or good.seconds < LEAST_S + _HELD_S:
+    if good is None or good.seconds < LEAST_S + _HELD_S or twin.method == PAPER:
         return
     twin.hybrid_t = newest
     if not twin.checked_t <= newest < twin.checked_t + _CHECK_S:

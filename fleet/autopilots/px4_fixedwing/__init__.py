@@ -18,9 +18,21 @@ Source: see `npfg`, `tecs`; PX4 1.13 to 1.16 for the law as flown.
 
 from fleet.autopilots.px4_fixedwing.attitude import stabilise
 from fleet.autopilots.px4_fixedwing.guide import fly, init, shift
-from fleet.autopilots.px4_fixedwing.params import DEFAULTS, NAMES, parameters
+from fleet.autopilots.px4_fixedwing.params import DEFAULTS, NAMES, TABLE, parameters
 from fleet.autopilots.px4_fixedwing.path import begin, height_demand
 
 LAW = "px4: NPFG + TECS"
 
-__all__ = ["DEFAULTS", "LAW", "NAMES", "begin", "fly", "height_demand", "init", "parameters", "shift", "stabilise"]
+__all__ = [
+    "DEFAULTS",
+    "LAW",
+    "NAMES",
+    "TABLE",
+    "begin",
+    "fly",
+    "height_demand",
+    "init",
+    "parameters",
+    "shift",
+    "stabilise",
+]

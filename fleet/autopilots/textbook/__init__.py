@@ -11,9 +11,21 @@ Source: Beard & McLain, "Small Unmanned Aircraft" (2012), chapters 6, 10 and 11;
 """
 
 from fleet.autopilots.textbook.loops import fly, init, shift, stabilise
-from fleet.autopilots.textbook.params import DEFAULTS, NAMES, parameters
+from fleet.autopilots.textbook.params import DEFAULTS, NAMES, TABLE, parameters
 from fleet.autopilots.textbook.path import begin, height_demand
 
 LAW = "textbook: vector field, loops within loops"
 
-__all__ = ["DEFAULTS", "LAW", "NAMES", "begin", "fly", "height_demand", "init", "parameters", "shift", "stabilise"]
+__all__ = [
+    "DEFAULTS",
+    "LAW",
+    "NAMES",
+    "TABLE",
+    "begin",
+    "fly",
+    "height_demand",
+    "init",
+    "parameters",
+    "shift",
+    "stabilise",
+]
