@@ -139,11 +139,11 @@ def test_nobody_followed_beyond_a_minute(past):
 
 
 def test_a_wider_table_is_left_out_by_groups(past):
-    other = replace(made_up.scored(4, 30, seed=6, loud=3.0), group=np.full(120, "hybrid/arduplane/c172p/known"))
+    other = replace(made_up.scored(4, 30, seed=6, loud=3.0), group=np.full(120, "both/arduplane/c172p/known"))
     both = Scored(**{f.name: np.concatenate([getattr(past, f.name), getattr(other, f.name)]) for f in fields(Scored)})
-    wide = both.folds("hybrid/arduplane/*/known")
+    wide = both.folds("route/arduplane/*/known")
     assert wide.max() == 1 and both.folds(GROUP).max() == 13
-    assert (fit(both, "hybrid/arduplane/*/known").half_axes(past.spread[0], AHEAD)[30] > 10.0).any()
+    assert (fit(both, "route/arduplane/*/known").half_axes(past.spread[0], AHEAD)[30] > 10.0).any()
 
 
 # --- groups and tables -----------------------------------------------------------------------------------------------
@@ -152,7 +152,9 @@ def test_a_wider_table_is_left_out_by_groups(past):
 def test_the_chain_of_groups_keeps_parameters_longer_than_the_airframe():
     chain = ["a/b/c/known", "a/b/*/known", "a/b/*/*", "a/*/*/*"]
     assert list(wider("a/b/c/known")) == chain
-    assert list(wider("a")) == ["a/*/*/*"] * 4
+    assert wider("a") == wider("a/*/*/*") == ("a/*/*/*",)
+    ways = ["route/arduplane/fixed_wing/known", "route/arduplane/*/known", "route/arduplane/*/*", "route/*/*/*"]
+    assert list(wider(GROUP)) == [GROUP, *ways] and list(wider("both" + GROUP[6:]))[1:] == ways
     assert group_of("hybrid", "arduplane: L1 + TECS", "fixed_wing", "known") == GROUP
     assert group_of("imm", "", "", "a/b") == "imm/none/none/a b"
     assert [airframe_class("fixed_wing", v) for v in (22.0, 50.0)] == ["fixed_wing", "fixed_wing_fast"]
@@ -160,7 +162,7 @@ def test_the_chain_of_groups_keeps_parameters_longer_than_the_airframe():
 
 
 def test_the_narrowest_table_is_chosen_and_said(table):
-    names = [GROUP, "hybrid/arduplane/*/known", "hybrid/*/*/*"]
+    names = [GROUP, "route/arduplane/*/known", "route/*/*/*"]
     tables = Tables({name: replace(table, group=name) for name in names})
     for group, chosen in (
         (GROUP, names[0]),
@@ -171,8 +173,9 @@ def test_the_narrowest_table_is_chosen_and_said(table):
         found, said = tables.choose(group)
         assert found.group == chosen and chosen in said and "300 predictions of 10 flights" in said
         assert (f"none for {group}" in said) == (group != chosen)
-    found, said = tables.choose("dynamics/arduplane/fixed_wing/known")
-    assert found.starts == 0 and "not calibrated: no table for dynamics/" in said
+    assert tables.choose("dynamics/arduplane/fixed_wing/known")[0].group == names[1]
+    found, said = tables.choose("paper/arduplane/fixed_wing/known")
+    assert found.starts == 0 and "not calibrated: no table for paper/" in said
 
 
 @pytest.mark.parametrize("method", ["dynamics", "hybrid", "paper", "copter", "greybox", "imm", "unheard of"])
@@ -251,7 +254,7 @@ def test_the_command_fits_and_checks(tmp_path, capsys, past):
     assert main(["fit", str(tmp_path / "p.npz"), str(tmp_path / "few.npz"), "--out", str(out)]) == 0
     told = capsys.readouterr().out
     assert f"{GROUP}: 150 predictions of 5 flights; flights left out: coverage" in told
-    assert "imm/none/fixed_wing/known: no table from 24 predictions of 2 flights" in told
+    assert "imm/none/fixed_wing/known: no table from 24 predictions, 2 flights; 30 of 3 are needed" in told
     sheet = json.loads(out.read_text())
     assert sheet["command"].endswith("fit p.npz few.npz") and str(tmp_path) not in out.read_text()
     assert {t["group"] for t in sheet["tables"]} == set(wider(GROUP))
@@ -259,6 +262,18 @@ def test_the_command_fits_and_checks(tmp_path, capsys, past):
     told = capsys.readouterr().out
     assert "table alone: coverage" in told and "adapted in flight: coverage" in told
     assert KNOTS.tolist() == sheet["knots_s"]
+
+
+def test_few_flights_of_one_way_are_told_by_those_of_all(tmp_path, capsys, past):
+    as_npz(tmp_path / "p.npz", past)
+    as_npz(tmp_path / "q.npz", made_up.scored(4, 15, seed=14, group="both" + GROUP[6:]))
+    out = tmp_path / "t.json"
+    assert main(["fit", str(tmp_path / "p.npz"), str(tmp_path / "q.npz"), "--out", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "no table from 60 predictions, 4 flights; with those of route/arduplane/fixed_wing/known there are" in told
+    found = read_tables(out).by_group
+    assert set(found) == set(wider(GROUP)) and found["route/*/*/*"].starts == 360
+    assert "route/arduplane/fixed_wing/known: 360 predictions of 14 flights; flights left out" in told
 
 
 def test_the_command_says_what_is_wrong(tmp_path, capsys, past):

@@ -1,7 +1,8 @@
 """`python -m twin_worker.calibration fit|check FILE…`: calibration tables from scored predictions, and their worth.
 
-`fit` writes a table for every group and every wider one, and says what tables that had not seen a flight (a group,
-where a table spans several) claim of it. `check` says what tables claim of other predictions, alone and adapted.
+`fit` writes a table for every group and every wider one, and says what tables that had not seen a flight claim of it
+(a setting of law, airframe and parameters, where a table spans several). `check` says what tables claim of other
+predictions, alone and adapted.
 """
 
 import argparse
@@ -13,12 +14,13 @@ from pathlib import Path
 from fleet.cli import guarded, parser_for
 from twin_worker.calibration.check import adapted, claimed, figures, left_out, said
 from twin_worker.calibration.fit import fit
-from twin_worker.calibration.groups import wider
+from twin_worker.calibration.groups import ANY, wider
 from twin_worker.calibration.scored import Scored, read
 from twin_worker.calibration.table import Table
 from twin_worker.calibration.written import Source, load, read_tables, write
 
 LEAST_STARTS, LEAST_FLIGHTS = 30, 3  # fewer teach no table
+ENOUGH_FLIGHTS = 8  # fewer of one method are told apart from its like by chance
 
 EXAMPLES = """
   python -m twin_worker.calibration fit predictions.npz --out twin_worker/calibration/pretend.json
@@ -28,32 +30,48 @@ EXAMPLES = """
 
 def _fit(args: argparse.Namespace) -> int:
     scored = read(args.files)
-    groups = dict.fromkeys(name for group in sorted(set(scored.group.tolist())) for name in wider(group))
+    names = set(scored.group.tolist())
+    fitted: dict[bytes, Table] = {}  # by which predictions: a wider group of no more is the same table
     tables = []
-    for group in groups:
-        mine = scored.part(scored.within(group))
-        flights = len(set(mine.flight.tolist()))
-        if len(mine) < LEAST_STARTS or flights < LEAST_FLIGHTS:
-            least = f"{LEAST_STARTS} of {LEAST_FLIGHTS} flights are needed"
-            print(f"{group}: no table from {len(mine)} predictions of {flights} flights, {least}")
+    for group in dict.fromkeys(name for own in sorted(names) for name in wider(own)):
+        rows = scored.within(group)
+        mine = scored.part(rows)
+        if why := _too_few(scored, group):
+            print(f"{group}: no table from {len(mine)} predictions, {why}")
             continue
-        tables.append(_table(mine, group))
+        known = fitted.get(rows.tobytes())
+        table = replace(known, group=group) if known else _table(mine, group)
+        fitted[rows.tobytes()] = table
+        tables.append(table)
     if not tables:
         raise ValueError(f"calibration: found no group of {LEAST_STARTS} predictions; give more flights")
-    sources = [_source(path) for path in args.files]
     command = " ".join(["python -m twin_worker.calibration fit", *(path.name for path in args.files)])
-    write(args.out, tables, sources, date.today().isoformat(), command)
+    write(args.out, tables, [_source(path) for path in args.files], date.today().isoformat(), command)
     print(f"{args.out.name}: {len(tables)} tables")
     return 0
+
+
+def _too_few(scored: Scored, group: str) -> str:
+    """Say why a group is too small for a table of its own; empty where it is not."""
+    flights = _flights(scored, group)
+    if scored.within(group).sum() < LEAST_STARTS or flights < LEAST_FLIGHTS:
+        return f"{flights} flights; {LEAST_STARTS} of {LEAST_FLIGHTS} are needed"
+    chain = list(wider(group))
+    if ANY not in group and flights < ENOUGH_FLIGHTS and _flights(scored, chain[1]) > flights:
+        return f"{flights} flights; with those of {chain[1]} there are more"
+    return ""
+
+
+def _flights(scored: Scored, group: str) -> int:
+    return len(set(scored.flight[scored.within(group)].tolist()))
 
 
 def _table(mine: Scored, group: str) -> Table:
     table = fit(mine, group)
     measured = figures(mine, left_out(mine, group))
-    apart = "groups" if len(set(mine.group.tolist())) > 1 else "flights"
-    print(
-        said(f"{group}: {table.starts} predictions of {table.flights} flights; {apart} left out", measured), flush=True
-    )
+    apart = "settings" if mine.several(group) else "flights"
+    what = f"{group}: {table.starts} predictions of {table.flights} flights; {apart} left out"
+    print(said(what, measured), flush=True)
     return replace(table, held_out=measured)
 
 

@@ -46,16 +46,20 @@ def fit_sigma(spread: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _likeliest(s2: np.ndarray, e2: np.ndarray) -> tuple[float, float]:
     """Give scale and floor under errors with Student's t law of `_NU` degrees of freedom."""
-
-    def cost(x: np.ndarray) -> float:
-        sigma2 = np.exp(2 * x[0]) * s2 + np.exp(2 * x[1])
-        fit = np.mean(np.log(sigma2) + (_NU + 1) * np.log1p(e2 / (_NU * sigma2)))
-        return float(fit + _RIDGE * x[0] ** 2 + _RIDGE_FLOOR * (x[1] - usual) ** 2)
-
     typical = max(float(np.sqrt(np.median(e2))), _LEAST_M)
     usual = np.log(_USUAL_FLOOR * typical)
+
+    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+        known, unknown = np.exp(2 * x[0]) * s2, np.exp(2 * x[1])
+        sigma2 = known + unknown
+        fit = np.mean(np.log(sigma2) + (_NU + 1) * np.log1p(e2 / (_NU * sigma2)))
+        slope = 2 * (1 - (_NU + 1) * e2 / (_NU * sigma2 + e2)) / sigma2
+        gradient = [np.mean(slope * known) + 2 * _RIDGE * x[0], np.mean(slope) * unknown]
+        gradient[1] += 2 * _RIDGE_FLOOR * (x[1] - usual)
+        return float(fit + _RIDGE * x[0] ** 2 + _RIDGE_FLOOR * (x[1] - usual) ** 2), np.array(gradient)
+
     bounds = [(-_MOST_SPREAD, _MOST_SPREAD), (np.log(_LEAST_M), np.log(max(20 * typical, 10 * _LEAST_M)))]
-    found = minimize(cost, [0.0, np.log(typical)], method="Nelder-Mead", bounds=bounds, options={"maxiter": 120})
+    found = minimize(cost, [0.0, np.log(typical)], jac=True, method="L-BFGS-B", bounds=bounds)
     return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
 
 

@@ -1,8 +1,7 @@
 """Groups of predictions that share a calibration table: method / law / airframe / parameters, and wider ones."""
 
-from collections.abc import Iterator
-
 ANY = "*"
+_WAYS = dict.fromkeys(("hybrid", "both", "dynamics"), "route")  # chosen among in flight; one ensemble tells their doubt
 _FAST = 35.0  # trim airspeed from which a winged aircraft is no small one [m/s]
 
 
@@ -24,11 +23,18 @@ def airframe_class(vehicle: str, speed: float) -> str:
     return f"{vehicle}_fast" if vehicle == "fixed_wing" and speed > _FAST else vehicle
 
 
-def wider(group: str) -> Iterator[str]:
-    """Give a group and those it belongs to, narrowest first: any airframe, any parameters, any law.
+def wider(group: str) -> tuple[str, ...]:
+    """Give a group and those it belongs to, narrowest first: any of its ways, any airframe, any parameters, any law.
 
     Parameters matter more than the airframe, and the law more than either.
     """
-    parts = [*group.split("/"), *[ANY] * 4][:4]
-    for known in ((0, 1, 2, 3), (0, 1, 3), (0, 1), (0,)):
-        yield "/".join(part if i in known else ANY for i, part in enumerate(parts))
+    method, *rest = [*group.split("/"), *[ANY] * 4][:4]
+    way = [_WAYS.get(method, method), *rest]
+    known = ((0, 1, 2, 3), (0, 1, 3), (0, 1), (0,))
+    chain = ["/".join(part if i in of else ANY for i, part in enumerate(way)) for of in known]
+    return tuple(dict.fromkeys(["/".join([method, *rest]), *chain]))
+
+
+def setting(group: str) -> str:
+    """Give what a group says besides the method: law / airframe / parameters."""
+    return group.partition("/")[2]

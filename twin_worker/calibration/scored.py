@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from twin_worker.calibration.groups import ANY, wider
+from twin_worker.calibration.groups import ANY, setting, wider
 from twin_worker.calibration.miss import AHEAD, axes_error
 from twin_worker.calibration.table import filled
 
@@ -53,13 +53,17 @@ class Scored:
         named = {name: group in wider(name) for name in set(self.group.tolist())}
         return np.array([named[name] for name in self.group.tolist()], bool)
 
-    def folds(self, group: str) -> np.ndarray:
-        """Number what is left out together, (s,): a whole group of a table of several, else a flight.
+    def several(self, group: str) -> bool:
+        """Tell whether a table of a group would span several settings (law, airframe, parameters)."""
+        return ANY in group and len({setting(name) for name in self.group.tolist()}) > 1
 
-        A table of several groups stands in for one it has not seen: that is what leaving out must show.
+    def folds(self, group: str) -> np.ndarray:
+        """Number what is left out together, (s,): a whole setting of several, else a flight.
+
+        A table of several settings stands in for one it has not seen: that is what leaving out must show.
         """
-        groups = self.group if ANY in group and len(set(self.group.tolist())) > 1 else self.flight
-        return np.unique(groups, return_inverse=True)[1]
+        settings = np.array([setting(name) for name in self.group.tolist()])
+        return np.unique(settings if self.several(group) else self.flight, return_inverse=True)[1]
 
 
 def read(paths: Sequence[Path]) -> Scored:
