@@ -49,6 +49,7 @@ def _about(args: argparse.Namespace, plan: Plan, found: Found) -> dict[str, Any]
         "files": [str(path) for path in args.file],
         "every_s": plan.every_s,
         "method": args.method,
+        "methods": list(plan.methods),
         "without_params": plan.without_params,
         "counted": sum(not case.apart for case in found.cases),
         "apart": sum(bool(case.apart) for case in found.cases),
