@@ -278,6 +278,12 @@ def test_an_aircraft_that_was_never_up_is_taking_off() -> None:
     assert alert.kind is AlertKind.GROUND
 
 
+def test_a_quadplane_that_leaves_its_rotors_below_the_height_of_wings_is_taking_off() -> None:
+    twin = flying()
+    twin.peak = 20.0  # on rotors
+    assert told(twin, straight(7, p=(0.0, 0.0, -24.0))) == []
+
+
 def test_a_turn_rate_says_nothing_of_far_ground_nor_of_its_own_horizon() -> None:
     twin = flying(mode="FBWA")
     assert told(twin, msgspec.structs.replace(SINKING, method="imm", horizon_s=2.0, held_n=99)) == []

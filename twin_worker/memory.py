@@ -127,7 +127,7 @@ class Twin:
     achievable_t: float = -np.inf  # mission last judged
     turning_t: float = np.inf  # since when predictions are a turn rate alone
     stood: Origin | None = None  # where it last stood disarmed
-    aloft: bool = False  # it has been above the least height since it was disarmed
+    peak: float = -np.inf  # greatest height above home since it was disarmed [m]
     lost: bool = False  # nothing is heard
     back_t: float = -np.inf  # link last back
     broken: bool = False  # much is heard, but no positions

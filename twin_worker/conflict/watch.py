@@ -56,7 +56,7 @@ def _remember_ground(twin: Twin) -> None:
     """Take where it stands disarmed for home, until a mission tells better, and notice that it is down."""
     if twin.status is None or twin.status.armed:
         return
-    twin.aloft = False
+    twin.peak = -np.inf
     _, position = twin.history.rows("position", twin.history.newest - 2.0)
     if len(position):
         twin.stood = Origin(*map(int, position[-1]))
@@ -78,10 +78,10 @@ def _dangers(twin: Twin, flight: Forecast) -> list[Finding]:
     if base is None:
         return [_unknown(AlertKind.GROUND), _unknown(AlertKind.GEOFENCE)]
     margin = ROTORS_M if rotors else WINGS_M
-    twin.aloft = twin.aloft or bool(above(flight, base)[0] > margin)
+    twin.peak = max(twin.peak, float(above(flight, base)[0]))
     until = flight.made.t + _TURNING_S if flight.made.method == "imm" else np.inf
     found = [_unknown(AlertKind.GROUND)]
-    low = not twin.aloft or _lands(twin, rotors)
+    low = twin.peak <= margin or _lands(twin, rotors)  # not yet up: it takes off, perhaps on rotors first
     if not low:
         found = [sinks(flight, base, margin, until)]
     limit = fence(_params(twin))
