@@ -47,7 +47,7 @@ class Told(NamedTuple):
     seed: int
     meets: bool | None  # the aircraft before it: meets it, passes it clear; None for the first
     sinks: bool
-    leaves: bool
+    may_leave: bool
 
 
 @dataclass
@@ -78,6 +78,10 @@ class Flight:
     def away(self, home: np.ndarray | None = None) -> np.ndarray:
         """Give the distance from home (or from another place) over ground, (n,) [m]."""
         return np.hypot(*(self.path - (self.home if home is None else home))[:, :2].T)
+
+    def leaves(self) -> bool:
+        """Tell whether it ever leaves its geofence."""
+        return bool((self.away() > self.radius).any())
 
 
 def make(told: Told, plan: Plan, radius: float = 0.0) -> PretendUav:
@@ -184,7 +188,8 @@ def chain(count: int, seed: int, say: Callable[[str], None] = print) -> list[Fli
     rng = np.random.default_rng((seed, 77))
     flights: list[Flight] = []
     for uav in range(count):
-        told = Told(uav, seed, None if uav == 0 else uav % 2 == 1, uav % 4 in (1, 2), uav % 4 in (2, 3))
+        may_leave = sum(one.leaves() for one in flights) < count // 2
+        told = Told(uav, seed, None if uav == 0 else uav % 2 == 1, uav % 4 in (1, 2), may_leave)
         flights.append(_arrange(told, rng, flights[-1].path if flights else None))
         say(f"arranged {uav + 1} of {count}")
     return flights
@@ -195,7 +200,7 @@ def _arrange(told: Told, rng: np.random.Generator, before: np.ndarray | None) ->
     drawn = fly(told, Plan(*mission(own, CRUISE, HOME), HOME), MEET_S[1] + 5)
     one = _heights(told, drawn, rng)
     plan = one.plan
-    if told.leaves:
+    if told.may_leave:
         plan = homed(plan, _home(one, rng))
     if before is not None:
         assert told.meets is not None
@@ -243,6 +248,6 @@ def _goes(away: np.ndarray) -> np.ndarray:
 def _fence(one: Flight, rng: np.random.Generator) -> float:
     """Draw a fence that it leaves for the first time between 115 and 150 s, or one it stays within by 40 to 80 m."""
     away, goes = one.away(), _goes(one.away())
-    if one.told.leaves and len(goes):
+    if one.told.may_leave and len(goes):
         return float(away[rng.choice(goes)])
     return float(np.ceil(away.max() + rng.uniform(40, 80)))
