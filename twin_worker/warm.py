@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from fleet import hybrid
 from fleet.airframes import GENERIC, load
 from fleet.autopilots import arduplane, copter, greybox
 from fleet.autopilots.shadow import shadow
@@ -12,6 +13,7 @@ from fleet.simulate import N_STATE, coupled_plant, linear_plant, simulate
 from fleet.window import Window
 from twin_worker.conflict.traffic import Traffic
 from twin_worker.coupled import identify
+from twin_worker.hybrid import lags
 from twin_worker.identify import AXES, identify_axis
 
 _SPEED = 22.0  # [m/s]
@@ -40,11 +42,23 @@ def warm_up() -> None:
     for plant in (paper, coupled):
         simulate(ctl.copy(), par, legs, plant, state, np.zeros(6), air, window.dt, np.empty((50, N_STATE)))
 
+    _in_the_large((ctl.copy(), par, legs), window)
     ahead, grey = np.empty((5, 3)), np.ones(greybox.N_PAR)
     greybox.follow(grey_ctl, par, legs, grey, np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0]), np.zeros(2), 0.1, ahead)  # type: ignore
     segments, told = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
     _meet(origin)
     copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), told, 0.1, ahead)  # type: ignore
+
+
+def _in_the_large(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: Window) -> None:
+    """Fly the hybrid, alone and in a bundle of two."""
+    body, air, start = np.ones(hybrid.N_BODY), np.ones(hybrid.N_AIR), np.zeros(hybrid.N_START)
+    body[hybrid.V_0] = start[hybrid.V] = _SPEED
+    start[:3], chance = window.p[-1], np.zeros((2, 5, 4))
+    hybrid.fly(control[0].copy(), *control[1:], body, air, start, chance[0], hybrid.STEP, np.empty((5, 3)))
+    twice = [np.tile(row, (2, 1)) for row in (body, air, start)]
+    hybrid.bundle(control, *twice, chance, np.arange(0, 17, 4), np.empty((2, 5, 3)))  # type: ignore
+    lags.identify(window.x[:, 6], window.x[:, 6])
 
 
 def _meet(origin: Origin) -> None:
