@@ -62,6 +62,18 @@ def test_without_functions_the_usual_order_is_assumed_and_said():
     assert servo_map(PLANE).sentence == ""
 
 
+def test_px4_says_the_same_in_other_words():
+    outputs = {"PWM_MAIN_FUNC1": 201, "PWM_MAIN_FUNC2": 202, "PWM_MAIN_FUNC3": 101, "PWM_MAIN_FUNC4": 203}
+    px4 = outputs | {"CA_SV_CS0_TYPE": 2, "CA_SV_CS1_TYPE": 3, "CA_SV_CS2_TYPE": 4, "PWM_MAIN_REV": 0b10}
+    assert servo_map(px4).sentence == ""
+    assert inputs(px4, s1=2000, s2=2000, s3=1250, s4=1250) == [1.0, -1.0, -0.5, 0.25]
+    left = px4 | {"CA_SV_CS0_TYPE": 1}
+    assert inputs(left, s1=2000, s3=1000)[0] == -1.0
+    assert inputs(px4 | {"PWM_MAIN_MIN3": 1200.0}, s3=1600)[3] == 0.5
+    elevons = px4 | {"CA_SV_CS0_TYPE": 5, "CA_SV_CS1_TYPE": 6, "PWM_MAIN_REV": 0}
+    assert inputs(elevons, s1=1000, s2=2000, s3=1000)[:2] == [1.0, 0.0]
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e30, 0.0])
 @pytest.mark.parametrize("name", ["SERVO1_FUNCTION", "SERVO1_MIN", "SERVO1_MAX", "SERVO1_TRIM", "SERVO1_REVERSED"])
 def test_absurd_parameters_give_finite_inputs(name: str, value: float):

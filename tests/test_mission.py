@@ -186,3 +186,32 @@ def test_nothing_raises_and_every_leg_is_finite(items, seq, params):
     assert np.isfinite(r.legs).all()
     assert len(r.legs) <= 64
     assert all("mission" in s and ";" in s for s in r.sentences)
+
+
+# --- a mission that does not hold home (PX4) -------------------------------------------------------------------------
+
+
+def without_home(items, seq=0) -> m.Route:
+    return m.route(items, seq=seq, origin=ORIGIN, params={}, limit=6, first=m.FIRST["px4"])
+
+
+def test_without_home_item_0_is_flown_and_jumps_go_to_it():
+    r = without_home([waypoint(0, 1), waypoint(1, 1, 1), jump(2, 0, 1)])
+    assert seqs(r) == [0, 1, 0, 1, -1] and r.sentences == ()
+    assert r.legs[0, m.P_D] == pytest.approx(-100)  # home is the origin
+    assert r.legs[-1, m.KIND] == m.LOITER_UNLIMITED  # it stays where its mission ends
+    np.testing.assert_allclose(r.legs[-1, m.P_N : m.P_D + 1], r.legs[-2, m.P_N : m.P_D + 1])
+    assert np.isnan(r.start).all()
+    assert seqs(without_home([waypoint(0, 1)], seq=99)) == [0, -1]
+    empty = without_home([])
+    assert not len(empty.legs) and "one at least" in empty.sentences[0]
+
+
+def test_without_home_circles_have_a_radius_and_an_exit_of_their_own():
+    timed = waypoint(1, 1, 1, command=19, param1=40.0, param2=1.0, param3=-120.0)
+    climb = waypoint(2, 1, 2, command=31, param1=0.0, param2=90.0)
+    legs = without_home([waypoint(0, 1), timed, climb]).legs
+    assert legs[1, [m.TURNS, m.RADIUS, m.ACCEPT]].tolist() == [40.0, -120.0, 1.0]
+    assert legs[2, [m.RADIUS, m.ACCEPT]].tolist() == [90.0, 0.0]
+    home_first = fly([HOME, timed]).legs[0]
+    assert home_first[[m.RADIUS, m.ACCEPT]].tolist() == [-60.0, 0.0]  # ArduPlane reads the direction only

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from flights import drive, predictions, published, shifted, status
 
+from fleet.autopilots import laws
 from fleet.codec import encode
 from fleet.contract import (
     Mission,
@@ -167,7 +168,9 @@ def test_what_has_no_wings_is_not_given_any(heard):
     assert "kinematic twin" in predictions(results)[-1].sentence
 
 
-def test_an_autopilot_flown_by_a_law_that_is_not_its_own_is_said(twin):
-    end = twin.history.newest
-    (made,) = predictions(advance(twin, [status(twin, autopilot="px4")], end + 1.0))
-    assert made.method in ROUTE and "px4 is flown by ArduPlane's law" in made.sentence
+def test_an_autopilot_that_does_not_say_what_it_is_is_told_by_the_banks_it_asked_for(heard):
+    twin = Twin(1)
+    told = [msgspec.structs.replace(m, autopilot="generic") if isinstance(m, Status) else m for m in heard]
+    last = predictions(drive(twin, told))[-1]
+    assert twin.learnt.law == "arduplane" and last.method in ROUTE and last.law == laws.LAWS["arduplane"].sentence
+    assert "autopilot generic is flown by arduplane: L1 + TECS, which asks for the banks it asked for" in last.sentence

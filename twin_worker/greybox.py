@@ -56,6 +56,7 @@ class Board:
     origin: Origin
     wind: np.ndarray | None  # NED, (3,) [m/s]; None: no airspeed was ever received
     instead: Instead | None = None  # what a what-if flies from the start on
+    first: int = 1  # number of the first mission item to fly
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def fly(track: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
 def _fly(seen: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarray) -> Ahead:
     law_now = on_wings(board.params, grey.identified, sentence=law.LAW)
     par = law_now.par(_altitude(seen, board))
-    way = route(board.items, seq=int(seq[0]), origin=board.origin, params=board.params)
+    way = route(board.items, seq=int(seq[0]), origin=board.origin, params=board.params, first=board.first)
     if not len(way.legs):
         return Ahead(None, int(seq[-1]), " ".join(way.sentences) or "the mission has no legs to fly")
     w, V = air_of(seen, board.wind)

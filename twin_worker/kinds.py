@@ -92,7 +92,7 @@ def _wing_board(twin: Twin) -> wing.Board:
     assert twin.origin is not None
     items = twin.mission.items if twin.mission else ()
     wind = twin.wind.wind if np.isfinite(twin.wind.t) else None
-    return wing.Board(items, twin.received, twin.since, twin.origin, wind, twin.instead)
+    return wing.Board(items, twin.received, twin.since, twin.origin, wind, twin.instead, twin.first_item)
 
 
 def compare_with_flight(twin: Twin) -> None:

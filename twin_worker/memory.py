@@ -9,6 +9,7 @@ from fleet.airframe import ServoMap, servo_map
 from fleet.airframes import GENERIC, Airframe, load
 from fleet.contract import Event, Message, Mission, Model, Outcome, Params, Prediction, Sample, State, Status, Verdict
 from fleet.frames import Origin
+from fleet.mission import FIRST
 from fleet.window import Window
 from twin_worker.conflict.ledger import Ledger
 from twin_worker.contest import Contest
@@ -145,6 +146,11 @@ class Twin:
         if self.in_force is None or self.verdict.outcome is Outcome.VERIFIED:
             return self.verdict.sentence
         return f"{self.in_force.sentence}; newest try: {self.verdict.outcome.value.replace('_', ' ')}"
+
+    @property
+    def first_item(self) -> int:
+        """Give the number of the first mission item to fly: 0 where the mission does not hold home."""
+        return FIRST.get(self.autopilot, 1)
 
     @property
     def autopilot(self) -> str:

@@ -6,7 +6,19 @@ import numpy as np
 from matplotlib.patheffects import withStroke
 
 from fleet.frames import Origin, to_ned
-from fleet.mission import KIND, LOITER_TIME, LOITER_TO_ALT, LOITER_TURNS, LOITER_UNLIMITED, P_E, P_N, RADIUS, SEQ, route
+from fleet.mission import (
+    FIRST,
+    KIND,
+    LOITER_TIME,
+    LOITER_TO_ALT,
+    LOITER_TURNS,
+    LOITER_UNLIMITED,
+    P_E,
+    P_N,
+    RADIUS,
+    SEQ,
+    route,
+)
 from fleet.page.ink import GRID, INK, MUTED, ROUTE, drawn
 from fleet.telemetry.findings import Findings
 from fleet.telemetry.survey import Survey, airborne, spells
@@ -62,7 +74,8 @@ def _flown(ax: Any, known: Survey, t: np.ndarray, p: np.ndarray, colours: dict[s
 def _legs(known: Survey, origin: Origin) -> list[np.ndarray]:
     """Unroll the route once: each mission item at most one leg."""
     seen: dict[int, np.ndarray] = {}
-    for leg in route(known.items, seq=1, origin=origin, params=known.values).legs:
+    first = FIRST.get(known.status.autopilot, 1) if known.status else 1
+    for leg in route(known.items, seq=first, origin=origin, params=known.values, first=first).legs:
         if leg[SEQ] >= 0:
             seen.setdefault(int(leg[SEQ]), leg)
     return [seen[seq] for seq in sorted(seen)]

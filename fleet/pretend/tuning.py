@@ -83,7 +83,7 @@ _C172P_ARDUPLANE = Tuning(
         "KFF_RDDRMIX": 0.05,
     },
     {
-        "NAVL1_PERIOD": (17.0, 20.0, 25.0),
+        "NAVL1_PERIOD": (17.0, 19.0, 21.0),
         "NAVL1_DAMPING": (0.75, 0.8),
         "WP_RADIUS": (200.0, 250.0, 300.0),
         "ROLL_LIMIT_DEG": (35.0, 40.0),

@@ -43,7 +43,7 @@ TYPES = {
     # Cessna 172P, a ton and a piston engine, as it comes with JSBSim: only its load differs from one to the next
     "c172p": Type(
         *("c172p", True, 48.0, "fcs/throttle-cmd-norm"),
-        Field(scale=3.0, circle=4.5, height=2.0, climb=0.045, sink=0.04),
+        Field(scale=5.0, circle=4.5, height=2.0, climb=0.045, sink=0.04),
         *((0.0, 90.0), {}, {}),
     ),
 }

@@ -9,7 +9,7 @@ import numpy as np
 
 from fleet.airframe import ServoMap, servo_map
 from fleet.contract import COLUMNS
-from fleet.mission import route
+from fleet.mission import FIRST, route
 from fleet.telemetry.survey import LONGEST_S, Survey, airborne, spells
 from fleet.telemetry.thinned import Span, inside, overlap, seconds
 from fleet.window import INPUTS
@@ -183,12 +183,14 @@ def _on_route(known: Survey, unidentified: str, flown: list[Span]) -> Ability:
         return Ability(
             name, False, "no mission list in the recording; let the ground station download it while recording"
         )
-    if not len(route(known.items, seq=1, origin=origin, params=known.values).legs):
+    autopilot = known.status.autopilot if known.status else "unknown"
+    first = FIRST.get(autopilot, 1)
+    if not len(route(known.items, seq=first, origin=origin, params=known.values, first=first).legs):
         return Ability(name, False, f"the mission of {len(known.items)} items has no legs to fly")
     if not known.rows["leg"].count:
         return Ability(name, False, "the mission item in force is not in the recording (MISSION_CURRENT)")
-    autopilot = known.status.autopilot if known.status else "unknown"
-    law = "" if autopilot == "ardupilot" else f"; autopilot {autopilot} is flown by ArduPlane's law, not its own"
+    told = autopilot in ("ardupilot", "px4")
+    law = "" if told else f"; autopilot {autopilot} is flown by the law that asks for the banks it asks for, if any"
     items = f"{len(known.items)} mission items" + ("" if known.mission and known.mission.complete else ", not all")
     return Ability(name, True, f"{flew:.0f} s on the route, {items}; take-off and landing are not modelled{law}")
 

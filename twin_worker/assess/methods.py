@@ -141,7 +141,8 @@ def _line(now: Now) -> np.ndarray | None:
     if not np.isfinite(seq[-1]):
         return None
     params = twin.params.values if twin.params else {}
-    way = route(twin.mission.items, seq=int(seq[-1]), origin=twin.origin, params=params)
+    first = twin.first_item
+    way = route(twin.mission.items, seq=int(seq[-1]), origin=twin.origin, params=params, first=first)
     if not len(way.legs):
         return None
     other = np.flatnonzero(seq != seq[-1])

@@ -119,10 +119,11 @@ def _mission(twin: Twin, now: float) -> Finding:
     if twin.vehicle not in WINGS or twin.why_no_route() or hangs(twin) or not len(position):
         return nothing
     assert twin.origin is not None and twin.mission is not None
-    if twin.mission.seq < 1:
+    if twin.mission.seq < twin.first_item:
         return nothing
     p = to_ned(twin.origin, *position[-1:].T)[0]
-    way = route(twin.mission.items, seq=twin.mission.seq, origin=twin.origin, params=_params(twin), limit=16)
+    more = {"params": _params(twin), "limit": 16, "first": twin.first_item}
+    way = route(twin.mission.items, seq=twin.mission.seq, origin=twin.origin, **more)  # type: ignore[arg-type]
     wind = np.array([*twin.wind.wind[:2], twin.wind.sigma])
     return achievable(Now(now, p, twin.origin, wind, way), ability(_params(twin), position[-1, 2] * 1e-3))
 

@@ -127,7 +127,7 @@ def _instead(twin: Twin, asked: WhatIf) -> Instead:
     if seq is None:
         seq = _first(items, twin) if asked.items is not None else _in_force(twin)
     anew = (asked.seq is not None and asked.seq != _in_force(twin)) or asked.start is not None
-    return Instead(items, seq, params, anew, asked.start.speed if asked.start else None)
+    return Instead(items, seq, params, anew, asked.start.speed if asked.start else None, twin.first_item)
 
 
 def _at_speed(item: Item, speed: float) -> Item:
@@ -135,9 +135,9 @@ def _at_speed(item: Item, speed: float) -> Item:
 
 
 def _first(items: tuple[Item, ...], twin: Twin) -> int:
-    """Give the first item to fly: on ArduPilot item 0 is home."""
-    home = 0 if twin.status is not None and twin.status.autopilot == "px4" else 1
-    return min((item.seq for item in items if item.seq >= home), default=home)
+    """Give the first item to fly."""
+    first = twin.first_item
+    return min((item.seq for item in items if item.seq >= first), default=first)
 
 
 def _in_force(twin: Twin) -> int:

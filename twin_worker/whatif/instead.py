@@ -22,6 +22,7 @@ class Instead:
         seq: item flown to first
         asked: autopilot parameters
         anew: begin at `seq` from where the aircraft is, though it may already be flying that item
+        first: number of the first item to fly
         speed: through the air at the start, of what hovers over ground [m/s]; None: as it is
     """
 
@@ -30,10 +31,11 @@ class Instead:
     asked: Mapping[str, float] = field(default_factory=dict)
     anew: bool = False
     speed: float | None = None
+    first: int = 1
 
     def way(self, origin: Origin, received: Mapping[str, float]) -> Route:
         """Lay the route."""
-        return route(self.items, seq=self.seq, origin=origin, params={**received, **self.asked})
+        return route(self.items, seq=self.seq, origin=origin, params={**received, **self.asked}, first=self.first)
 
     def at_speed(self, velocity: np.ndarray, psi: float = 0.0) -> np.ndarray:
         """Give a velocity (3,) [m/s] the speed asked for; of one who stands the nose tells the direction [rad]."""
