@@ -6,7 +6,7 @@ from flights import HERE
 
 from twin_worker.assess.case import OURS, Asked, Case, Told
 from twin_worker.assess.compare import BEATEN, MATCHED, ONE_FLIGHT, WORSE, compare
-from twin_worker.assess.score import LIMITS, quantile, score, signed, surviving
+from twin_worker.assess.score import LIMITS, quantile, score, surviving
 from twin_worker.assess.summary import figures, summary
 
 V = 20.0
@@ -48,7 +48,7 @@ def test_a_known_offset_is_told_by_axis_and_passes_the_tighter_limits_at_once():
     assert np.allclose(one.error[0], [0.0, -3.0, 0.0]) and np.allclose(one.distance, 3.0)
     assert one.passages[0.10].tolist() == [[AHEAD[-1], 1.0]]  # 3 m of at least 40 m
     assert one.passages[0.05].tolist() == [[0.0, 0.0]] and one.passages[0.03].tolist() == [[0.0, 0.0]]
-    assert np.allclose(signed(EAST, EAST + np.array([0.0, 6.0, 5.0])), [6.0, 0.0, 5.0])
+    assert np.allclose(score([case(ours=off(0.0, 6.0, 5.0))], OURS).error, [6.0, 0.0, 5.0])
     assert not score([case(ours=off(0.0, 9.0, 0.0))], OURS).inside.any()  # 9 m along, the half-axis is 8 m
 
 
@@ -164,7 +164,7 @@ def test_one_flight_has_no_interval():
 def test_the_summary_counts_what_counts_and_tells_the_rest_apart():
     told = summary([case(ours=EAST, cv=off(3, 0, 0)), case(ours=EAST, apart="on the ground")])
     assert told[OURS]["starts"] == told["cv"]["starts"] == 1
-    assert told["apart"] == {"on the ground": {"starts": 1, "m1_t10_lq_s": AHEAD[-1]}}
+    assert told["apart"] == {"on the ground": {"starts": 1, "m1_t10_lq_s": AHEAD[-1], "followed_s": AHEAD[-1]}}
     assert told[OURS]["phases"]["level"]["starts"] == 1 and set(told["compare"]) == {"cv"}
     assert summary([]) == {"compare": {}, "apart": {}}
 

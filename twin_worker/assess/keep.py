@@ -4,14 +4,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.special import ndtri
 
 from fleet.frames import to_geodetic
 from twin_worker.assess.case import OURS, Case
-from twin_worker.horizon import QUANTILE, path_length, track_frame
+from twin_worker.calibration.miss import QUANTILE, path_length, track_frame
 
 KEYS = {
     "t0": "start, (s,) [s since 1970]",
-    "t": "instants predicted for, (s, k) [s since 1970]",
+    "t": "instants asked for, (s, k) [s since 1970]",
     "latitude": "(s, k) [deg]",
     "longitude": "(s, k) [deg]",
     "altitude": "above mean sea level, (s, k) [m]",
@@ -21,7 +22,7 @@ KEYS = {
     "uav": "id, (s,)",
     "apart": "why a start does not count; empty: it counts, (s,)",
     "ahead": "look-ahead, (k,) [s]",
-    "path": "predicted, NED from the aircraft's first position, (s, k, 3) [m]",
+    "path": "predicted, NED from the aircraft's first position; nan beyond its end, (s, k, 3) [m]",
     "tube": "half-axes along, cross, vertical, (s, k, 3) [m]",
     "spread": "standard deviations of the ensemble along, cross, vertical; nan without one, (s, k, 3) [m]",
     "flown": "what happened, NED; nan where not known or after an event, (s, k, 3) [m]",
@@ -41,14 +42,15 @@ def keep(path: Path, cases: Sequence[Case]) -> None:
 
 def _row(case: Case) -> dict[str, object]:
     asked, told = case.asked, case.asked.told[OURS]
-    place = to_geodetic(asked.origin, told.path)
+    place, far = np.full(told.path.shape, np.nan), np.isfinite(told.path).all(axis=1)
+    place[far] = to_geodetic(asked.origin, told.path[far]) * np.array([1e-7, 1e-7, 1e-3])
     assert told.tube is not None
     return {
         "t0": asked.t,
         "t": asked.t + asked.ahead,
-        "latitude": place[:, 0] * 1e-7,
-        "longitude": place[:, 1] * 1e-7,
-        "altitude": place[:, 2] * 1e-3,
+        "latitude": place[:, 0],
+        "longitude": place[:, 1],
+        "altitude": place[:, 2],
         "covariance": covariance(told.path, told.tube).astype(np.float32),
         "horizon": told.horizon_s,
         "flight": asked.flight,
@@ -67,8 +69,6 @@ def _row(case: Case) -> dict[str, object]:
 
 def covariance(path: np.ndarray, tube: np.ndarray) -> np.ndarray:
     """Give the covariance, NED, of independent normal errors of which the tube holds its share, (k, 3, 3) [m2]."""
-    from scipy.special import ndtri
-
     sigma = tube / ndtri(0.5 + 0.5 * QUANTILE ** (1 / 3))
     along = track_frame(path)
     axes = np.zeros((len(path), 3, 3))

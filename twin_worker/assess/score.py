@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin_worker.assess.case import Case
-from twin_worker.horizon import LIMIT, first_passage, path_length, track_frame
+from twin_worker.calibration.miss import LIMIT, along_cross_down, first_passage, least_length, track_frame
 
 LIMITS = (0.10, 0.05, 0.03)  # relative errors whose first passage is told [-]
 
@@ -82,7 +82,7 @@ def score(cases: Sequence[Case], method: str) -> Scores:
         ahead=ahead,
         flight=np.array([case.asked.flight for case in cases]),
         made_by=np.array([one.made_by for one in told]),
-        error=np.array([signed(one.path, case.flown) for one, case in zip(told, cases, strict=True)]),
+        error=along_cross_down(track_frame(path, ahead), flown - path),
         distance=distance,
         passages={limit: passages(relative, ahead, limit) for limit in LIMITS},
         strict=passages(strict, ahead, LIMIT),
@@ -91,17 +91,9 @@ def score(cases: Sequence[Case], method: str) -> Scores:
     )
 
 
-def signed(path: np.ndarray, flown: np.ndarray) -> np.ndarray:
-    """Split flown minus predicted into along, cross (right), vertical (down), (k, 3) [m]."""
-    error, along = flown - path, track_frame(path)
-    cross = np.column_stack([-along[:, 1], along[:, 0]])
-    return np.column_stack([np.sum(error[:, :2] * along, axis=1), np.sum(error[:, :2] * cross, axis=1), error[:, 2]])
-
-
 def _displacement(case: Case) -> np.ndarray:
     """Give the distance from the start, at least two seconds of ground speed, (k,) [m]."""
-    least = path_length(case.flown[:1], case.asked.speed)[0]
-    return np.fmax(np.linalg.norm(case.flown - case.flown[0], axis=1), least)
+    return np.fmax(np.linalg.norm(case.flown - case.flown[0], axis=1), least_length(case.asked.speed))
 
 
 def passages(relative: np.ndarray, ahead: np.ndarray, limit: float) -> np.ndarray:

@@ -41,6 +41,7 @@ def figures(found: Scores) -> dict[str, Any]:
     for name, limit in zip(_HEAD, LIMITS, strict=True):
         out[f"m1_{name}_lq_s"] = _round(quantile(found.passages[limit], 0.25))
         out[f"m1_{name}_median_s"] = _round(quantile(found.passages[limit], 0.5))
+    out["followed_s"] = _followed(found)
     out["survive_60"] = _round(surviving(found.passages[LIMITS[0]], WHOLE_S), 3)
     out["m2_t10_lq_s"] = _round(quantile(found.strict, 0.25))
     out["p50_m"] = {s: _round(_percentile(found.distance[:, k], 50)) for s, k in look.items()}
@@ -100,6 +101,7 @@ def _phases(found: Scores, phases: np.ndarray) -> dict[str, Any]:
         out[phase] = {
             "starts": int(rows.sum()),
             "m1_t10_lq_s": _round(quantile(its.passages[LIMITS[0]], 0.25)),
+            "followed_s": _followed(its),
             "survive_60": _round(surviving(its.passages[LIMITS[0]], WHOLE_S), 3),
             "p50_m": {s: _round(_percentile(its.distance[:, k], 50)) for s, k in look.items()},
             "p90_m": {s: _round(_percentile(its.distance[:, k], 90)) for s, k in look.items()},
@@ -112,8 +114,15 @@ def _apart(cases: Sequence[Case]) -> dict[str, Any]:
     out = {}
     for why, n in Counter(case.apart for case in cases if case.apart).most_common():
         its = score([case for case in cases if case.apart == why], "ours")
-        out[why] = {"starts": n, "m1_t10_lq_s": _round(quantile(its.passages[LIMITS[0]], 0.25))}
+        lower = _round(quantile(its.passages[LIMITS[0]], 0.25))
+        out[why] = {"starts": n, "m1_t10_lq_s": lower, "followed_s": _followed(its)}
     return out
+
+
+def _followed(found: Scores) -> float | None:
+    """Give the longest any start was followed [s]."""
+    known = np.isfinite(found.distance).any(axis=0)
+    return _round(float(found.ahead[known][-1])) if known.any() else None
 
 
 def _percentile(values: np.ndarray, share: float) -> float:

@@ -50,10 +50,10 @@ def _methods(found: dict[str, Any], names: list[str]) -> Table:
         held = "–" if row["survive_60"] is None else f"{row['survive_60']:.0%}"
         out.add_row(
             _LABELS.get(name, name),
-            f"{_number(row['m1_t10_lq_s'])} / {_number(row['m1_t10_median_s'])}",
-            _number(row["m1_t5_lq_s"]),
+            f"{_time(row, 'm1_t10_lq_s')} / {_time(row, 'm1_t10_median_s')}",
+            _time(row, "m1_t5_lq_s"),
             held,
-            _number(row["m2_t10_lq_s"]),
+            _time(row, "m2_t10_lq_s"),
             *(_number(row["p50_m"].get(s)) for s in _ERRORS),
             _number(row["p90_m"].get("60")),
             style="bold" if name == OURS else "",
@@ -86,7 +86,7 @@ def _phases(phases: dict[str, Any]) -> Table:
         _column(out, f"p50 {s} s [m]")
     for name, row in phases.items():
         errors = (_number(row["p50_m"].get(s)) for s in _ERRORS)
-        out.add_row(name, str(row["starts"]), _number(row["m1_t10_lq_s"]), _share(row["survive_60"]), *errors)
+        out.add_row(name, str(row["starts"]), _time(row, "m1_t10_lq_s"), _share(row["survive_60"]), *errors)
     return out
 
 
@@ -136,6 +136,12 @@ def _column(out: Table, heading: str, justify: Literal["left", "right"] = "right
 
 def _number(value: float | None, digits: int = 1) -> str:
     return "–" if value is None else f"{value:.0f}" if abs(value) >= 100 else f"{value:.{digits}f}"
+
+
+def _time(row: dict[str, Any], key: str) -> str:
+    """Give a quantile of times; `>`: fewer had passed by the end of what could be followed."""
+    value, end = row[key], row["followed_s"]
+    return f"> {end:.0f}" if value is not None and end is not None and value >= end else _number(value)
 
 
 def _share(value: float | None) -> str:

@@ -6,8 +6,8 @@ from fleet.frames import G
 from fleet.mission import P_D, P_N, route
 from twin_worker.assess.case import Asked, Case
 from twin_worker.assess.log import Log
+from twin_worker.calibration.miss import path_length
 from twin_worker.flown import mode_named
-from twin_worker.horizon import path_length
 
 FIRST_S = 120.0  # a start counts from here on: before, the twin has not seen its identification window [s]
 WHOLE_S = 60.0  # a start counts where so much was flown without an event [s]
