@@ -5,6 +5,7 @@ import os
 import shutil
 import socket
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import flights
@@ -12,6 +13,8 @@ import pytest
 
 from fleet.bus import MemoryBus, open_router
 from fleet.contract import Message
+from twin_worker.contest import Contest
+from twin_worker.horizon import Record
 from twin_worker.twin import Twin
 from twin_worker.worker import Held, Worker
 
@@ -92,12 +95,23 @@ def twin(flown) -> Twin:
     return copy.deepcopy(flown[0])
 
 
-@pytest.fixture(params=["dynamics", "greybox"])
+@pytest.fixture(params=["dynamics", "hybrid", "greybox"])
 def winged(request, twin) -> Twin:
-    """The same, with its model and without."""
-    if request.param == "greybox":
+    """The same, with one of its models and with none."""
+    if request.param != "dynamics":
         twin.plant = None
+    if request.param != "hybrid":
+        twin.hybrid = None
+    twin.contest = Contest()
     return twin
+
+
+@pytest.fixture
+def sighted(monkeypatch) -> float:
+    """A confidence horizon of every prediction, whatever the tables say [s]."""
+    seconds, trust = 12.0, Record.trust
+    monkeypatch.setattr(Record, "trust", lambda *given: replace(trust(*given), horizon_s=seconds, horizon_open=False))
+    return seconds
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from flights import T0, drive, predictions, published
 
 from fleet.autopilots import greybox
-from fleet.contract import Message, Model, Outcome, Sample, State, Status
+from fleet.contract import Event, Message, Model, Outcome, Sample, State, Status
 from fleet.frames import to_ned
 from fleet.telemetry.recordings import replay_messages
 from twin_worker.greybox import air_of
@@ -59,11 +59,13 @@ def test_slow_rows_are_named_with_what_is_needed():
     assert "servo at 1.8 Hz" in twin.verdict.sentence and twin.verdict.outcome is Outcome.STARVED
 
 
-def test_a_hole_in_the_positions_is_no_place_to_start_from():
+def test_a_hole_in_the_positions_is_coasted_through_from_its_edge():
     twin = Twin(4)
     laid = f.without(thinned(f.turn(30.0), {"position": 5.0, "air": 5.0}), "position", 20.0, 40.0)
     made = predictions(drive(twin, f.messages(laid, uav=4)))
-    assert made and max(p.t for p in made) < T0 + 20.5
+    beyond = [p for p in made if p.t > T0 + 20.5]
+    assert made and all(p.coast_s > 3.0 and "positions stopped" in p.sentence for p in beyond)
+    assert made[-1].event is Event.HORIZON_OVER
 
 
 @pytest.mark.parametrize("vehicle", ["unknown", "rover"])

@@ -91,14 +91,13 @@ def test_a_recorded_flight_in_bursts_is_answered_as_one_by_one(recordings: Path)
     assert n_models > 3 and n_made > 40
 
 
-def test_a_silence_in_the_data_is_met_on_the_same_beat(heard):
+def test_a_silence_in_the_data_is_met_on_the_same_beat(heard, sighted):
     start = heard[0].t
     gap = [m for m in heard if m.t < start + 40.0 or m.t > start + 52.0][:700]
     offline = list(run(gap, {}))
     _, made = same(lived(gap, 7), offline, 1)
     coasting = [m for m in offline if isinstance(m, Prediction) and m.coast_s]
-    assert made and 3 <= len(coasting) <= 12
-    assert all(p.t + p.horizon_s > p.event_t for p in coasting[:-1]) and coasting[-1].event is Event.HORIZON_OVER
+    assert made and int(sighted) - 5 <= len(coasting) <= int(sighted) + 1
     assert [m.active for m in offline if isinstance(m, Alert)] == [True, False]
 
 

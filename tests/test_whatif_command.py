@@ -65,7 +65,7 @@ def test_the_path_is_told_in_a_few_lines(holder, monkeypatch, capsys):
     assert command.run(options("--speed", "18")) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "it flew at 18 m/s" in lines[0] and "horizon" in lines[1]
-    assert [int(line.split()[0]) for line in lines[3:]] == [0, 5, 10, 20, 30, 45, 60]
+    assert [int(line.split()[0]) for line in lines[3:]] == [0, 5, 10, 20, 30, 45, 60, 92, 120, 180]
     assert float(lines[3].split()[-1]) < 30.0 < float(lines[-1].split()[4])
 
 

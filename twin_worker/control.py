@@ -28,7 +28,7 @@ TOLD_OF = {"arduplane": _ARDUPLANE, "px4": _PX4, "textbook": _TEXTBOOK}
 """Parameters that shape a path, by law; the others are flown with all the same."""
 TOLD_OF_GUIDANCE = (*_ARDUPLANE[:5], "AIRSPEED_CRUISE", "TECS_CLMB_MAX", "TECS_SINK_MAX")
 CRUISE_OF = {"arduplane": "AIRSPEED_CRUISE", "px4": "FW_AIRSPD_TRIM", "textbook": "Va_c"}
-CRUISE = ("AIRSPEED_CRUISE", "WP_SPD", "FW_AIRSPD_TRIM", "MPC_XY_CRUISE", "Q_WP_SPD")  # what a wished speed overrides
+CRUISES = (*CRUISE_OF.values(), "WP_SPD", "MPC_XY_CRUISE", "Q_WP_SPD")  # what a wished speed overrides
 
 
 def why_unusable(name: str, value: float) -> str:

@@ -83,9 +83,9 @@ def _coasts(twin: Twin, flown: Track, now: float) -> float:
 
 
 def _is_over(twin: Twin, coast: float, now: float) -> bool:
-    """Tell whether coasting has used up the confidence horizon of the last prediction."""
+    """Tell whether coasting, once it was told of, has used up the confidence horizon of the last prediction."""
     last = twin.prediction
-    return coast > AHEAD[-1] or (last is not None and now >= last.t + last.horizon_s)
+    return coast > AHEAD[-1] or (last is not None and last.coast_s > 0 and now >= last.t + last.horizon_s)
 
 
 def _close(twin: Twin, coast: float, now: float) -> list[Message]:

@@ -16,7 +16,7 @@ from fleet.autopilots.shadow import shadow
 from fleet.contract import Item
 from fleet.frames import G, Origin
 from fleet.mission import KIND, TAKEOFF, VA_C, Route, route
-from twin_worker.control import Control, on_wings
+from twin_worker.control import CRUISE_OF, Control, on_wings
 from twin_worker.track import STEP, Track
 from twin_worker.whatif.instead import Instead, gone_over
 
@@ -27,7 +27,7 @@ _PERIODS = (9.0, 12.0, 16.0, 20.0, 26.0)  # NAVL1_PERIOD tried where it is not k
 _LAGS = (0.4, 0.8, 1.4)  # bank lags tried [s]
 _SPEED_S = 20.0  # airspeed is the mean over as much [s]
 _SLOWEST = 5.0  # a wing flies no slower [m/s]
-CRUISE = "AIRSPEED_CRUISE"
+CRUISE = CRUISE_OF["arduplane"]
 _RIDGE = 5.0  # usual wind, before it is seen [m/s]
 
 

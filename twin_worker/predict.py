@@ -210,7 +210,7 @@ def set_out(now: Situation) -> Start | Flown:
     said = " ".join(filter(None, (board.why, seen.sentence)))
     begun = Start(seen.good, (ctl, par, legs), _start(now, seen.good), seq, said, law)
     if board.instead is not None:
-        begun = _otherwise(now, begun, board.instead)
+        begun = _otherwise(now, begun, board.instead, told)
     return _refused(begun) or replace(begun, sentence=" ".join(filter(None, (begun.sentence, _assumed(begun.law)))))
 
 
@@ -218,18 +218,21 @@ def _altitude(now: Situation, good: Window) -> float:
     return now.origin.alt_mm * 1e-3 - float(good.p[-1, 2])
 
 
-def _otherwise(now: Situation, begun: Start, instead: Instead) -> Start:
-    """Let the synchronised controller go over to what a what-if flies."""
-    law = on_wings(now.onboard.params, now.onboard.identified, instead.asked, now.onboard.law)
+def _otherwise(now: Situation, begun: Start, instead: Instead, told: float) -> Start:
+    """Let the synchronised controller go over to what a what-if flies; `told`: airspeed aimed at so far [m/s]."""
+    name = now.onboard.law
+    law, cruise = on_wings(now.onboard.params, now.onboard.identified, instead.asked, name), CRUISE_OF[name]
     way = instead.way(now.origin, now.onboard.params)
     par = laws.blown(law.par(_altitude(now, begun.good)), *known_wind(now, begun.good))
-    ctl, _, legs = begun.control
-    if len(way.legs):
-        ctl = gone_over(ctl, legs, par, way.legs, (instead.anew, begun.good.p[-1]))
+    legs, (ctl, _, before) = way.legs, begun.control
+    if len(legs):
+        aimed = np.nan if cruise in instead.asked else told
+        legs = as_told(legs, float(instead.seq), float(law.values[cruise]), aimed)
+        ctl = gone_over(ctl, before, par, legs, (instead.anew, begun.good.p[-1]))
     state = begun.state[0].copy()
     state[3:6] = instead.at_speed(state[3:6])
     said = " ".join(way.sentences)
-    begun = replace(begun, state=(state, *begun.state[1:]), control=(ctl, par, way.legs))
+    begun = replace(begun, state=(state, *begun.state[1:]), control=(ctl, par, legs))
     return replace(begun, seq=instead.seq, sentence=said, law=law)
 
 
@@ -258,24 +261,37 @@ def fly_from(start: Start, plant: Plant, ahead: np.ndarray) -> Flown:
     out = np.empty((int(ahead[-1] / dt) + 2, N_STATE))
     ctl = ctl.copy()
     done = simulate(ctl, par, legs, settled(plant, start.good), *start.state, dt, out)
-    if done <= min(ahead[-1], ahead[0] + LEAST_AHEAD_S) / dt:
-        return Flown(None, start.seq, f"the twin leaves its envelope {done * dt:.0f} s ahead", True)
-    stay_down(out[:done, :3], ctl, legs)
-    t = dt * np.arange(done)
-    path = np.column_stack([np.interp(ahead, t, column, right=np.nan) for column in out[:done, :3].T])
+    return at_times(out[:done, :3], dt, start, ctl, ahead)
+
+
+def at_times(p: np.ndarray, step: float, start: Start, ctl: np.ndarray, ahead: np.ndarray) -> Flown:
+    """Give a flight at the look-aheads wanted: nan beyond its end, held in place beyond its touch-down.
+
+    Args:
+        p: positions every `step` [s] until the twin left its envelope, NED, (n, 3) [m], changed
+        start: where it started
+        ctl: the controller at its end
+        ahead: wanted look-ahead times, rising, (k,) [s]
+    """
+    landed = _stay_down(p, ctl, start.control[2])
+    if not landed and len(p) <= min(ahead[-1], ahead[0] + LEAST_AHEAD_S) / step:
+        return Flown(None, start.seq, f"the twin leaves its envelope {len(p) * step:.0f} s ahead", True)
+    t, beyond = step * np.arange(len(p)), None if landed else np.nan
+    path = np.column_stack([np.interp(ahead, t, column, right=beyond) for column in p.T])
     return Flown(path, start.seq, start.sentence, law=start.law)
 
 
-def stay_down(p: np.ndarray, ctl: np.ndarray, legs: np.ndarray) -> None:
-    """Hold a flight, NED (n, 3) [m], where its route ends on the ground; `ctl` is the controller's at its end."""
+def _stay_down(p: np.ndarray, ctl: np.ndarray, legs: np.ndarray) -> bool:
+    """Hold a flight, NED (n, 3) [m], where its route ends on the ground; tell whether it came so far."""
     at = int(ctl[arduplane.LEG])
-    if int(legs[at, KIND]) != LAND:
-        return
+    if not len(p) or int(legs[at, KIND]) != LAND:
+        return False
     begin = ctl[arduplane.FROM][:2]
     line = legs[at, P_N:P_D] - begin
     short = np.flatnonzero((p[:, :2] - begin) @ line < line @ line)
     down = int(short[-1]) + 1 if len(short) else 0
     p[down:] = p[min(down, len(p) - 1)]
+    return down < len(p)
 
 
 def _on_this_route(window: Window, since: float) -> Window:

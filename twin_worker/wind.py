@@ -57,7 +57,7 @@ class WindFilter:
     def blow(self, t: float, wind: np.ndarray) -> None:
         """Believe this wind at time `t` [s since 1970], NED, (3,) [m/s]."""
         self.t = t
-        self._filter.x[2:] = [*wind[:2], *np.zeros(4)]
+        self._filter.x[2:6] = *wind[:2], 0.0, 0.0  # mean, and no drift from it
 
     @property
     def state(self) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ EXAMPLES = """
   fleet whatif 7 --start 47.4,8.5,600,90,22       latitude, longitude, metres above sea, heading, airspeed
   fleet whatif 7 --wind 6,-2 --param NAVL1_PERIOD=25 --json
 """
-_SHOWN_S = (0, 5, 10, 20, 30, 45, 60, 90, 120, 180)
+_SHOWN_S = (0, 5, 10, 20, 30, 45, 60, 92, 120, 180)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

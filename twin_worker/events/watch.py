@@ -95,4 +95,5 @@ def _frame(twin: "Twin") -> None:
         twin.origin = Origin(*(int(x) for x in place[-1]))
         twin.ground.height = float("nan")
         twin.record.forget()
+        twin.contest.forget()
         note(twin, Event.ORIGIN, twin.history.newest, f"it is {away * 1e-3:.0f} km from where it was first heard")

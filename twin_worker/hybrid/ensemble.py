@@ -8,7 +8,7 @@ import numpy as np
 from fleet import hybrid as H
 from twin_worker.horizon import track_frame
 from twin_worker.hybrid.fit import Hybrid
-from twin_worker.hybrid.fly import begin, ground_velocity, rest
+from twin_worker.hybrid.fly import begin, over_ground, rest
 from twin_worker.predict import Situation, Start
 
 MEMBERS = 24
@@ -41,7 +41,7 @@ def draw(
     airs[:, [H.DRIFT, H.REST]] *= _ROUGH * now.wind.roughness
     states[:, :3] += _POSITION * z[:, 8:11]
     states[:, H.V] = states[:, H.V] / air[H.SCALE] * airs[:, H.SCALE] + _AIRSPEED * z[:, 11]
-    v = ground_velocity(start.good) + _VELOCITY * z[:, 12:14]
+    v = over_ground(state, air) + _VELOCITY * z[:, 12:14]
     airs[:, [H.REST_N, H.REST_E]] = rest(states, airs, v)
     body[:, H.C_0 : H.C_N + 1] += _POWER * z[:, 14:18] @ np.linalg.cholesky(found.power.cov).T
     body[:, H.A_0] += _ALPHA * z[:, 18]

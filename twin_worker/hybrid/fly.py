@@ -7,7 +7,7 @@ import numpy as np
 from fleet import hybrid as H
 from fleet.window import Window
 from twin_worker.hybrid.fit import Hybrid, flight_of
-from twin_worker.predict import LEAST_AHEAD_S, Flown, Situation, Start, stay_down
+from twin_worker.predict import Flown, Situation, Start, at_times
 from twin_worker.wind import DRIFT, DRIFT_S, GUST, GUST_S
 
 _SPEED_ROWS = 8  # rows of 0.1 s that the airspeed at the start is the mean of
@@ -68,7 +68,14 @@ def begin(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray]:
     start = start_of(now, good)
     air = air_of(now, start)
     air[[H.REST_N, H.REST_E]] = rest(start, air, ground_velocity(good))
+    if now.onboard.instead is not None and now.onboard.instead.speed is not None:
+        start[H.V] = now.onboard.instead.speed
     return start, air
+
+
+def over_ground(start: np.ndarray, air: np.ndarray) -> np.ndarray:
+    """Give the ground velocity that a start and its air make, north and east, (2,) [m/s]."""
+    return air[[H.REST_N, H.REST_E]] - rest(start, air, np.zeros(2))
 
 
 def fly_hybrid(now: Situation, start: Start, found: Hybrid, ahead: np.ndarray) -> Flown:
@@ -81,14 +88,7 @@ def fly_hybrid(now: Situation, start: Start, found: Hybrid, ahead: np.ndarray) -
     """
     ctl, par, legs = start.control
     state, air = begin(now, start.good)
-    if now.onboard.instead is not None and now.onboard.instead.speed is not None:
-        state[H.V] = now.onboard.instead.speed
     out = np.empty((int(ahead[-1] / H.STEP) + 2, 3))
     ctl = ctl.copy()
     done = H.fly(ctl, par, legs, found.body, air, state, _NO_CHANCE, H.STEP, out)
-    if done <= min(ahead[-1], ahead[0] + LEAST_AHEAD_S) / H.STEP:
-        return Flown(None, start.seq, f"the twin leaves its envelope {done * H.STEP:.0f} s ahead", True)
-    stay_down(out[:done], ctl, legs)
-    t = H.STEP * np.arange(done)
-    path = np.column_stack([np.interp(ahead, t, column, right=np.nan) for column in out[:done].T])
-    return Flown(path, start.seq, start.sentence, law=start.law)
+    return at_times(out[:done], H.STEP, start, ctl, ahead)

@@ -27,7 +27,7 @@ def renew(twin: Twin) -> None:
     if window is not None and not twin.learnt.t <= newest < twin.learnt.t + LEARN_S:
         learn_law(twin.learnt, twin.autopilot, twin.situation(window))
     good = window and _whole(window)
-    if good is None or good.seconds < LEAST_S + _HELD_S or twin.method == PAPER:
+    if window is None or good is None or len(good) < (LEAST_S + _HELD_S) / window.dt + 1 or twin.method == PAPER:
         return
     twin.hybrid_t = newest
     if not twin.checked_t <= newest < twin.checked_t + _CHECK_S:

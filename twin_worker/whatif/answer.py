@@ -9,7 +9,8 @@ import numpy as np
 
 from fleet.contract import Item, Mission, Prediction, Status, WhatIf
 from fleet.frames import Origin, to_ned
-from twin_worker.control import CRUISE
+from fleet.mission import FIRST
+from twin_worker.control import CRUISES
 from twin_worker.foresee import foresee
 from twin_worker.greybox import air_of
 from twin_worker.kinds import NO_WINGS, seen
@@ -121,7 +122,7 @@ def _instead(twin: Twin, asked: WhatIf) -> Instead:
     items = on_board if asked.items is None else asked.items
     params = dict(asked.params)
     if asked.speed is not None:
-        params = dict.fromkeys(CRUISE, asked.speed) | params
+        params = dict.fromkeys(CRUISES, asked.speed) | params
         items = tuple(_at_speed(item, asked.speed) for item in items)
     seq = asked.seq
     if seq is None:
@@ -143,7 +144,7 @@ def _first(items: tuple[Item, ...], twin: Twin) -> int:
 def _in_force(twin: Twin) -> int:
     _, leg = twin.history.rows("leg")
     told = int(leg[-1, 0]) if len(leg) else twin.mission.seq if twin.mission else -1
-    return told if told >= 0 else 1
+    return told if told >= 0 else FIRST.get(twin.autopilot, 1)
 
 
 def _as_if_on_it(twin: Twin, instead: Instead) -> None:

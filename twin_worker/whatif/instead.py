@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleet.autopilots import arduplane
+from fleet.autopilots import arduplane, laws
 from fleet.contract import Item
 from fleet.frames import Origin
 from fleet.mission import VA_C, Route, route
@@ -22,8 +22,8 @@ class Instead:
         seq: item flown to first
         asked: autopilot parameters
         anew: begin at `seq` from where the aircraft is, though it may already be flying that item
-        first: number of the first item to fly
         speed: through the air at the start, of what hovers over ground [m/s]; None: as it is
+        first: number of the first item to fly, as for `fleet.mission.route`
     """
 
     items: tuple[Item, ...]
@@ -58,10 +58,11 @@ def gone_over(
     """
     out, (anew, p) = ctl.copy(), begin
     rest = [column for column in range(legs.shape[1]) if column != VA_C]
-    same = not anew and np.array_equal(was[int(ctl[arduplane.LEG]), rest], legs[0, rest])
-    arduplane.set_leg(out, par, legs, 0, ctl[arduplane.FROM] if same else p)
-    if same:
-        turn = out[arduplane.TURN]
-        out[: arduplane.N_LEG] = ctl[: arduplane.N_LEG]
-        out[arduplane.LEG], out[arduplane.TURN] = 0, turn
+    out[arduplane.LEG] = 0
+    if anew or not np.array_equal(was[int(ctl[arduplane.LEG]), rest], legs[0, rest]):
+        laws.begin(out, par, legs, 0, p)
+        return out
+    again = ctl.copy()
+    arduplane.set_leg(again, par, legs, 0, ctl[arduplane.FROM])
+    out[arduplane.TURN] = again[arduplane.TURN]
     return out
