@@ -103,6 +103,7 @@ def _move(twin: Twin, asked: WhatIf) -> None:
         twin.origin = to if float(np.linalg.norm(far)) > _FAR_M else twin.origin
     if asked.wind is not None:
         twin.wind.blow(twin.history.newest, then)
+        twin.history.put("wind", np.array([twin.history.newest]), then[None, :2])  # the autopilot knows it too
         twin.rotor = replace(twin.rotor, wind=(float(then[0]), float(then[1])))
     twin.grid.clear()
 
