@@ -39,7 +39,7 @@ N_COLUMNS = 9
 NAMES = ("waypoint", "loiter turns", "loiter", "loiter time", "loiter to altitude", "takeoff", "land")
 _KINDS = {16: WAYPOINT, 17: LOITER_UNLIMITED, 18: LOITER_TURNS, 19: LOITER_TIME, 20: LOITER_UNLIMITED}
 _KINDS |= {21: LAND, 22: TAKEOFF, 31: LOITER_TO_ALT, 82: WAYPOINT, 84: TAKEOFF, 85: LAND}
-_RETURN, _LAST_NAV, _JUMP, _SPEED = 20, 95, 177, 178  # MAV_CMD: RETURN_TO_LAUNCH, NAV_LAST, DO_JUMP, DO_CHANGE_SPEED
+_RETURN, _LAST_NAV, _JUMP, SPEED = 20, 95, 177, 178  # MAV_CMD: RETURN_TO_LAUNCH, NAV_LAST, DO_JUMP, DO_CHANGE_SPEED
 _ABSOLUTE, _RELATIVE, _TERRAIN = (0, 5), (3, 6), (10, 11)  # MAV_FRAME
 GLOBAL_FRAMES = _ABSOLUTE + _RELATIVE + _TERRAIN
 _SHORTEST = 1.0  # a line shorter than this has no direction worth flying [m]
@@ -232,7 +232,7 @@ def _jump(walk: _Walk, item: Item) -> int:
 
 def _visit(walk: _Walk, item: Item) -> None:
     """Let one item other than DO_JUMP act: change the speed, add a leg, or say why not."""
-    if item.command == _SPEED:
+    if item.command == SPEED:
         _change_speed(walk, item)
     elif item.command in _KINDS:
         _add(walk, item)

@@ -12,13 +12,13 @@ from fleet.autopilots import arduplane, laws
 from fleet.autopilots.shadow import shadow
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
-from fleet.mission import FIRST, KIND, LAND, P_D, P_N, TAKEOFF, route
+from fleet.mission import FIRST, KIND, LAND, P_D, P_N, SPEED, TAKEOFF, route
 from fleet.simulate import N_STATE, simulate
 from fleet.window import Window
 from twin_worker.control import CRUISE_OF, Control, on_wings
 from twin_worker.history import History
 from twin_worker.plant import Plant, acting, settled
-from twin_worker.speed import aimed_at, as_told
+from twin_worker.speed import aimed_at, as_told, held_to
 from twin_worker.whatif.instead import Instead, gone_over
 from twin_worker.wind import WindFilter
 
@@ -204,7 +204,7 @@ def set_out(now: Situation) -> Start | Flown:
         return Flown(None, seq, board.why or "the control law is not known yet")
     law = on_wings(board.params, board.identified, law=board.law)
     par = laws.blown(law.par(seen.altitude_m), *known_wind(now, seen.good))
-    told = aimed_at(now.history, float(seen.good.t[-1]))
+    told = _aimed(now, float(seen.good.t[-1]), float(law.values[CRUISE_OF[board.law]]))
     legs = as_told(seen.legs, float(seq), float(law.values[CRUISE_OF[board.law]]), told)
     ctl, _ = shadow(par, legs, seen.start, *seen.rows, seen.seq)  # type: ignore[call-arg]
     said = " ".join(filter(None, (board.why, seen.sentence)))
@@ -212,6 +212,15 @@ def set_out(now: Situation) -> Start | Flown:
     if board.instead is not None:
         begun = _otherwise(now, begun, board.instead, told)
     return _refused(begun) or replace(begun, sentence=" ".join(filter(None, (begun.sentence, _assumed(begun.law)))))
+
+
+def _aimed(now: Situation, t: float, cruise: float) -> float:
+    """Give the airspeed aimed at: as told, else the one of the mission's that is held; nan unknown [m/s]."""
+    told = aimed_at(now.history, t)
+    if np.isfinite(told):
+        return told
+    named = {item.param2 for item in now.onboard.items if item.command == SPEED and 0 < item.param2 < np.inf}
+    return held_to(now.history, t, np.array(sorted(named | {cruise}))) if named else told
 
 
 def _altitude(now: Situation, good: Window) -> float:

@@ -1,7 +1,8 @@
 """The airspeed that the autopilot says it aims at, where the route alone does not tell.
 
 A mission that jumps back keeps the speed that was commanded last; which one that was is not on the wire, but how far
-the flown airspeed is from the wanted one is (NAV_CONTROLLER_OUTPUT).
+the flown airspeed is from the wanted one is (NAV_CONTROLLER_OUTPUT). Who does not say so, as PX4 by its attitude
+targets, still holds one of the few speeds that its mission names.
 """
 
 import numpy as np
@@ -11,6 +12,8 @@ from twin_worker.history import History
 
 _OVER_S = 3.0  # seconds whose median counts [s]
 _LEAST = 3  # reports within them
+_STEADY_S = 20.0  # seconds over which a speed is held
+_STEADY, _STRAYS = 0.04, 0.06  # of the airspeed: change within them, distance from the speed held [-]
 _APART = 0.5  # a smaller difference is rounding and noise [m/s]
 
 
@@ -22,6 +25,20 @@ def aimed_at(history: History, t: float) -> float:
         return float("nan")
     wanted = command[:, 4] + np.interp(t_c, t_air, air[:, 0])
     return float(np.median(wanted[t_c <= t])) if (t_c <= t).any() else float("nan")
+
+
+def held_to(history: History, t: float, speeds: np.ndarray) -> float:
+    """Give the one of `speeds` [m/s] that was held just before `t`; nan where the airspeed keeps to none of them."""
+    t_air, air = history.rows("air", t - _STEADY_S)
+    Va = air[t_air <= t, 0]
+    if len(Va) < 2 * _LEAST or not len(speeds) or Va.min() < 3.0:
+        return float("nan")
+    half = len(Va) // 2
+    off = np.sort(np.abs(speeds - np.median(Va)))
+    steady = abs(float(np.median(Va[:half]) - np.median(Va[half:]))) < _STEADY * float(np.median(Va))
+    if not steady or off[0] > _STRAYS * float(np.median(Va)) or (len(off) > 1 and off[0] > 0.5 * off[1]):
+        return float("nan")
+    return float(speeds[np.argmin(np.abs(speeds - np.median(Va)))])
 
 
 def as_told(legs: np.ndarray, seq: float, cruise: float, told: float) -> np.ndarray:
