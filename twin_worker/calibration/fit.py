@@ -3,10 +3,13 @@
 Source: Vovk 2015, "Cross-conformal predictors"; Angelopoulos et al. 2024, "Conformal risk control".
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import minimize
 
-from twin_worker.calibration.miss import AHEAD, QUANTILE, first_passage
+from twin_worker.calibration.conform import factors_of
+from twin_worker.calibration.miss import AHEAD, first_passage
 from twin_worker.calibration.quantile import censored_quantile, weighted_quantile
 from twin_worker.calibration.risk import critical, growth
 from twin_worker.calibration.scored import Scored
@@ -68,20 +71,26 @@ def fit(scored: Scored, group: str) -> Table:
     error, folds = scored.errors()[..., :3], scored.folds(group)
     weight = 1.0 / np.bincount(folds)[folds]  # each flight speaks as loud
     scale, floor = fit_sigma(scored.spread, error)
-    ratio = np.empty(error.shape[:2])  # of the largest error to its sigma
+    ratio = np.empty(error.shape)  # to sigma
     batch = folds % min(_FOLDS, int(folds.max()) + 1)
     for b in np.unique(batch):
         left = batch == b
         apart = _raw(group, *(fit_sigma(scored.spread[~left], error[~left]) if not left.all() else (scale, floor)))
-        ratio[left] = (error[left] / apart.sigma(scored.spread[left], AHEAD)).max(axis=2)
-    factor = _known(np.array([_factor(ratio[:, near(knot)], weight) for knot in KNOTS]))
-    again = ratio / np.interp(AHEAD, KNOTS, factor)
-    known = np.isfinite(again[:, 1:])
-    loud = np.where(known, weight[:, None], 0.0).ravel()
-    scores = [float(weighted_quantile(again[:, 1:].reshape(1, -1), loud[None], np.array([p]))[0]) for p in LEVELS]
-    shape = np.maximum.accumulate(np.maximum(scores, 1e-3))
-    table = Table(group, len(scored), len(set(scored.flight.tolist())), scale, floor, factor, shape, shape)
-    return _with_risks(table, scored, weight)
+        ratio[left] = error[left] / apart.sigma(scored.spread[left], AHEAD)
+    factor = _known(np.array([factors_of(ratio[:, near(knot)], weight) for knot in KNOTS]))
+    flights = len(set(scored.flight.tolist()))
+    table = replace(_raw(group, scale, floor), factor=factor, starts=len(scored), flights=flights)
+    return _with_risks(replace(table, scores=_scores(table, ratio, weight)), scored, weight)
+
+
+def _scores(table: Table, ratio: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Give how the largest error over its half-axis was distributed, over all look-aheads, (20,)."""
+    unit = replace(table, scale=np.zeros_like(table.scale), floor=np.ones_like(table.floor))
+    score = (ratio / unit.half_axes(np.zeros(3), AHEAD)).max(axis=2)[:, 1:]
+    known = np.isfinite(score)
+    loud = np.where(known, weight[:, None], 0.0).reshape(1, -1)
+    found = [float(weighted_quantile(score.reshape(1, -1), loud, np.array([p]))[0]) for p in LEVELS]
+    return np.maximum.accumulate(np.maximum(found, 1e-3))
 
 
 def _raw(group: str, scale: np.ndarray, floor: np.ndarray) -> Table:
@@ -89,21 +98,12 @@ def _raw(group: str, scale: np.ndarray, floor: np.ndarray) -> Table:
     return Table(group, 0, 0, scale, floor, plain.factor, plain.scores, plain.risks)
 
 
-def _factor(ratio: np.ndarray, weight: np.ndarray) -> float:
-    """Give the quantile of scores (s, k) that holds the wanted share of the next one too; nan where none is known."""
-    known = np.isfinite(ratio)
-    n = int(known.any(axis=1).sum())
-    if not n:
-        return float("nan")
-    level = min(QUANTILE * (n + 1) / n, 1.0)
-    loud = np.where(known, weight[:, None], 0.0)
-    return float(weighted_quantile(ratio.reshape(1, -1), loud.reshape(1, -1), np.array([level]))[0])
-
-
 def _known(factor: np.ndarray) -> np.ndarray:
-    """Let look-aheads nobody followed take the factor of their neighbours."""
-    known = np.isfinite(factor)
-    return np.interp(KNOTS, KNOTS[known], factor[known]) if known.any() else np.full(len(KNOTS), 2.0)
+    """Let look-aheads nobody followed take the factors of their neighbours, (13, 3)."""
+    known = np.isfinite(factor[:, 0])
+    if not known.any():
+        return np.full_like(factor, 2.0)
+    return np.column_stack([np.interp(KNOTS, KNOTS[known], column[known]) for column in factor.T])
 
 
 def _with_risks(table: Table, scored: Scored, weight: np.ndarray) -> Table:
@@ -114,4 +114,4 @@ def _with_risks(table: Table, scored: Scored, weight: np.ndarray) -> Table:
     x, exact = critical(ratio, np.array(followed)), ~np.array(censored)
     n = len(x)
     risks = [censored_quantile(x, weight, exact, min(p * (n + 1) / n, 1.0)) for p in LEVELS]
-    return Table(**{**vars(table), "risks": np.maximum.accumulate(risks)})
+    return replace(table, risks=np.maximum.accumulate(risks))

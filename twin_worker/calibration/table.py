@@ -1,6 +1,7 @@
 """Calibration tables: how large errors were beside what an ensemble said, by look-ahead, of one group of flights.
 
-sigma^2 = scale^2 s^2 + floor^2 by axis; half-axes = factor sigma hold `QUANTILE` of the flights in each look-ahead.
+sigma^2 = scale^2 s^2 + floor^2 by axis; half-axes = factor sigma, of which each axis misses as
+often as another, hold `QUANTILE` of the flights at each look-ahead, all three at once.
 """
 
 from dataclasses import dataclass, field
@@ -36,7 +37,7 @@ class Table:
         starts, flights: predictions and flights behind it
         scale: share of the ensemble's spread, by knot and axis, (13, 3) [-]
         floor: what the ensemble does not know of, (13, 3) [m]
-        factor: from sigma to half-axes, (13,) [-]
+        factor: from sigma to half-axes, (13, 3) [-]
         scores: largest error over its half-axis, `ATOMS` quantiles [-]
         risks: critical factors of the horizon, `ATOMS` quantiles [-]
         held_out: what it did on flights left out of it, by name
@@ -55,12 +56,16 @@ class Table:
     def sigma(self, spread: np.ndarray, ahead: np.ndarray) -> np.ndarray:
         """Give what errors to expect by the spread of an ensemble, growing beyond the last knot, (..., n, 3) [m]."""
         beyond = np.maximum(ahead / KNOTS[-1], 1.0)[:, None]
-        a, b = (np.column_stack([np.interp(ahead, KNOTS, row) for row in rows.T]) for rows in (self.scale, self.floor))
-        return np.hypot(a * spread, b * beyond)
+        return np.hypot(_at(ahead, self.scale) * spread, _at(ahead, self.floor) * beyond)
 
     def half_axes(self, spread: np.ndarray, ahead: np.ndarray) -> np.ndarray:
         """Give the half-axes that held `QUANTILE` of these flights in each look-ahead, (..., n, 3) [m]."""
-        return np.interp(ahead, KNOTS, self.factor)[:, None] * self.sigma(spread, ahead)
+        return _at(ahead, self.factor) * self.sigma(spread, ahead)
+
+
+def _at(ahead: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Interpolate what is written by knot and axis, (13, 3), at look-aheads, (n, 3)."""
+    return np.column_stack([np.interp(ahead, KNOTS, column) for column in rows.T])
 
 
 def law_of_growth(method: str, ahead: np.ndarray) -> np.ndarray:
@@ -83,4 +88,4 @@ def untaught(method: str) -> Table:
     law = law_of_growth(method, KNOTS)
     shape = np.sqrt(2.0) * erfinv(np.cbrt(LEVELS))  # the largest of three normal errors
     shape = shape / np.interp(QUANTILE, LEVELS, shape)
-    return Table(method, 0, 0, np.ones_like(law), law, np.full(len(KNOTS), 2.0), shape, shape)
+    return Table(method, 0, 0, np.ones_like(law), law, np.full_like(law, 2.0), shape, shape)

@@ -27,14 +27,14 @@ class Source(msgspec.Struct, frozen=True):
 
 
 class Row(msgspec.Struct, frozen=True):
-    """One table as it is written; scale and floor by axis, then knot."""
+    """One table as it is written; scale, floor and factor by axis, then knot."""
 
     group: str
     starts: int
     flights: int
     scale: list[list[float]]
     floor: list[list[float]]
-    factor: list[float]
+    factor: list[list[float]]
     scores: list[float]
     risks: list[float]
     held_out: dict[str, float] = {}
@@ -85,7 +85,7 @@ def read_tables(path: Path) -> Tables:
 
 
 def _table(file: str, row: Row) -> Table:
-    shapes = {"scale": (3, 13), "floor": (3, 13), "factor": (13,), "scores": (ATOMS,), "risks": (ATOMS,)}
+    shapes = {"scale": (3, 13), "floor": (3, 13), "factor": (3, 13), "scores": (ATOMS,), "risks": (ATOMS,)}
     arrays = {}
     for name, shape in shapes.items():
         try:
@@ -100,8 +100,8 @@ def _table(file: str, row: Row) -> Table:
             )
     if not ((arrays["factor"] > 0).all() and (arrays["scores"] > 0).all() and (arrays["floor"] > 0).all()):
         raise ValueError(f"calibration {file}: found a zero width for {row.group}, expected more; fit it again")
-    scale, floor = arrays.pop("scale").T, arrays.pop("floor").T
-    return Table(row.group, row.starts, row.flights, scale, floor, **arrays, held_out=row.held_out)
+    by_knot = {name: arrays.pop(name).T for name in ("scale", "floor", "factor")}
+    return Table(row.group, row.starts, row.flights, **by_knot, **arrays, held_out=row.held_out)
 
 
 @lru_cache(maxsize=8)
@@ -125,7 +125,7 @@ def write(path: Path, tables: Sequence[Table], sources: Sequence[Source], made: 
 
 
 def _row(table: Table) -> Row:
-    parts = table.scale.T, table.floor.T, table.factor, table.scores, table.risks
+    parts = table.scale.T, table.floor.T, table.factor.T, table.scores, table.risks
     scale, floor, factor, scores, risks = map(_short, parts)
     measured = {name: round(value, 4) for name, value in table.held_out.items() if np.isfinite(value)}
     return Row(table.group, table.starts, table.flights, scale, floor, factor, scores, risks, measured)
