@@ -44,6 +44,9 @@ _ABSOLUTE, _RELATIVE, _TERRAIN = (0, 5), (3, 6), (10, 11)  # MAV_FRAME
 GLOBAL_FRAMES = _ABSOLUTE + _RELATIVE + _TERRAIN
 _SHORTEST = 1.0  # a line shorter than this has no direction worth flying [m]
 FIRST = {"px4": 0}  # number of the first item to fly, by autopilot; 1 elsewhere
+_SAID = 3  # sentences told of one mission
+_FAR = 500e3  # a leg that long is a slip, and a flat earth does not know its direction [m]
+_FASTEST = 300.0  # commanded speeds beyond are noise [m/s]
 _HIGHEST = 1e5  # altitudes beyond are noise [m]
 _RTL_ALTITUDE = 100.0  # ArduPlane's default RTL_ALTITUDE [m]
 
@@ -56,6 +59,11 @@ class Route:
     legs: np.ndarray  # (n, 9) float64, columns above, NED [m]
     start: np.ndarray  # (3,) the navigation point before legs[0], NED [m]; nan: begin where the aircraft is
     sentences: tuple[str, ...] = ()  # what was wrong with the mission, and what was made of it
+
+    @property
+    def said(self) -> str:
+        """Give the first sentences, and how many more there are; empty where nothing was wrong."""
+        return few(self.sentences)
 
     def __str__(self) -> str:
         kinds = Counter(NAMES[int(kind)] for kind in self.legs[:, KIND])
@@ -75,6 +83,7 @@ class _Walk:
     params: Mapping[str, float]
     home: np.ndarray  # (3,) NED [m]
     point: np.ndarray  # (3,) the navigation point last passed, NED [m]
+    places: dict[int, np.ndarray] = field(default_factory=dict)  # of every item, NED but for the height, (3,) [m]
     kind: int = TAKEOFF  # of the leg that ended there; home is no point to start a line from
     speed: float = 0.0  # commanded airspeed; 0: cruise [m/s]
     left: dict[int, float] = field(default_factory=dict)  # jumps left at each DO_JUMP
@@ -85,6 +94,12 @@ class _Walk:
     def say(self, sentence: str) -> None:
         """Remember a sentence once."""
         self.sentences.setdefault(sentence)
+
+
+def few(sentences: Sequence[str]) -> str:
+    """Give the first sentences in one, and how many more there are."""
+    more = len(sentences) - _SAID
+    return " ".join([*sentences[:_SAID], *([f"and {more} more remarks on the mission"] if more > 0 else [])])
 
 
 def route(
@@ -126,6 +141,8 @@ def _begin(items: Sequence[Item], origin: Origin, params: Mapping[str, float], f
     if lost:
         walk.say(f"mission: found {len(kept)} of {walk.last + 1} items; skipped {lost}, download the mission again")
     walk.home = walk.point = _home(walk) if first else np.zeros(3)
+    lat, lon = (np.array([getattr(item, name) for item in kept.values()], float) for name in ("lat_e7", "lon_e7"))
+    walk.places = dict(zip(kept, to_ned(origin, lat, lon, np.zeros(len(lat))), strict=True))
     return walk
 
 
@@ -245,6 +262,10 @@ def _change_speed(walk: _Walk, item: Item) -> None:
         walk.speed = 0.0
     if not (isfinite(item.param2) and item.param2 > 0):
         return
+    if item.param2 > _FASTEST:
+        found = f"found a speed of {item.param2:g} m/s, expected at most {_FASTEST:.0f}"
+        walk.say(f"mission item {item.seq}: {found}; kept the one before, correct it")
+        return
     walk.speed = item.param2
     if item.param1 == 1:
         walk.say(f"mission item {item.seq}: found a ground speed, expected an airspeed; took it as one, set type 0")
@@ -264,7 +285,11 @@ def _add(walk: _Walk, item: Item) -> None:
         return
     kind = _KINDS[item.command]
     target = _point(walk, item)
-    near = hypot(*(target - walk.point)[:2]) < _SHORTEST
+    length = hypot(*(target - walk.point)[:2])
+    if length > _FAR:
+        found = f"found {length * 1e-3:,.0f} km from the point before, expected {_FAR * 1e-3:.0f} km at most"
+        walk.say(f"mission item {item.seq}: {found}; flown towards, check where it lies")
+    near = length < _SHORTEST
     if near and kind == WAYPOINT == walk.kind and (walk.legs or not _nowhere(item)):
         walk.say(f"mission item {item.seq}: found a leg of zero length, expected {_SHORTEST:.0f} m; skipped, remove it")
         return
@@ -279,7 +304,8 @@ def _point(walk: _Walk, item: Item) -> np.ndarray:
         walk.say(f"mission item {item.seq}: found altitude over terrain; took it over home, give it relative to home")
     absolute = item.frame in _ABSOLUTE
     altitude = item.alt_m + (0.0 if absolute else walk.origin.alt_mm * 1e-3 - walk.home[2])
-    point = _ned(walk.origin, item, altitude)
+    point = walk.places[item.seq].copy()
+    point[2] = walk.origin.alt_mm * 1e-3 - altitude
     if _nowhere(item):
         point[:2] = walk.point[:2]
     return point

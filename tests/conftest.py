@@ -9,12 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import flights
+import hover
 import pytest
 
 from fleet.bus import MemoryBus, open_router
 from fleet.contract import Message
 from twin_worker.contest import Contest
 from twin_worker.horizon import Record
+from twin_worker.offline import run
 from twin_worker.twin import Twin
 from twin_worker.worker import Held, Worker
 
@@ -104,6 +106,21 @@ def winged(request, twin) -> Twin:
         twin.hybrid = None
     twin.contest = Contest()
     return twin
+
+
+@pytest.fixture(scope="session")
+def hovering() -> Twin:
+    """A multirotor's twin in the middle of its mission."""
+    twins: dict[int, Twin] = {}
+    for _ in run(hover.fly(3).messages[:500], twins):
+        pass
+    return twins[7]
+
+
+@pytest.fixture
+def hovered(hovering) -> Twin:
+    """A copy of it, to do anything with."""
+    return copy.deepcopy(hovering)
 
 
 @pytest.fixture

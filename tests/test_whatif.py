@@ -3,7 +3,6 @@
 import copy
 import time
 
-import hover
 import msgpack
 import msgspec
 import numpy as np
@@ -15,21 +14,11 @@ from fleet.contract import MAX_ITEMS, Prediction, WhatIf, WhatIfStart
 from fleet.frames import to_geodetic
 from twin_worker.foresee import foresee
 from twin_worker.memory import Twin
-from twin_worker.offline import run
 from twin_worker.whatif.answer import answer
 
 NAN, INF = float("nan"), float("inf")
 FAST_S = 0.05  # the best of three answers takes no longer [s]
 SPEED_ITEM = 178  # MAV_CMD: DO_CHANGE_SPEED
-
-
-@pytest.fixture(scope="module")
-def hovered() -> Twin:
-    """A multirotor's twin in the middle of its mission."""
-    twins: dict[int, Twin] = {}
-    for _ in run(hover.fly(3).messages[:500], twins):
-        pass
-    return twins[7]
 
 
 def asked(twin: Twin, **what) -> Prediction:

@@ -113,7 +113,7 @@ def _fly(seen: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
     par = law_now.par(_altitude(seen, board))
     way = route(board.items, seq=int(seq[0]), origin=board.origin, params=board.params, first=board.first)
     if not len(way.legs):
-        return Ahead(None, int(seq[-1]), " ".join(way.sentences) or "the mission has no legs to fly")
+        return Ahead(None, int(seq[-1]), way.said or "the mission has no legs to fly")
     w, V = air_of(seen, board.wind)
     if V < _SLOWEST or np.linalg.norm(seen.v[-1] - [*w, 0.0]) < _SLOWEST:
         return Ahead(None, int(seq[-1]), "too slow to fly on wings")
@@ -124,7 +124,7 @@ def _fly(seen: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
     if board.instead is not None:
         flown = _otherwise(flown, seen, board, grey, board.instead)
     if not len(flown.way.legs):
-        return Ahead(None, int(seq[-1]), " ".join(flown.way.sentences) or "the mission has no legs to fly")
+        return Ahead(None, int(seq[-1]), flown.way.said or "the mission has no legs to fly")
     if int(flown.way.legs[int(flown.ctl[arduplane.LEG]), KIND]) == TAKEOFF:
         return Ahead(None, int(seq[-1]), "take-off is not modelled: no route-aware prediction")
     state, out = _state(seen, w), np.empty((int(ahead[-1] / STEP) + 2, 3))
@@ -133,7 +133,7 @@ def _fly(seen: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
     law.follow(flown.ctl, flown.par, flown.way.legs, flown.lags, state, w, STEP, out)
     path = np.column_stack([np.interp(ahead, STEP * np.arange(len(out)), column) for column in out.T])
     seq_now = int(seq[-1]) if board.instead is None else board.instead.seq
-    return Ahead(path, seq_now, " ".join(flown.way.sentences), flown.law)
+    return Ahead(path, seq_now, flown.way.said, flown.law)
 
 
 @dataclass(frozen=True)

@@ -163,10 +163,10 @@ def _fly_rotor(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
     seq = rotor.items_in_force(flown.t, twin.history.rows("leg"), twin.mission)
     if twin.instead is not None:
         seq[-1], flown = twin.instead.seq, _at_speed(flown, twin.instead)
-    if not np.isfinite(seq[-1]):
-        return nothing("the mission item in force is not reported (MISSION_CURRENT)")
-    path = rotor.fly_route(flown, seq, board, twin.rotor, ahead)
+    path, wrong = rotor.fly_route(flown, seq, board, twin.rotor, ahead)
+    at = int(seq[-1]) if np.isfinite(seq[-1]) else -1
     if path is None:
-        return nothing("the mission has nothing to fly", int(seq[-1]))
+        return nothing(wrong, at)
     hung = "it hangs on its rotors; " if twin.vehicle == QUADPLANE else ""
-    return Flight(path, "copter", copter.LAW, int(seq[-1]), hung + rotor.said(board, twin.rotor), control)
+    said = " ".join(filter(None, (hung + rotor.said(board, twin.rotor), wrong)))
+    return Flight(path, "copter", copter.LAW, at, said, control)

@@ -179,7 +179,7 @@ def heard(now: Situation) -> Heard | Flown:
     board = now.onboard
     first = FIRST.get(board.autopilot, 1)
     way = route(board.items, seq=int(seq[0]), origin=now.origin, params=board.params, first=first)
-    said = " ".join(way.sentences)
+    said = way.said
     if not len(way.legs):
         return Flown(None, int(seq[-1]), said or "the mission has no legs to fly")
     start = way.start if np.isfinite(way.start).all() else good.p[0]
@@ -240,7 +240,7 @@ def _otherwise(now: Situation, begun: Start, instead: Instead, told: float) -> S
         ctl = gone_over(ctl, before, par, legs, (instead.anew, begun.good.p[-1]))
     state = begun.state[0].copy()
     state[3:6] = instead.at_speed(state[3:6])
-    said = " ".join(way.sentences)
+    said = way.said
     begun = replace(begun, state=(state, *begun.state[1:]), control=(ctl, par, legs))
     return replace(begun, seq=instead.seq, sentence=said, law=law)
 

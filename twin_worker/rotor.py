@@ -13,6 +13,7 @@ from fleet.autopilots import copter
 from fleet.autopilots.copter import Limits
 from fleet.contract import Item, Mission
 from fleet.frames import Origin
+from fleet.mission import few
 from twin_worker.plan import home_again, lay, numbered_from_one, paced, stop_from
 from twin_worker.predict import held
 from twin_worker.track import STEP, Track
@@ -104,8 +105,10 @@ def _usual_speed(flown: Track, otherwise: float) -> float:
     return float(np.quantile(moving, 0.9)) if len(moving) > 5.0 / STEP else otherwise
 
 
-def fly_route(track: Track, seq: np.ndarray, board: Onboard, rotor: Rotor, ahead: np.ndarray) -> np.ndarray | None:
-    """Fly the mission ahead from the end of the track; None where there is nothing to fly.
+def fly_route(
+    track: Track, seq: np.ndarray, board: Onboard, rotor: Rotor, ahead: np.ndarray
+) -> tuple[np.ndarray | None, str]:
+    """Fly the mission ahead from the end of the track; None where there is nothing to fly. Say what is wrong with it.
 
     Args:
         track: newest flight
@@ -114,9 +117,12 @@ def fly_route(track: Track, seq: np.ndarray, board: Onboard, rotor: Rotor, ahead
         ahead: wanted look-ahead times, (k,) [s]
     """
     if not isfinite(seq[-1]):
-        return None
-    laid, _ = lay(board.items, int(seq[-1]) + board.shift, board.origin, track.p[-1], board.params)
-    return fly_segments(track, laid, int(seq[-1]) + board.shift, Way(board, rotor), ahead) if len(laid) else None
+        return None, "the mission item in force is not reported (MISSION_CURRENT)"
+    at = int(seq[-1]) + board.shift
+    laid, wrong = lay(board.items, at, board.origin, track.p[-1], board.params)
+    if not len(laid):
+        return None, few(("the mission has nothing to fly", *wrong))
+    return fly_segments(track, laid, at, Way(board, rotor), ahead), few(wrong)
 
 
 def fly_home(track: Track, board: Onboard, rotor: Rotor, ahead: np.ndarray) -> np.ndarray | None:
