@@ -14,6 +14,7 @@ AT = np.arange(0.0, 61.0, 5.0)  # look-ahead at which paths are compared [s]
 EVERY_S = 5.0  # between predictions that are compared [s]
 ORDER = ("both", "hybrid", "dynamics", "paper")  # while there is nothing to compare
 _NEWS = 0.1  # weight of the newest, once there are many
+_CLEARLY = 0.85  # share of the usual one's miss below which another is preferred: the mean of two errs less [-]
 _LEAST = 4  # answered predictions before any of them counts
 _HOLE_S = 2.0  # a longer hole in the flight gives no answer [s]
 
@@ -70,11 +71,13 @@ class Contest:
         self.miss[method] = before + max(_NEWS, 1.0 / n) * (miss - before)
 
     def best(self, methods: tuple[str, ...]) -> str:
-        """Choose among methods: the one that strayed least, where enough were answered."""
+        """Choose the first of `ORDER` among methods, unless another strayed clearly less in enough that were answered."""
         known = [method for method in methods if self.count.get(method, 0) >= _LEAST]
         if len(known) < len(methods):
             return min(methods, key=ORDER.index)
-        return min(known, key=lambda method: self.miss[method])
+        usual = min(methods, key=ORDER.index)
+        least = min(known, key=lambda method: self.miss[method])
+        return least if self.miss[least] < _CLEARLY * self.miss[usual] else usual
 
     def said(self, method: str) -> str:
         """Say what the choice rests on; empty before enough were answered."""
