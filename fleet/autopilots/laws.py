@@ -163,7 +163,26 @@ def fly(
     return fly_arduplane(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
 
 
-@inlined
+@kernel
+def _guide_other(
+    ctl: np.ndarray,
+    par: np.ndarray,
+    legs: np.ndarray,
+    p: np.ndarray,
+    v: np.ndarray,
+    euler: np.ndarray,
+    Va: float,
+    Va_dot: float,
+    dt: float,
+) -> tuple[float, float, float]:
+    """Fly the route for one step by any law but ArduPlane's."""
+    phi_c, theta_c, delta_t, over = fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    if over and int(ctl[LEG]) + 1 < legs.shape[0]:
+        begin(ctl, par, legs, int(ctl[LEG]) + 1, p)
+    return phi_c, theta_c, delta_t
+
+
+@kernel
 def guide(
     ctl: np.ndarray,
     par: np.ndarray,
@@ -179,11 +198,12 @@ def guide(
 
     Arguments and answer as for ArduPlane's `guide`.
     """
-    if mark(par) >= ARDUPLANE:
-        return arduplane.guide(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
-    phi_c, theta_c, delta_t, over = fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    if mark(par) < ARDUPLANE:
+        return _guide_other(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
+    # ArduPlane's `guide`, written out: behind one more call it would be a tenth slower
+    phi_c, theta_c, delta_t, over = fly_arduplane(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
     if over and int(ctl[LEG]) + 1 < legs.shape[0]:
-        begin(ctl, par, legs, int(ctl[LEG]) + 1, p)
+        leg_rules.begin(ctl, par, legs, int(ctl[LEG]) + 1, p)
     return phi_c, theta_c, delta_t
 
 
