@@ -3,7 +3,8 @@
 import numpy as np
 
 from twin_worker.calibration.miss import AHEAD, path_length
-from twin_worker.calibration.scored import Scored
+from twin_worker.calibration.scored import Scored, revisions
+from twin_worker.calibration.table import Doubt
 
 V = 20.0  # over ground [m/s]
 LINE = np.column_stack([V * AHEAD, 0 * AHEAD, 0 * AHEAD - 100.0])
@@ -32,20 +33,23 @@ def scored(flights: int, starts: int, seed: int, *, loud: float = 1.0, group: st
     """Make up so many flights of so many predictions; a fifth of them is not followed to the end."""
     rng = np.random.default_rng(seed)
     n = flights * starts
+    t0 = np.tile(5.0 * np.arange(starts), flights)
+    names = np.repeat([f"seed-{seed}-{i}" for i in range(flights)], starts)
     spread = np.array([spreads(rng) for _ in range(n)])
-    error = np.array([errors(rng, one, loud) for one in spread])
-    flown = LINE + error
+    flown = LINE + V * t0[:, None, None] * [1.0, 0.0, 0.0]
+    path = flown - np.array([errors(rng, one, loud) for one in spread])
     for row in np.flatnonzero(rng.random(n) < 0.2):
         flown[row, rng.integers(20, len(AHEAD)) :] = np.nan
+    revision = revisions(t0, path, names)
     length = np.tile(path_length(LINE, V), (n, 1))
     return Scored(
-        t0=np.tile(5.0 * np.arange(starts), flights),
-        path=np.tile(LINE, (n, 1, 1)),
-        spread=spread,
+        t0=t0,
+        path=path,
+        doubt=Doubt(spread, np.where(np.isfinite(revision), revision, spread)),
         flown=flown,
         length=np.where(np.isfinite(flown[..., 0]), length, np.nan),
         predicted_length=length,
         group=np.full(n, group),
         method=np.full(n, group.partition("/")[0]),
-        flight=np.repeat([f"seed-{seed}-{i}" for i in range(flights)], starts),
+        flight=names,
     )

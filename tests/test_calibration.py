@@ -1,7 +1,7 @@
 """Calibration tables: fitted, left out, written, read, chosen; coverage and horizons on errors of known law."""
 
 import json
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import made_up
 import numpy as np
@@ -14,8 +14,9 @@ from twin_worker.calibration.fit import fit, fit_sigma
 from twin_worker.calibration.groups import airframe_class, group_of, wider
 from twin_worker.calibration.miss import AHEAD, axes_error, first_passage, path_length, track_frame
 from twin_worker.calibration.quantile import censored_quantile, masses, median_passage, survival, weighted_quantile
-from twin_worker.calibration.scored import Scored
-from twin_worker.calibration.table import KNOTS, filled, law_of_growth, untaught
+from twin_worker.calibration.revision import Earlier
+from twin_worker.calibration.scored import Scored, joined
+from twin_worker.calibration.table import KNOTS, Doubt, doubt_of, law_of_growth, untaught
 from twin_worker.calibration.written import Source, Tables, load, read_tables, write
 
 
@@ -89,7 +90,7 @@ def test_survival_by_hand():
 
 
 def test_the_fit_finds_how_much_wider_errors_are_than_the_ensemble(past):
-    scale, _ = fit_sigma(past.spread, past.errors()[..., :3])
+    scale, _, _ = fit_sigma(past.doubt, past.errors()[..., :3])
     assert np.median(scale[4:, 0]) == pytest.approx(0.8 * 2.0, rel=0.15)  # heavy tails take a normal law for narrower
 
 
@@ -119,31 +120,34 @@ def test_horizons_hold_and_tell_easy_minutes_from_hard_ones(table):
     assert got["rank_correlation"] >= 0.5
     horizon = claimed(table, fresh)[1]
     assert np.mean(horizon > 60) > 0.5 and np.mean(horizon < 60) > 0.1
-    hard = fresh.spread[:, 40, 0] > np.quantile(fresh.spread[:, 40, 0], 0.8)
+    hard = fresh.doubt.spread[:, 40, 0] > np.quantile(fresh.doubt.spread[:, 40, 0], 0.8)
     assert figures(fresh.part(hard), claimed(table, fresh.part(hard)))["hit_rate"] >= 0.82  # the hard ones hold too
 
 
 def test_without_an_ensemble_the_law_of_growth_is_calibrated_instead(past):
-    bare = replace(past, spread=np.array([filled(None, "hybrid", AHEAD)] * len(past)))
-    fresh = replace(made_up.scored(20, 30, seed=5), spread=np.array([filled(None, "hybrid", AHEAD)] * 600))
-    assert figures(fresh, claimed(fit(bare, GROUP), fresh))["coverage"] == pytest.approx(0.9, abs=0.03)
+    law = doubt_of(None, None, "hybrid", AHEAD)
+    bare, fresh = (
+        replace(of, doubt=Doubt(np.array([law.spread] * len(of)), of.doubt.revision))
+        for of in (past, made_up.scored(20, 30, seed=5))
+    )
+    assert figures(fresh, claimed(fit(bare, GROUP), fresh))["coverage"] == pytest.approx(0.9, abs=0.04)
 
 
 def test_nobody_followed_beyond_a_minute(past):
     flown, length = past.flown.copy(), past.length.copy()
     flown[:, 61:], length[:, 61:] = np.nan, np.nan
     short = fit(replace(past, flown=flown, length=length), GROUP)
-    for part in (short.scale, short.floor, short.factor, short.scores, short.risks):
+    for part in (short.scale, short.lag, short.floor, short.factor, short.scores, short.risks):
         assert np.isfinite(part).all()
-    assert short.half_axes(past.spread[0], AHEAD)[-1, 0] > 0
+    assert (short.half_axes(past.doubt, AHEAD)[:, -1] > 0).all()
 
 
 def test_a_wider_table_is_left_out_by_groups(past):
     other = replace(made_up.scored(4, 30, seed=6, loud=3.0), group=np.full(120, "both/arduplane/c172p/known"))
-    both = Scored(**{f.name: np.concatenate([getattr(past, f.name), getattr(other, f.name)]) for f in fields(Scored)})
+    both = joined([past, other])
     wide = both.folds("route/arduplane/*/known")
     assert wide.max() == 1 and both.folds(GROUP).max() == 13
-    assert (fit(both, "route/arduplane/*/known").half_axes(past.spread[0], AHEAD)[30] > 10.0).any()
+    assert (fit(both, "route/arduplane/*/known").half_axes(past.doubt, AHEAD)[:, 30] > 10.0).any()
 
 
 # --- groups and tables -----------------------------------------------------------------------------------------------
@@ -157,7 +161,11 @@ def test_the_chain_of_groups_keeps_parameters_longer_than_the_airframe():
     assert list(wider(GROUP)) == [GROUP, *ways] and list(wider("both" + GROUP[6:]))[1:] == ways
     assert group_of("hybrid", "arduplane: L1 + TECS", "fixed_wing", "known") == GROUP
     assert group_of("imm", "", "", "a/b") == "imm/none/none/a b"
-    assert [airframe_class("fixed_wing", v) for v in (22.0, 50.0)] == ["fixed_wing", "fixed_wing_fast"]
+    assert [airframe_class("fixed_wing", v) for v in (22.0, 36.0, 50.0)] == [
+        "fixed_wing",
+        "fixed_wing",
+        "fixed_wing_fast",
+    ]
     assert airframe_class("multirotor", 50.0) == "multirotor"
 
 
@@ -183,7 +191,7 @@ def test_an_untaught_table_is_never_narrower_than_the_law_of_growth(method):
     ahead = np.concatenate([AHEAD, [200.0, 300.0]])
     law = law_of_growth(method, ahead)
     for spread in (None, np.zeros((93, 3)), np.full((93, 3), 5.0)):
-        axes = untaught(method).half_axes(filled(spread, method, ahead), ahead)
+        axes = untaught(method).half_axes(doubt_of(spread, None, method, ahead), ahead)
         assert np.isfinite(axes).all() and (axes >= law * 0.99)[1:91].all() and (axes[-1] > axes[-2]).all()
 
 
@@ -191,16 +199,33 @@ def test_an_untaught_table_is_never_narrower_than_the_law_of_growth(method):
 def test_a_spread_that_is_nonsense_is_replaced_where_it_is(noise):
     spread = np.ones((91, 3))
     spread[30:40, 1] = noise
-    got = filled(spread, "hybrid", AHEAD)
-    assert np.isfinite(got).all() and got[29, 1] == 1.0
-    assert np.allclose(got[30:40, 1], law_of_growth("hybrid", AHEAD)[30:40, 1])
+    got = doubt_of(spread, spread, "hybrid", AHEAD)
+    assert np.isfinite(got.spread).all() and got.spread[29, 1] == 1.0
+    assert np.allclose(got.spread[30:40, 1], law_of_growth("hybrid", AHEAD)[30:40, 1])
+    assert np.array_equal(got.revision, got.spread)
+
+
+def test_a_prediction_that_was_revised_is_in_doubt():
+    earlier = Earlier()
+    assert earlier.revised(0.0, AHEAD, made_up.LINE) is None
+    turn = 80.0 * np.column_stack([np.sin(AHEAD / 4), 1 - np.cos(AHEAD / 4), 0 * AHEAD])
+    at = (AHEAD + 5.0) / 4
+    earlier.add(0.0, AHEAD, turn)
+    later = 80.0 * np.column_stack([np.sin(at), 1 - np.cos(at), 0 * at])
+    assert earlier.revised(3.0, AHEAD, later) is None  # so soon it says nothing
+    assert earlier.revised(5.0, AHEAD, later).max() < 3.0  # the same turn: what is left is the interpolation's
+    revised = earlier.revised(5.0, AHEAD, later + np.outer(AHEAD, [0.0, 0.0, 2.0]))
+    assert np.allclose(revised[:80, 2], 2.0 * AHEAD[:80]) and revised[-1, 2] == revised[-2, 2]  # its end stays
+    assert earlier.revised(30.0, AHEAD, later) is None and earlier.revised(5.0, AHEAD + 176.0, later) is None
+    earlier.clear()
+    assert earlier.revised(5.0, AHEAD, later) is None
 
 
 def test_tables_are_written_and_read_back(tmp_path, table):
     path = tmp_path / "a.json"
     write(path, [table], [Source("p.npz", 300, ("seed-1",))], "2024-05-01", "fit p.npz")
     back = read_tables(path).by_group[GROUP]
-    for name in ("scale", "floor", "factor", "scores", "risks"):
+    for name in ("scale", "lag", "floor", "factor", "scores", "risks"):
         assert np.allclose(getattr(back, name), getattr(table, name), rtol=1e-3)
     assert json.loads(path.read_text())["sources"] == [{"file": "p.npz", "starts": 300, "flights": ["seed-1"]}]
 
@@ -243,8 +268,13 @@ def test_the_tables_that_come_along_are_whole():
 # --- the command -----------------------------------------------------------------------------------------------------
 
 
+def arrays(scored: Scored) -> dict[str, np.ndarray]:
+    names = ("t0", "path", "flown", "length", "predicted_length", "group", "method", "flight")
+    return {"ahead": AHEAD, "spread": scored.doubt.spread} | {name: getattr(scored, name) for name in names}
+
+
 def as_npz(path, scored: Scored) -> None:
-    np.savez(path, ahead=AHEAD, **{f.name: getattr(scored, f.name) for f in fields(Scored)})
+    np.savez(path, **arrays(scored))
 
 
 def test_the_command_fits_and_checks(tmp_path, capsys, past):
@@ -282,7 +312,7 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys, past):
     out = ["--out", str(tmp_path / "t.json")]
     assert main(["fit", str(bad), *out]) == 2
     assert "bad.npz: found no scored predictions" in capsys.readouterr().err
-    np.savez(bad, ahead=np.arange(61.0), **{f.name: getattr(past, f.name) for f in fields(Scored)})
+    np.savez(bad, **arrays(past) | {"ahead": np.arange(61.0)})
     assert main(["fit", str(bad), *out]) == 2 and "another look-ahead grid" in capsys.readouterr().err
     as_npz(bad, replace(past, flown=past.flown[:, :61]))
     assert main(["fit", str(bad), *out]) == 2 and "found flown of shape" in capsys.readouterr().err

@@ -241,7 +241,7 @@ def test_the_horizon_tells_easy_minutes_from_hard_ones(tables):
 
 def test_first_passages_before_the_horizon_shorten_it(tables):
     record = Record(tables)
-    made = Made(900.0, "hybrid", GROUP, AHEAD, LINE, V, made_up.GROWTH)
+    made = Made(900.0, "hybrid", GROUP, AHEAD, LINE, V, 3.0 * made_up.GROWTH)
     before = record.trust(made).horizon_s
     flight(record, np.full(150, 4.0), seed=13)
     assert record.trust(made).horizon_s < 0.5 * before

@@ -49,7 +49,7 @@ def foresee(twin: Twin, now: float) -> list[Message]:
     guess = Made(
         t0,
         made.method,
-        _group(twin, made, speed),
+        _group(twin, made, flown),
         ahead[:n],
         made.path[:n],
         speed,
@@ -167,13 +167,14 @@ def _whole(path: np.ndarray | None) -> int:
     return n if AHEAD[n - 1] >= LEAST_AHEAD_S else 0
 
 
-def _group(twin: Twin, flight: Flight, speed: float) -> str:
+def _group(twin: Twin, flight: Flight, flown: Track) -> str:
     """Name the calibration group of a flight ahead."""
     control = flight.control
     known = "known"
     if control is not None and len(control.absent) > _MISSED:
         known = "identified" if IDENTIFIED in control.known.values() else "absent"
-    return group_of(flight.method, flight.law, airframe_class(twin.vehicle, speed), known)
+    usual = float(np.median(np.linalg.norm(flown.v, axis=1)))
+    return group_of(flight.method, flight.law, airframe_class(twin.vehicle, usual), known)
 
 
 def _state(twin: Twin, otherwise: State) -> State:

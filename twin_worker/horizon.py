@@ -16,8 +16,9 @@ from twin_worker.calibration.adapt import Factors, Levels, factors
 from twin_worker.calibration.ledger import EVERY_S, Ledger
 from twin_worker.calibration.miss import AHEAD, LIMIT, QUANTILE, axes_error, first_passage, path_length, track_frame
 from twin_worker.calibration.quantile import median_passage
+from twin_worker.calibration.revision import Earlier
 from twin_worker.calibration.risk import growth
-from twin_worker.calibration.table import Table, filled
+from twin_worker.calibration.table import Table, doubt_of
 from twin_worker.calibration.written import Tables, load
 
 __all__ = [
@@ -90,6 +91,7 @@ class Record:
     scored: dict[str, int] = field(default_factory=dict)  # predictions ended so far, by method
     latest: tuple[Made, Trust] | None = None
     _ledger: Ledger = field(default_factory=Ledger)
+    _earlier: Earlier = field(default_factory=Earlier)
     _levels: dict[str, Levels] = field(default_factory=dict)
     _joined: tuple[tuple[str, float], Factors] | None = None
 
@@ -97,7 +99,8 @@ class Record:
         """Wrap a prediction in its tube and say up to when it stays within 10 %."""
         table, said = self.tables.choose(made.group)
         now = self._factors(made.group, table)
-        half_axes = table.half_axes(filled(made.spread, made.method, made.ahead), made.ahead)
+        revision = self._earlier.revised(made.t, made.ahead, made.path)
+        half_axes = table.half_axes(doubt_of(made.spread, revision, made.method, made.ahead), made.ahead)
         length = path_length(made.path, made.speed, made.speed * float(made.ahead[0]))
         ratio = growth(half_axes, length)
         horizon, open_end = first_passage(now.horizon * ratio, made.ahead)
@@ -128,6 +131,7 @@ class Record:
             self._ledger = Ledger()
         if made.t - self._ledger.newest < EVERY_S or n < 2:
             return
+        self._earlier.add(made.t, made.ahead, made.path)
         book = self._ledger
         r = book.add(made.t, made.method, made.group, made.path, made.speed)
         book.tube[r, :n], book.factor[r], book.horizon[r] = trust.tube, trust.factor, trust.horizon_s
@@ -136,6 +140,7 @@ class Record:
     def forget(self) -> None:
         """Follow no prediction beyond now: an event (mode, mission, clock) has made them meaningless."""
         self._enter(self._ledger.end())
+        self._earlier.clear()
 
     def answer(self, t: np.ndarray, flown: np.ndarray) -> int:
         """Answer every look-ahead that has been flown by now.

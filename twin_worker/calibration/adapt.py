@@ -25,7 +25,7 @@ _TUBE_STEP, _HORIZON_STEP = 0.05, 0.02  # of the level, per independent miss [-]
 _LEAST_LEVEL, _MOST_LEVEL = 0.5, 0.99
 _COLUMN_OF = np.full(len(AHEAD), -1)
 _COLUMN_OF[COLUMN] = np.arange(len(KNOTS))
-_LEAST_FACTOR, _MOST_FACTOR = 0.3, 20.0
+_LEAST_FACTOR, _MOST_FACTOR = 0.1, 20.0
 
 
 @dataclass

@@ -20,7 +20,7 @@ Claims = tuple[np.ndarray, np.ndarray]  # tubes (s, k, 3) [m], horizons (s,) [s]
 
 def claimed(table: Table, scored: Scored) -> Claims:
     """Give what a table alone claims of predictions."""
-    tube = table.half_axes(scored.spread, AHEAD)
+    tube = table.half_axes(scored.doubt, AHEAD)
     ratio = growth(tube, scored.predicted_length) * np.interp(QUANTILE, LEVELS, table.risks)
     return tube, np.array([first_passage(one)[0] for one in ratio])
 
@@ -37,7 +37,9 @@ def adapted(tables: Tables, scored: Scored) -> Claims:
             seen = t <= scored.t0[r]
             record.answer(t[seen][-30:], flown[seen][-30:])
             speed = float(scored.length[r, 0] / 2.0)
-            made = Made(scored.t0[r], scored.method[r], scored.group[r], AHEAD, scored.path[r], speed, scored.spread[r])
+            made = Made(
+                scored.t0[r], scored.method[r], scored.group[r], AHEAD, scored.path[r], speed, scored.doubt.spread[r]
+            )
             trust = record.trust(made)
             record.keep(made, trust)
             tube[r], horizon[r] = trust.tube, trust.horizon_s

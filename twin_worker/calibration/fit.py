@@ -13,15 +13,15 @@ from twin_worker.calibration.miss import AHEAD, first_passage
 from twin_worker.calibration.quantile import censored_quantile, weighted_quantile
 from twin_worker.calibration.risk import critical, growth
 from twin_worker.calibration.scored import Scored
-from twin_worker.calibration.table import KNOTS, LEVELS, Table, untaught
+from twin_worker.calibration.table import KNOTS, LEVELS, Doubt, Table, at_look_aheads, untaught
 
 _NEAR = 1.2  # look-aheads within this factor of a knot speak for it [-]
 _SPEAKERS = 3  # as many of them, evenly: neighbours say much the same
 _NU = 4.0  # degrees of freedom of the errors: heavy tails
-_RIDGE = 0.05  # holds the scale near 1 where the spread never varies [-]
-_RIDGE_FLOOR = 0.02  # holds the floor near its usual share where the spread leaves it nothing [-]
+_USUAL_LAG = np.log(0.5)
 _USUAL_FLOOR = 0.3  # of the median error [-]
-_MOST_SPREAD = 3.0  # scale lies within exp of this, either way
+_RIDGE = np.array([0.05, 0.01, 0.01])  # hold scale, lag and floor near what is usual where errors leave them free [-]
+_MOST = 3.0  # scale and lag lie within exp of this, either way
 _FOLDS = 4  # most of them when a table is fitted; leaving one out is another matter
 _LEAST_M = 0.02  # smallest floor [m]
 
@@ -32,70 +32,71 @@ def near(knot: float) -> np.ndarray:
     return found[np.unique(np.linspace(0, len(found) - 1, _SPEAKERS).round().astype(int))]
 
 
-def fit_sigma(spread: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fit scale and floor by knot and axis to spreads and errors (s, k, 3) [m]; each (13, 3)."""
-    scale, floor = np.ones((len(KNOTS), 3)), np.full((len(KNOTS), 3), _LEAST_M)
+def fit_sigma(doubt: Doubt, error: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit scale, lag and floor by knot and axis to doubts and errors (s, k, 3) [m]; each (13, 3)."""
+    found = np.tile([1.0, 1.0, _LEAST_M], (len(KNOTS), 3, 1))
     for i, knot in enumerate(KNOTS):
         columns = near(knot)
         for axis in range(3):
-            s, e = spread[:, columns, axis].ravel(), error[:, columns, axis].ravel()
+            s, r, e = (x[:, columns, axis].ravel() ** 2 for x in (doubt.spread, doubt.revision, error))
             known = np.isfinite(e)
             if known.any():
-                scale[i, axis], floor[i, axis] = _likeliest(s[known] ** 2, e[known] ** 2)
+                found[i, axis] = _likeliest(s[known], r[known], e[known])
             elif i:
-                scale[i, axis], floor[i, axis] = scale[i - 1, axis], floor[i - 1, axis] * knot / KNOTS[i - 1]
-    return scale, floor
+                found[i, axis] = found[i - 1, axis] * [1.0, 1.0, knot / KNOTS[i - 1]]
+    return found[..., 0], found[..., 1], found[..., 2]
 
 
-def _likeliest(s2: np.ndarray, e2: np.ndarray) -> tuple[float, float]:
-    """Give scale and floor under errors with Student's t law of `_NU` degrees of freedom."""
+def _likeliest(s2: np.ndarray, r2: np.ndarray, e2: np.ndarray) -> np.ndarray:
+    """Give scale, lag and floor under errors with Student's t law of `_NU` degrees of freedom, (3,)."""
     typical = max(float(np.sqrt(np.median(e2))), _LEAST_M)
-    usual = np.log(_USUAL_FLOOR * typical)
+    usual = np.array([0.0, _USUAL_LAG, np.log(_USUAL_FLOOR * typical)])
+    parts = np.stack([s2, r2, np.ones_like(e2)])
 
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
-        known, unknown = np.exp(2 * x[0]) * s2, np.exp(2 * x[1])
-        sigma2 = known + unknown
+        each = np.exp(2 * x)[:, None] * parts
+        sigma2 = each.sum(axis=0)
         fit = np.mean(np.log(sigma2) + (_NU + 1) * np.log1p(e2 / (_NU * sigma2)))
         slope = 2 * (1 - (_NU + 1) * e2 / (_NU * sigma2 + e2)) / sigma2
-        gradient = [np.mean(slope * known) + 2 * _RIDGE * x[0], np.mean(slope) * unknown]
-        gradient[1] += 2 * _RIDGE_FLOOR * (x[1] - usual)
-        return float(fit + _RIDGE * x[0] ** 2 + _RIDGE_FLOOR * (x[1] - usual) ** 2), np.array(gradient)
+        off = x - usual
+        return float(fit + _RIDGE @ off**2), each @ slope / len(e2) + 2 * _RIDGE * off
 
-    bounds = [(-_MOST_SPREAD, _MOST_SPREAD), (np.log(_LEAST_M), np.log(max(20 * typical, 10 * _LEAST_M)))]
-    found = minimize(cost, [0.0, np.log(typical)], jac=True, method="L-BFGS-B", bounds=bounds)
-    return float(np.exp(found.x[0])), float(np.exp(found.x[1]))
+    least = np.log(_LEAST_M)
+    bounds = [(-_MOST, _MOST), (-_MOST, _MOST), (least, max(np.log(20 * typical), least + 1.0))]
+    start = np.array([0.0, _USUAL_LAG, max(np.log(typical), least)])
+    return np.exp(minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds).x)
 
 
 def fit(scored: Scored, group: str) -> Table:
     """Fit the table of one group to its predictions; every score comes from a fit that had not seen its flight."""
     error, folds = scored.errors()[..., :3], scored.folds(group)
     weight = 1.0 / np.bincount(folds)[folds]  # each flight speaks as loud
-    scale, floor = fit_sigma(scored.spread, error)
+    sigma = fit_sigma(scored.doubt, error)
     ratio = np.empty(error.shape)  # to sigma
     batch = folds % min(_FOLDS, int(folds.max()) + 1)
     for b in np.unique(batch):
         left = batch == b
-        apart = _raw(group, *(fit_sigma(scored.spread[~left], error[~left]) if not left.all() else (scale, floor)))
-        ratio[left] = error[left] / apart.sigma(scored.spread[left], AHEAD)
+        others = scored.part(~left).doubt
+        apart = _raw(group, *(fit_sigma(others, error[~left]) if not left.all() else sigma))
+        ratio[left] = error[left] / apart.sigma(scored.part(left).doubt, AHEAD)
     factor = _known(np.array([factors_of(ratio[:, near(knot)], weight) for knot in KNOTS]))
     flights = len(set(scored.flight.tolist()))
-    table = replace(_raw(group, scale, floor), factor=factor, starts=len(scored), flights=flights)
+    table = replace(_raw(group, *sigma), factor=factor, starts=len(scored), flights=flights)
     return _with_risks(replace(table, scores=_scores(table, ratio, weight)), scored, weight)
 
 
 def _scores(table: Table, ratio: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Give how the largest error over its half-axis was distributed, over all look-aheads, (20,)."""
-    unit = replace(table, scale=np.zeros_like(table.scale), floor=np.ones_like(table.floor))
-    score = (ratio / unit.half_axes(np.zeros(3), AHEAD)).max(axis=2)[:, 1:]
+    score = (ratio / at_look_aheads(AHEAD, table.factor)).max(axis=2)[:, 1:]
     known = np.isfinite(score)
     loud = np.where(known, weight[:, None], 0.0).reshape(1, -1)
     found = [float(weighted_quantile(score.reshape(1, -1), loud, np.array([p]))[0]) for p in LEVELS]
     return np.maximum.accumulate(np.maximum(found, 1e-3))
 
 
-def _raw(group: str, scale: np.ndarray, floor: np.ndarray) -> Table:
+def _raw(group: str, scale: np.ndarray, lag: np.ndarray, floor: np.ndarray) -> Table:
     plain = untaught("imm")
-    return Table(group, 0, 0, scale, floor, plain.factor, plain.scores, plain.risks)
+    return Table(group, 0, 0, scale, lag, floor, plain.factor, plain.scores, plain.risks)
 
 
 def _known(factor: np.ndarray) -> np.ndarray:
@@ -108,7 +109,7 @@ def _known(factor: np.ndarray) -> np.ndarray:
 
 def _with_risks(table: Table, scored: Scored, weight: np.ndarray) -> Table:
     """Add how the critical factors of these predictions are distributed."""
-    ratio = growth(table.half_axes(scored.spread, AHEAD), scored.predicted_length)
+    ratio = growth(table.half_axes(scored.doubt, AHEAD), scored.predicted_length)
     relative = scored.errors()[..., 3] / scored.length
     followed, censored = zip(*(first_passage(miss) for miss in relative), strict=True)
     x, exact = critical(ratio, np.array(followed)), ~np.array(censored)

@@ -2,7 +2,7 @@
 
 ANY = "*"
 _WAYS = dict.fromkeys(("hybrid", "both", "dynamics"), "route")  # chosen among in flight; one ensemble tells their doubt
-_FAST = 35.0  # trim airspeed from which a winged aircraft is no small one [m/s]
+_FAST = 40.0  # usual speed from which a winged aircraft is no small one; a tailwind is no other aircraft [m/s]
 
 
 def group_of(method: str, law: str, airframe: str, parameters: str) -> str:
@@ -19,7 +19,7 @@ def group_of(method: str, law: str, airframe: str, parameters: str) -> str:
 
 
 def airframe_class(vehicle: str, speed: float) -> str:
-    """Name the class of an aircraft by its kind and usual airspeed [m/s]: fixed_wing, fixed_wing_fast, multirotor …."""
+    """Name the class of an aircraft by its kind and usual speed [m/s]: fixed_wing, fixed_wing_fast, multirotor …."""
     return f"{vehicle}_fast" if vehicle == "fixed_wing" and speed > _FAST else vehicle
 
 

@@ -8,19 +8,31 @@ import numpy as np
 AHEAD = np.concatenate([np.arange(0.0, 61.0), np.arange(64.0, 181.0, 4.0)])  # look-ahead of every prediction, (91,) [s]
 LIMIT = 0.10  # relative error at which trust ends [-]
 QUANTILE = 0.9  # share of flights that tube and horizon are meant to hold [-]
+_NORTH = np.array([1.0, 0.0])
 _FLOOR_S = 2.0  # least path length, as seconds of ground speed [s]
 
 
 def track_frame(path: np.ndarray, ahead: np.ndarray = AHEAD) -> np.ndarray:
     """Give the horizontal unit vector along paths (..., n, 3) at each point, (..., n, 2); north where one stands."""
-    step = np.gradient(path[..., :2], ahead[: path.shape[-2]], axis=-2)
-    length = np.linalg.norm(step, axis=-1, keepdims=True)
-    return np.divide(step, length, out=np.tile([1.0, 0.0], (*step.shape[:-1], 1)), where=length > 1e-6)
+    step = _slope(path[..., :2], ahead[: path.shape[-2]])
+    length = np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2)[..., None]
+    still = length <= 1e-6
+    return np.where(still, _NORTH, step / np.where(still, 1.0, length))
+
+
+def _slope(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Give the slope of x (..., n, 2) over uneven times (n,), of second order inside, (..., n, 2)."""
+    rate = np.diff(x, axis=-2) / np.diff(t)[:, None]
+    before = (np.diff(t)[1:] / (t[2:] - t[:-2]))[:, None]  # the nearer side weighs more
+    out = np.empty_like(x)
+    out[..., 1:-1, :] = before * rate[..., :-1, :] + (1.0 - before) * rate[..., 1:, :]
+    out[..., 0, :], out[..., -1, :] = rate[..., 0, :], rate[..., -1, :]
+    return out
 
 
 def along_cross_down(along: np.ndarray, error: np.ndarray) -> np.ndarray:
     """Turn NED errors (..., 3) into along, cross, vertical, by the unit vector along the path, (..., 2) [m]."""
-    ahead = np.sum(error[..., :2] * along, axis=-1)
+    ahead = error[..., 0] * along[..., 0] + error[..., 1] * along[..., 1]
     across = error[..., 1] * along[..., 0] - error[..., 0] * along[..., 1]
     return np.stack([ahead, across, error[..., 2]], axis=-1)
 

@@ -1,14 +1,15 @@
 """Scored predictions as `assess` writes them: what was said, and what then happened."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from twin_worker.calibration.groups import ANY, setting, wider
 from twin_worker.calibration.miss import AHEAD, axes_error
-from twin_worker.calibration.table import filled
+from twin_worker.calibration.revision import Earlier
+from twin_worker.calibration.table import Doubt, doubt_of
 
 _WHOLE = ("path", "spread", "flown")
 _ROWS = ("t0", "length", "predicted_length", "group", "method", "flight")
@@ -21,7 +22,7 @@ class Scored:
     Attributes:
         t0: start of each, (s,) [s since 1970]
         path: as predicted, NED, (s, k, 3) [m]
-        spread: of the ensemble along, cross, vertical, the law of growth where there was none, (s, k, 3) [m]
+        doubt: spread of the ensemble and revision of each, (s, k, 3) [m]
         flown: what happened, nan where it was not followed, (s, k, 3) [m]
         length, predicted_length: path length so far, never below two seconds of ground speed, (s, k) [m]
         group, method, flight: names, (s,)
@@ -29,7 +30,7 @@ class Scored:
 
     t0: np.ndarray
     path: np.ndarray
-    spread: np.ndarray
+    doubt: Doubt
     flown: np.ndarray
     length: np.ndarray
     predicted_length: np.ndarray
@@ -42,7 +43,8 @@ class Scored:
 
     def part(self, rows: np.ndarray) -> "Scored":
         """Choose rows."""
-        return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+        doubt = Doubt(self.doubt.spread[rows], self.doubt.revision[rows])
+        return replace(self, doubt=doubt, **{name: getattr(self, name)[rows] for name in ("path", "flown", *_ROWS)})
 
     def errors(self) -> np.ndarray:
         """Give errors along, cross, vertical and the distance, nan where not followed, (s, k, 4) [m]."""
@@ -72,8 +74,14 @@ def read(paths: Sequence[Path]) -> Scored:
     Raises:
         ValueError: when one does not hold what `assess` writes.
     """
-    parts = [_read(path) for path in paths]
-    return Scored(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Scored)})
+    return joined([_read(path) for path in paths])
+
+
+def joined(parts: Sequence[Scored]) -> Scored:
+    """Join sets of predictions."""
+    doubt = Doubt(*(np.concatenate([getattr(part.doubt, name) for part in parts]) for name in ("spread", "revision")))
+    names = ("path", "flown", *_ROWS)
+    return Scored(doubt=doubt, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def _read(path: Path) -> Scored:
@@ -90,6 +98,22 @@ def _read(path: Path) -> Scored:
     for name, value in held.items():
         if value.shape != wanted.get(name, (s,)):
             raise ValueError(f"{path.name}: found {name} of shape {value.shape}, expected {wanted.get(name, (s,))}")
-    made = Scored(**held)
-    spread = [filled(one, method, AHEAD) for one, method in zip(made.spread, made.method.tolist(), strict=True)]
-    return replace(made, spread=np.array(spread).reshape(s, k, 3))
+    spread = held.pop("spread")
+    revision = revisions(held["t0"], held["path"], held["flight"])
+    methods = held["method"].tolist()
+    each = [doubt_of(*row, AHEAD) for row in zip(spread, revision, methods, strict=True)]
+    stacked = (np.array([getattr(one, name) for one in each]).reshape(s, k, 3) for name in ("spread", "revision"))
+    return Scored(doubt=Doubt(*stacked), **held)
+
+
+def revisions(t0: np.ndarray, path: np.ndarray, flight: np.ndarray) -> np.ndarray:
+    """Give the revision of each of s predictions of some flights, nan where it has none, (s, k, 3) [m]."""
+    out = np.full(path.shape, np.nan)
+    for name in dict.fromkeys(flight.tolist()):
+        earlier = Earlier()
+        rows = np.flatnonzero(flight == name)
+        for r in rows[np.argsort(t0[rows])]:
+            revision = earlier.revised(float(t0[r]), AHEAD, path[r])
+            out[r] = np.nan if revision is None else revision
+            earlier.add(float(t0[r]), AHEAD, path[r])
+    return out

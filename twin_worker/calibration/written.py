@@ -27,12 +27,13 @@ class Source(msgspec.Struct, frozen=True):
 
 
 class Row(msgspec.Struct, frozen=True):
-    """One table as it is written; scale, floor and factor by axis, then knot."""
+    """One table as it is written; scale, lag, floor and factor by axis, then knot."""
 
     group: str
     starts: int
     flights: int
     scale: list[list[float]]
+    lag: list[list[float]]
     floor: list[list[float]]
     factor: list[list[float]]
     scores: list[float]
@@ -85,7 +86,8 @@ def read_tables(path: Path) -> Tables:
 
 
 def _table(file: str, row: Row) -> Table:
-    shapes = {"scale": (3, 13), "floor": (3, 13), "factor": (3, 13), "scores": (ATOMS,), "risks": (ATOMS,)}
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("scale", "lag", "floor", "factor"), (3, 13))
+    shapes |= dict.fromkeys(("scores", "risks"), (ATOMS,))
     arrays = {}
     for name, shape in shapes.items():
         try:
@@ -100,7 +102,7 @@ def _table(file: str, row: Row) -> Table:
             )
     if not ((arrays["factor"] > 0).all() and (arrays["scores"] > 0).all() and (arrays["floor"] > 0).all()):
         raise ValueError(f"calibration {file}: found a zero width for {row.group}, expected more; fit it again")
-    by_knot = {name: arrays.pop(name).T for name in ("scale", "floor", "factor")}
+    by_knot = {name: arrays.pop(name).T for name in ("scale", "lag", "floor", "factor")}
     return Table(row.group, row.starts, row.flights, **by_knot, **arrays, held_out=row.held_out)
 
 
@@ -125,10 +127,10 @@ def write(path: Path, tables: Sequence[Table], sources: Sequence[Source], made: 
 
 
 def _row(table: Table) -> Row:
-    parts = table.scale.T, table.floor.T, table.factor.T, table.scores, table.risks
-    scale, floor, factor, scores, risks = map(_short, parts)
+    parts = table.scale.T, table.lag.T, table.floor.T, table.factor.T, table.scores, table.risks
+    scale, lag, floor, factor, scores, risks = map(_short, parts)
     measured = {name: round(value, 4) for name, value in table.held_out.items() if np.isfinite(value)}
-    return Row(table.group, table.starts, table.flights, scale, floor, factor, scores, risks, measured)
+    return Row(table.group, table.starts, table.flights, scale, lag, floor, factor, scores, risks, measured)
 
 
 def _short(values: np.ndarray) -> list:
