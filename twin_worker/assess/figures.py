@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.special import ndtr, ndtri
 
-from fleet.page.ink import INK, LINES, MUTED, ROUTE, spread
+from fleet.page.ink import INK, LINES, MUTED, ROUTE
 from twin_worker.assess.case import OURS, Case
 from twin_worker.assess.score import LIMITS, Scores, score
 from twin_worker.flown import MODES
@@ -53,7 +53,7 @@ def _usual(ours: Scores) -> int:
 
 def _route(case: Case, names: Sequence[str]) -> Figure:
     """Draw mission, flight and predictions of one start over 60 s, north up."""
-    figure = Figure(figsize=(9, 7.5), layout="constrained")
+    figure = Figure(figsize=(8, 8), layout="constrained")
     ax = figure.subplots()
     within = case.asked.ahead <= _WINDOW_S
     lines = [case.flown[within], *(case.asked.told[name].path[within] for name in (OURS, *_BESIDE) if name in names)]
@@ -66,10 +66,11 @@ def _route(case: Case, names: Sequence[str]) -> Figure:
     for name, line in zip([n for n in (OURS, *_BESIDE) if n in names], lines[1:], strict=True):
         ax.plot(*line[:, 1::-1].T, color=_COLOURS[name], lw=1.4, ls="-" if name == OURS else "--", label=name)
     ax.plot(*lines[0][0, 1::-1], "o", color=INK, ms=7)
-    everything = np.vstack(lines)
-    for axis, values in (("x", everything[:, 1]), ("y", everything[:, 0])):
-        getattr(ax, f"set_{axis}lim")(spread(values, room=0.12, least=60.0))
-    ax.set_aspect("equal", adjustable="box")
+    low, high = np.nanmin(np.vstack(lines), axis=0), np.nanmax(np.vstack(lines), axis=0)
+    middle, half = 0.5 * (low + high), 0.58 * max(float((high - low)[:2].max()), 60.0)
+    ax.set_xlim(middle[1] - half, middle[1] + half)
+    ax.set_ylim(middle[0] - half, middle[0] + half)
+    ax.set_aspect("equal")
     ax.set_xlabel("east [m]", fontsize=9, color=INK)
     ax.set_ylabel("north [m]", fontsize=9, color=INK)
     ax.legend(frameon=False, fontsize=8)
@@ -112,7 +113,7 @@ def _boxes(scores: dict[str, Scores]) -> Figure:
     figure = Figure(figsize=(9, 5), layout="constrained")
     ax = figure.subplots()
     for place, (name, one) in enumerate(scores.items()):
-        times = one.passages[LIMITS[0]][:, 0]
+        times = np.minimum(one.passages[LIMITS[0]][:, 0], _WINDOW_S)
         box = ax.boxplot(times, positions=[place], widths=0.55, showfliers=False, patch_artist=True)
         box["boxes"][0].set(facecolor=_COLOURS[name], alpha=0.35, edgecolor=_COLOURS[name])
         for line in (*box["whiskers"], *box["caps"], *box["medians"]):
@@ -122,7 +123,7 @@ def _boxes(scores: dict[str, Scores]) -> Figure:
     ax.axhline(_PAPER_S, color=INK, lw=1.0, ls="--")
     ax.set_xticks(range(len(scores)), list(scores))
     ax.set_ylabel("time within 10 % [s]", fontsize=9, color=INK)
-    said = f"time within 10 % of the path flown, {len(scores[OURS].flight)} starts"
+    said = f"time within 10 % of the path flown in the first {_WINDOW_S:.0f} s, {len(scores[OURS].flight)} starts"
     house(ax, f"{said}; dashed: lower quartile of Huang 2021, {_PAPER_S:.1f} s")
     return figure
 
@@ -141,7 +142,8 @@ def _coverage(scores: dict[str, Scores]) -> Figure:
     for name, one in scores.items():
         ax.plot(one.ahead[1:], 100 * _means(one.inside)[1:], color=_COLOURS[name], lw=2.0, label=name)
     ax.axhline(100 * QUANTILE, color=INK, lw=1.0, ls="--", label="claimed")
-    ax.set_ylim(0, 102)
+    lowest = min(float(np.nanmin(_means(one.inside))) for one in scores.values())
+    ax.set_ylim(min(50.0, 100 * lowest - 5.0), 101)
     ax.set_xlabel("look-ahead [s]", fontsize=9, color=INK)
     ax.set_ylabel("inside the tube [%]", fontsize=9, color=INK)
     ax.legend(frameon=False, fontsize=8, loc="lower left")
