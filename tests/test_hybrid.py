@@ -89,7 +89,7 @@ def test_power_is_told_by_what_the_route_asks_not_by_what_gusts_do():
 
 def test_a_flight_too_short_says_so():
     now = situation()
-    with pytest.raises(ValueError, match="hybrid: found .* s of flight, expected 20 s; wait"):
+    with pytest.raises(ValueError, match=r"hybrid: found .* s of flight, expected 20 s; wait"):
         identify(now.window.part(0, 100), now.history, 1.0)
 
 

@@ -71,7 +71,7 @@ class Contest:
         self.miss[method] = before + max(_NEWS, 1.0 / n) * (miss - before)
 
     def best(self, methods: tuple[str, ...]) -> str:
-        """Choose the first of `ORDER` among methods, unless another strayed clearly less in enough that were answered."""
+        """Choose the first of `ORDER` among methods, unless another strayed clearly less in enough of them."""
         known = [method for method in methods if self.count.get(method, 0) >= _LEAST]
         if len(known) < len(methods):
             return min(methods, key=ORDER.index)
