@@ -90,10 +90,12 @@ def on_route_in_wind(now: Now) -> np.ndarray | None:
     params = now.twin.params.values if now.twin.params else {}
     par, absent = arduplane.parameters(params)
     scale = now.twin.wind.scale if wind is not None else 1.0
-    cruise = V if "AIRSPEED_CRUISE" in absent else par[P.VA_CRUISE] * scale
 
     def ground_speed(points: np.ndarray) -> np.ndarray:
         commanded = points[1:, 3]
+        # a leg that commands none is flown as now: after a jump back that is seldom the cruise of the parameters
+        flown = commanded[0] <= 0 or "AIRSPEED_CRUISE" in absent
+        cruise = V if flown else par[P.VA_CRUISE] * scale
         Va = np.where(commanded > 0, commanded * scale, cruise)
         way = np.diff(points[:, :2], axis=0)
         t = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
