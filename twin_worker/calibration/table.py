@@ -25,6 +25,7 @@ _LAW = {  # expected spread of along, cross, vertical: base [m], growth [m/s^pow
     "greybox": ((0.5, 0.4, 0.4), (0.5, 0.3, 0.2), 1.3),
     "imm": ((1.0, 1.0, 0.5), (1.6, 1.6, 0.5), 1.4),
 }
+_SOON_S = 10.0  # how far predictions just before missed says little of less than this [s]
 _MOST_M = 1e6  # spreads beyond are noise [m]
 
 
@@ -121,4 +122,5 @@ def untaught(method: str) -> Table:
     law = law_of_growth(method, KNOTS)
     shape = np.sqrt(2.0) * erfinv(np.cbrt(LEVELS))  # the largest of three normal errors
     shape = shape / np.interp(QUANTILE, LEVELS, shape)
-    return Table(method, 0, 0, np.ones_like(law), np.ones_like(law), law, np.full_like(law, 2.0), shape, shape)
+    lag = np.tile((KNOTS / (KNOTS + _SOON_S))[:, None], 3)
+    return Table(method, 0, 0, np.ones_like(law), lag, law, np.full_like(law, 2.0), shape, shape)
