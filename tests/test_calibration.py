@@ -153,6 +153,16 @@ def test_a_wider_table_is_left_out_by_groups(past):
 # --- groups and tables -----------------------------------------------------------------------------------------------
 
 
+def test_a_stray_prediction_is_no_setting_of_its_own(past):
+    stray = replace(
+        made_up.scored(1, 3, seed=15, loud=50.0), group=np.full(3, "hybrid/arduplane/fixed_wing_fast/known")
+    )
+    both, group = joined([past, stray]), "route/arduplane/*/known"
+    assert not both.several(group) and both.folds(group).max() == 10
+    apart, alone = (fit(one, group).half_axes(past.doubt, AHEAD).mean() for one in (both, past))
+    assert apart == pytest.approx(alone, rel=0.15)
+
+
 def test_the_chain_of_groups_keeps_parameters_longer_than_the_airframe():
     chain = ["a/b/c/known", "a/b/*/known", "a/b/*/*", "a/*/*/*"]
     assert list(wider("a/b/c/known")) == chain
@@ -286,7 +296,8 @@ def test_the_command_fits_and_checks(tmp_path, capsys, past):
     assert f"{GROUP}: 150 predictions of 5 flights; flights left out: coverage" in told
     assert "imm/none/fixed_wing/known: no table from 24 predictions, 2 flights; 30 of 3 are needed" in told
     sheet = json.loads(out.read_text())
-    assert sheet["command"].endswith("fit p.npz few.npz") and str(tmp_path) not in out.read_text()
+    folder = tmp_path.name
+    assert sheet["command"].endswith(f"fit {folder}/p.npz {folder}/few.npz") and str(tmp_path) not in out.read_text()
     assert {t["group"] for t in sheet["tables"]} == set(wider(GROUP))
     assert main(["check", str(tmp_path / "p.npz"), "--with", str(out)]) == 0
     told = capsys.readouterr().out

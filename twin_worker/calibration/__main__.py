@@ -45,7 +45,7 @@ def _fit(args: argparse.Namespace) -> int:
         tables.append(table)
     if not tables:
         raise ValueError(f"calibration: found no group of {LEAST_STARTS} predictions; give more flights")
-    command = " ".join(["python -m twin_worker.calibration fit", *(path.name for path in args.files)])
+    command = " ".join(["python -m twin_worker.calibration fit", *map(_named, args.files)])
     write(args.out, tables, [_source(path) for path in args.files], date.today().isoformat(), command)
     print(f"{args.out.name}: {len(tables)} tables")
     return 0
@@ -75,9 +75,14 @@ def _table(mine: Scored, group: str) -> Table:
     return replace(table, held_out=measured)
 
 
+def _named(path: Path) -> str:
+    """Name a file by its folder too: every flight's are called alike."""
+    return f"{path.absolute().parent.name}/{path.name}"
+
+
 def _source(path: Path) -> Source:
     scored = read([path])
-    return Source(path.name, len(scored), tuple(sorted(set(scored.flight.tolist()))))
+    return Source(_named(path), len(scored), tuple(sorted(set(scored.flight.tolist()))))
 
 
 def _check(args: argparse.Namespace) -> int:

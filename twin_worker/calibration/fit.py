@@ -22,6 +22,7 @@ _USUAL_LAG = np.log(0.5)
 _USUAL_FLOOR = 0.3  # of the median error [-]
 _RIDGE = np.array([0.05, 0.01, 0.01])  # hold scale, lag and floor near what is usual where errors leave them free [-]
 _MOST = 3.0  # scale and lag lie within exp of this, either way
+_QUIET = 20  # predictions below which a flight speaks the less for being short
 _FOLDS = 4  # most of them when a table is fitted; leaving one out is another matter
 _LEAST_M = 0.02  # smallest floor [m]
 
@@ -70,7 +71,7 @@ def _likeliest(s2: np.ndarray, r2: np.ndarray, e2: np.ndarray) -> np.ndarray:
 def fit(scored: Scored, group: str) -> Table:
     """Fit the table of one group to its predictions; every score comes from a fit that had not seen its flight."""
     error, folds = scored.errors()[..., :3], scored.folds(group)
-    weight = 1.0 / np.bincount(folds)[folds]  # each flight speaks as loud
+    weight = 1.0 / np.maximum(np.bincount(folds), _QUIET)[folds]  # each flight speaks as loud, unless it is short
     sigma = fit_sigma(scored.doubt, error)
     ratio = np.empty(error.shape)  # to sigma
     batch = folds % min(_FOLDS, int(folds.max()) + 1)

@@ -11,6 +11,7 @@ from twin_worker.calibration.miss import AHEAD, axes_error
 from twin_worker.calibration.revision import Earlier
 from twin_worker.calibration.table import Doubt, doubt_of
 
+_LEAST = 30  # predictions of a setting, to be left out by itself
 _WHOLE = ("path", "spread", "flown")
 _ROWS = ("t0", "length", "predicted_length", "group", "method", "flight")
 
@@ -56,16 +57,22 @@ class Scored:
         return np.array([named[name] for name in self.group.tolist()], bool)
 
     def several(self, group: str) -> bool:
-        """Tell whether a table of a group would span several settings (law, airframe, parameters)."""
-        return ANY in group and len({setting(name) for name in self.group.tolist()}) > 1
+        """Tell whether a table of a group would span several settings (law, airframe, parameters) worth the name."""
+        return ANY in group and len(set(self._settings().tolist())) > 1
 
     def folds(self, group: str) -> np.ndarray:
         """Number what is left out together, (s,): a whole setting of several, else a flight.
 
         A table of several settings stands in for one it has not seen: that is what leaving out must show.
         """
-        settings = np.array([setting(name) for name in self.group.tolist()])
-        return np.unique(settings if self.several(group) else self.flight, return_inverse=True)[1]
+        return np.unique(self._settings() if self.several(group) else self.flight, return_inverse=True)[1]
+
+    def _settings(self) -> np.ndarray:
+        """Name the setting of each prediction, (s,); those of too few predictions go with the commonest."""
+        names = np.array([setting(name) for name in self.group.tolist()])
+        known, count = np.unique(names, return_counts=True)
+        few = np.isin(names, known[count < _LEAST])
+        return np.where(few, known[np.argmax(count)], names)
 
 
 def read(paths: Sequence[Path]) -> Scored:
