@@ -9,6 +9,7 @@ from flights import DT, HERE, SPEED, T0, item, truth
 
 from fleet.autopilots import arduplane
 from fleet.window import Window
+from twin_worker import predict
 from twin_worker.predict import Onboard, Situation, fly_ahead, held
 from twin_worker.wind import WindFilter
 
@@ -71,6 +72,21 @@ def test_an_envelope_exit_is_a_sentence_not_a_path():
     got = fly_ahead(situation(), truth(grow=0.02), AHEAD)
     assert got.path is None
     assert "envelope" in got.sentence and "s ahead" in got.sentence
+
+
+def test_beyond_a_minute_a_path_ends_where_its_envelope_does(monkeypatch):
+    far = np.concatenate([np.arange(0.0, 61.0), np.arange(64.0, 181.0, 4.0)])
+
+    def left_after(seconds: float):
+        whole = predict.simulate
+        monkeypatch.setattr(predict, "simulate", lambda *flight: min(whole(*flight), int(seconds / flight[-2])))
+        got = fly_ahead(situation(), truth(), far)
+        monkeypatch.undo()
+        return got
+
+    path = left_after(90.0).path
+    assert path is not None and np.isfinite(path[far < 89.0]).all() and np.isnan(path[far > 90.0]).all()
+    assert left_after(50.0).path is None
 
 
 def test_a_model_of_no_numbers_gives_no_path():

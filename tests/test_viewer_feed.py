@@ -160,3 +160,16 @@ def test_an_answer_older_than_what_came_meanwhile_is_dropped(clock: Clock) -> No
     bus.publish(new)
     feed.catch_up()
     assert feed.vehicles[0].mission == new
+
+
+def test_look_aheads_seconds_apart_cut_no_corner(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    ahead = np.concatenate([np.arange(0.0, 61.0), np.arange(64.0, 181.0, 4.0)])
+    circle = 80.0 * np.column_stack([np.cos(ahead / 5), np.sin(ahead / 5), 0 * ahead])
+    made = {**fields(PretendUav(0).prediction(T + 1, 0.0)), "origin": tuple(HOME), "horizon_s": 180.0}
+    made |= {"ahead": Array.of(ahead), "path": Array.of(circle), "tube": Array.of(0 * circle + 1.0)}
+    bus.publish(Prediction(**made), STAMP)
+    told = feed.vehicles[0].forecast
+    from_start = told.at(np.arange(0.0, 180.5, 0.5)) - told.at(0.0)
+    off = np.linalg.norm(from_start[:, :2] + [0.0, 8.0], axis=1)
+    assert told.until == 180.0 and np.abs(off - 8.0).max() < 0.3  # a chord over 4 s lies 0.6 inside, in tens of metres
