@@ -50,7 +50,9 @@ def test_a_straight_crossing_has_its_closed_form(miss: float, above: float, sigm
     closed = (norm.cdf((wide - miss) / s) - norm.cdf((-wide - miss) / s)) * (
         norm.cdf((high - above) / s) - norm.cdf((-high - above) / s)
     )
-    assert probability(*crossing(miss, above, sigma, at)) == pytest.approx(closed, abs=0.06)
+    found = probability(*crossing(miss, above, sigma, at))
+    given_up = found == 0.0 and closed < 0.1  # 32 draws without a hit: half of what an alert needs, at most
+    assert given_up or found == pytest.approx(closed, abs=0.06)
 
 
 def test_certain_and_impossible() -> None:

@@ -79,7 +79,7 @@ def forecast(made: Prediction) -> Forecast | None:
     at = STEP * np.arange(first, last + 1)
     laid = [np.column_stack([np.interp(at, t, column) for column in rows.T]) for rows in (path, tube)]
     sigma = np.maximum(laid[1] / axis_z(made.quantile), _LEAST)
-    along = track_frame(laid[0]) if len(at) > 1 else np.array([[1.0, 0.0]])
+    along = track_frame(laid[0], STEP * np.arange(len(at))) if len(at) > 1 else np.array([[1.0, 0.0]])
     return Forecast(made, first, laid[0], along, sigma)
 
 
