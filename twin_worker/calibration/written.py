@@ -13,6 +13,7 @@ from twin_worker.calibration.groups import wider
 from twin_worker.calibration.table import ATOMS, KNOTS, Table, untaught
 
 FORMAT = 1
+GUESSED = "not calibrated"  # how the sentence of a prediction begins whose tube no flight has taught
 _HERE = Path(__file__).parent
 _INNERMOST = re.compile(r"\[[^\[\]{}]*\]")  # lists of numbers: one a line
 _MOST = 1e6  # numbers beyond are no calibration
@@ -66,7 +67,7 @@ class Tables:
             if (table := self.by_group.get(name)) is not None:
                 own = "" if name == group else f", none for {group}"
                 return table, f"calibrated on {table.starts} predictions of {table.flights} flights ({name}{own})"
-        said = f"not calibrated: no table for {group}, a guess for {method} stands in"
+        said = f"{GUESSED}: no table for {group}, a guess for {method} stands in"
         return untaught(method), " ".join(filter(None, (said, self.sentence)))
 
 

@@ -5,6 +5,7 @@ import numpy as np
 from fleet.contract import Alert, AlertKind, Prediction
 from fleet.frames import Origin, to_ned
 from fleet.mission import route
+from twin_worker.calibration.written import GUESSED
 from twin_worker.conflict.achievable import Now, ability, achievable
 from twin_worker.conflict.fence import fence, leaves
 from twin_worker.conflict.forecast import Forecast, forecast
@@ -17,6 +18,8 @@ from twin_worker.rotor import RETURN_MODES
 _SHORT_S, _LONG_S = 10.0, 12.0  # confidence horizon below which an alert is raised, above which it is withdrawn [s]
 _TOLD = 30  # past predictions below which the 90 % horizon is the prior's word, not this aircraft's [-]
 _TURNING_S = 15.0  # a turn rate alone says nothing of ground and fence farther ahead [s]
+_REACH_S = 90.0  # beyond, the tube across is as wide as fences are kept from: a warning would say little [s]
+_GUESSED_S = 30.0  # nor does a tube that is a guess [s]
 _BETTER_S = 20.0  # on a mission a turn rate is judged only where nothing better came for so long [s]
 _ACHIEVABLE_EVERY_S = 5.0
 _LANDING = (21, 85, 189)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND, DO_LAND_START
@@ -79,7 +82,7 @@ def _dangers(twin: Twin, flight: Forecast) -> list[Finding]:
         return [_unknown(AlertKind.GROUND), _unknown(AlertKind.GEOFENCE)]
     margin = ROTORS_M if rotors else WINGS_M
     twin.peak = max(twin.peak, float(above(flight, base)[0]))
-    until = flight.made.t + _TURNING_S if flight.made.method == "imm" else np.inf
+    until = flight.made.t + _reach_s(flight.made)
     found = [_unknown(AlertKind.GROUND)]
     low = twin.peak <= margin or _lands(twin, rotors)  # not yet up: it takes off, perhaps on rotors first
     if not low:
@@ -88,6 +91,13 @@ def _dangers(twin: Twin, flight: Forecast) -> list[Finding]:
     if low:
         limit = limit._replace(floor=-np.inf)
     return [*found, leaves(flight, limit, base, until) if limit.limits() else _unknown(AlertKind.GEOFENCE)]
+
+
+def _reach_s(made: Prediction) -> float:
+    """Give how far ahead a prediction says anything of ground and fence [s]."""
+    if made.method == "imm":
+        return _TURNING_S
+    return _GUESSED_S if made.calibration.startswith(GUESSED) else _REACH_S
 
 
 def _lands(twin: Twin, rotors: bool) -> bool:
