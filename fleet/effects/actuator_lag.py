@@ -1,0 +1,41 @@
+"""A slow servo: a further first-order lag between command and surface."""
+
+from math import exp
+
+import numpy as np
+
+from fleet.effects import ALL_SURFACES, SURFACES, Body, Effect, Parameter, Stage
+from fleet.physics.kernel import kernel
+
+
+@kernel
+def act(u: np.ndarray, memory: np.ndarray, dt: float, par: np.ndarray) -> None:
+    """Lag the commands; memory[0] is the surface."""
+    for i in range(len(u)):
+        tau = par[0, i]
+        if tau > 0.0:
+            memory[0] += (u[i] - memory[0]) * (1.0 - exp(-dt / tau))
+            u[i] = memory[0]
+        else:
+            memory[0] = u[i]
+
+
+def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
+    """Give the whole lag, that of the healthy servo included."""
+    return {"tau_s": float(par[0]) + body.lag}
+
+
+EFFECT = Effect(
+    name="actuator_lag",
+    stage=Stage.DELTA,
+    channel="actuator",
+    equation="delta' = (delta_c - delta) / tau",
+    source="Stevens, Lewis & Johnson 2016, section 3.5 (first-order actuators)",
+    parameters=(Parameter("tau_s", "s", "time constant added", step=0.02, low=0.0, high=2.0),),
+    act=act,
+    told=told,
+    of=(*SURFACES, ALL_SURFACES),
+    starts=((0.06,), (0.12,), (0.2,), (0.3,), (0.45,), (0.7,)),
+    examples=((0.15,), (0.25,), (0.5,)),
+    confused={"actuator_delay": "alike at low frequency: fly sharp inputs", "actuator_rate_limit": "large inputs"},
+)

@@ -1,0 +1,36 @@
+"""An airspeed sensor that reads too much or too little by a share: a wrong ratio, a leak, ice on the tube."""
+
+from math import exp
+from typing import Any
+
+import numpy as np
+
+from fleet.effects import Body, Effect, Onset, Parameter, Stage
+
+
+def act(readings: dict[str, Any], log_scale: Any) -> dict[str, Any]:
+    """Scale the reading; the logarithm is undone by its negative."""
+    return {"Va": readings["Va"] * np.exp(log_scale)}
+
+
+def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
+    """Give the scale itself."""
+    return {"scale": exp(float(par[0]))}
+
+
+EFFECT = Effect(
+    name="airspeed_scale",
+    stage=Stage.SENSOR,
+    channel="airspeed",
+    equation="Va_reported = scale Va",
+    source="Beard & McLain 2012, section 7.3 (differential pressure)",
+    parameters=(Parameter("log_scale", "-", "logarithm of the scale", step=0.02, low=-0.7, high=0.7),),
+    act=act,
+    told=told,
+    onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
+    examples=((-0.05,), (0.1,), (-0.2,)),
+    confused={
+        "airspeed_bias": "a share grows with speed: fly at two speeds",
+        "air_density": "thin air takes moments and forces along, the sensor does not",
+    },
+)

@@ -1,0 +1,39 @@
+"""A mean wind, the same everywhere; from an onset on, a change of it."""
+
+from typing import Any
+
+import numpy as np
+
+from fleet.effects import Body, Effect, Flow, Onset, Parameter, Stage
+
+
+def act(flow: Flow, w_n: Any, w_e: Any) -> dict[str, Any]:
+    """Add wind."""
+    return {"w_n": w_n, "w_e": w_e}
+
+
+def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
+    """Give speed and where it blows from."""
+    w_n, w_e = map(float, par[:2])
+    return {"speed_mps": float(np.hypot(w_n, w_e)), "from_deg": float(np.degrees(np.arctan2(-w_e, -w_n)) % 360.0)}
+
+
+EFFECT = Effect(
+    name="wind_steady",
+    stage=Stage.AIR,
+    channel="air",
+    equation="v_a = v_g - w",
+    source="Beard & McLain 2012, eq. 2.6 (the wind triangle)",
+    parameters=(
+        Parameter("w_n", "m/s", "wind to the north", step=0.5, low=-40.0, high=40.0),
+        Parameter("w_e", "m/s", "wind to the east", step=0.5, low=-40.0, high=40.0),
+    ),
+    act=act,
+    told=told,
+    onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
+    examples=((2.0, -1.0), (-3.0, 4.0), (6.0, 6.0)),
+    confused={
+        "airspeed_bias": "wind depends on heading: fly a full turn",
+        "heading_bias": "a wrong compass turns with the aircraft: fly a full turn",
+    },
+)
