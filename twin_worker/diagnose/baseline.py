@@ -1,0 +1,77 @@
+"""The calibrated simulation: coefficients of every equation, timing, noise, spread from flight to flight."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from twin_worker.diagnose.card import Card
+
+CHANNELS = (
+    *("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed"),
+    *("gps_x", "gps_y", "gps_z", "gyro_roll", "gyro_pitch", "gyro_yaw", "baro"),
+)
+"""Residuals: fx [m/s2]; beta, alpha [deg]; p', q', r' [rad/s2]; airspeed [m/s]; dV/dt against the accelerometer
+[m/s2]; Euler rates against the gyros [rad/s]; barometric height [m]."""
+EQUATION = {"force_x": "X", "side": "beta", "lift": "alpha", "roll": "L", "pitch": "M", "yaw": "N"}
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What passes between a command and its effect: lag of servos and engine, transport delay [s]."""
+
+    servo: float = 0.0
+    engine: float = 0.25
+    delay: float = 0.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Innovations of each residual: e(k) = x(k) - a1 x(k-1) - a2 x(k-2), of standard deviation sigma; (c, 2), (c,)."""
+
+    ar: np.ndarray
+    sigma: np.ndarray
+
+    def whiten(self, x: np.ndarray) -> np.ndarray:
+        """Whiten residuals, (n, c); the first two rows are zero."""
+        e = np.zeros_like(x)
+        e[2:] = (x[2:] - self.ar[:, 0] * x[1:-1] - self.ar[:, 1] * x[:-2]) / self.sigma
+        return e
+
+
+def no_noise() -> Noise:
+    """Give the whitener that does nothing."""
+    n = len(CHANNELS)
+    return Noise(np.zeros((n, 2)), np.ones(n))
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """The simulation as calibrated on nominal flights.
+
+    Attributes:
+        card: the aircraft
+        coef: equation -> coefficients, in the order of `equations.TERMS`
+        speed: usual airspeed [m/s]
+        airspeed: reported over indicated airspeed, of the healthy sensor [-]
+        timing: of servos and engine
+        vane: the accelerometer served as the vane
+        r2: equation -> share of variance explained on the nominal flights
+        noise: of the residuals
+        spread: nuisance -> how much it varies from flight to flight, in its own unit
+        chance: guess and kind of onset -> gain that nominal flights left out reach
+        usual: mean square of each whitened residual on nominal flights, (c,)
+        flights: names of the nominal flights
+    """
+
+    card: Card
+    coef: dict[str, np.ndarray]
+    speed: float
+    airspeed: float = 1.0
+    timing: Timing = field(default_factory=Timing)
+    vane: bool = True
+    r2: dict[str, float] = field(default_factory=dict)
+    noise: Noise = field(default_factory=no_noise)
+    spread: dict[str, float] = field(default_factory=dict)
+    chance: dict[str, float] = field(default_factory=dict)
+    usual: np.ndarray = field(default_factory=lambda: np.ones(len(CHANNELS)))
+    flights: tuple[str, ...] = ()

@@ -1,0 +1,137 @@
+"""Calibrate the simulation on nominal flights: coefficients, timing, noise, spread between flights, threshold."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from twin_worker.diagnose.baseline import CHANNELS, Baseline, Noise
+from twin_worker.diagnose.card import Card
+from twin_worker.diagnose.fit import fit, fit_timing, fit_wind, wind
+from twin_worker.diagnose.flight import Flight
+from twin_worker.diagnose.guess import Guess
+from twin_worker.diagnose.nuisance import nuisances
+from twin_worker.diagnose.residual import Case
+from twin_worker.diagnose.decide import best
+from twin_worker.diagnose.sight import Sight, is_weather
+
+_ROUNDS = 10  # of expectation and maximisation
+_FADED = 4.0  # residual rows that count as one while spreads are learnt: whitening is never whole
+_SAFE = 1.05  # noise of flights not calibrated on, over that of those that were
+_LEAST_USUAL = 0.6
+
+Say = Callable[[str], None]
+
+
+def calibrate(flights: Sequence[Flight], card: Card, say: Say = lambda word: None) -> Baseline:
+    """Calibrate.
+
+    Args:
+        flights: nominal ones, the more and the livelier the better
+        card: the aircraft, or `card.UNKNOWN`
+        say: takes words of progress
+    Raises:
+        ValueError: when there is no flight.
+    """
+    if not flights:
+        raise ValueError("calibrate: found no nominal flight, expected one at least; name recordings")
+    vane = all(flight.vane for flight in flights)
+    say("timing of servos and engine")
+    timing = fit_timing(flights, card, vane)
+    base, _ = fit(flights, card, timing, vane)
+    say("leaving each flight out in turn")
+    parts = list(flights) if len(flights) > 1 else halves(flights[0])
+    left = [fit([f for f in parts if f is not one], card, timing, vane)[0] for one in parts]
+    cases = [Case(one, without) for one, without in zip(parts, left, strict=True)]
+    base = _with_noise(base, cases)
+    cases = [replaced(case, base) for case in cases]
+    say("what nominal flights reach by chance")
+    chance: dict[str, float] = {}
+    usual = []
+    for case in cases:
+        sight = Sight(case, own_weather(case))
+        usual.append(sight.left())
+        for found in best(sight, ()):
+            chance[found.kind] = max(chance.get(found.kind, 0.0), found.gain)
+    return replace(base, chance=chance, usual=np.maximum(np.median(usual, axis=0), _LEAST_USUAL))
+
+
+def halves(flight: Flight) -> list[Flight]:
+    """Give a flight's halves, each trusted where the other is not."""
+    middle = np.median(flight.t[flight.ok])
+    return [replace(flight, ok=flight.ok & side) for side in (flight.t < middle, flight.t >= middle)]
+
+
+def replaced(case: Case, base: Baseline) -> Case:
+    """Give a case with the noise and spread of another baseline."""
+    own = replace(case.base, noise=base.noise, spread=base.spread, usual=base.usual, chance=base.chance)
+    return Case(case.flight, own)
+
+
+def own_weather(case: Case) -> tuple[Guess, ...]:
+    """Give the flight's own mean wind as granted, where wind is weather."""
+    return wind(fit_wind(case, np.zeros(4))) if is_weather(case.base) else ()
+
+
+def _with_noise(base: Baseline, cases: list[Case]) -> Baseline:
+    """Learn noise, and the spread of every nuisance, from flights left out."""
+    winds = [fit_wind(case, np.zeros(4)) for case in cases]
+    granted = [wind(w) for w in winds]
+    rows = [case.residuals(g) for case, g in zip(cases, granted, strict=True)]
+    several = nuisances()
+    slopes = [_slopes(case, g, x) for case, g, x in zip(cases, granted, rows, strict=True)]
+    noise = _noise(rows, cases)
+    for _ in range(2):
+        spread, means = _spreads(noise, cases, rows, slopes)
+        noise = _noise([x + J @ m for x, J, m in zip(rows, slopes, means, strict=True)], cases)
+    for k, n in enumerate(several):
+        if n.effect.name == "wind_steady":
+            spread[k] = max(spread[k], np.sqrt(np.mean([w[n.index] ** 2 for w in winds])))
+    named = {n.name: float(s) for n, s in zip(several, spread, strict=True)}
+    return replace(base, noise=Noise(noise.ar, noise.sigma * _SAFE), spread=named)
+
+
+def _slopes(case: Case, granted: tuple[Guess, ...], rows: np.ndarray) -> np.ndarray:
+    """Give how residuals change with each nuisance, (n, c, nuisances)."""
+    return np.stack([(case.residuals((*granted, n.guess(n.step))) - rows) / n.step for n in nuisances()], axis=2)
+
+
+def _spreads(
+    noise: Noise, cases: list[Case], rows: list[np.ndarray], slopes: list[np.ndarray]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Learn the nuisances' standard deviations by expectation and maximisation; give them and each flight's values.
+
+    A nuisance that a flight says nothing about leaves its spread where it was.  Source: Dempster, Laird & Rubin 1977.
+    """
+    floors = np.array([n.floor for n in nuisances()])
+    parts = []
+    for case, x, J in zip(cases, rows, slopes, strict=True):
+        white = np.stack([noise.whiten(J[:, :, k]) for k in range(J.shape[2])], axis=2)[case.ok]
+        flat, e = white.reshape(-1, white.shape[2]), noise.whiten(x)[case.ok].ravel()
+        parts.append((flat.T @ flat / _FADED, -flat.T @ e / _FADED))
+    spread = floors.copy()
+    for _ in range(_ROUNDS):
+        inverse = [np.linalg.inv(A + np.diag(spread**-2.0)) for A, _ in parts]
+        means = [P @ b for P, (_, b) in zip(inverse, parts, strict=True)]
+        spread = np.sqrt(np.mean([m * m + np.diag(P) for m, P in zip(means, inverse, strict=True)], axis=0))
+        spread = np.maximum(spread, floors)
+    return spread, means
+
+
+def _noise(rows: list[np.ndarray], cases: list[Case]) -> Noise:
+    """Fit each channel's autoregression of order two and its innovations."""
+    n = len(CHANNELS)
+    ar, sigma = np.zeros((n, 2)), np.ones(n)
+    for c in range(n):
+        A, y = [], []
+        for x, case in zip(rows, cases, strict=True):
+            good = case.ok[2:] & case.ok[1:-1] & case.ok[:-2]
+            A.append(np.column_stack([x[1:-1, c], x[:-2, c]])[good])
+            y.append(x[2:, c][good])
+        stacked, value = np.concatenate(A), np.concatenate(y)
+        if not np.any(value):
+            continue
+        ridge = 1e-3 * np.linalg.norm(value) * np.eye(2)
+        ar[c] = np.linalg.lstsq(np.vstack([stacked, ridge]), np.concatenate([value, [0.0, 0.0]]), rcond=None)[0]
+        sigma[c] = np.sqrt(np.mean((value - stacked @ ar[c]) ** 2)) + 1e-9
+    return Noise(ar, sigma)

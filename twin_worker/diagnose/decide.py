@@ -1,0 +1,134 @@
+"""Name what explains a flight: up to three effects, re-chosen beside each other, each with what it cannot be told from."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet.effects import catalogue
+from twin_worker.diagnose.baseline import CHANNELS
+from twin_worker.diagnose.guess import Guess
+from twin_worker.diagnose.refine import refine
+from twin_worker.diagnose.scan import PRICE, Found, scan
+from twin_worker.diagnose.sight import Sight
+
+MOST = 3  # effects named together
+_TRIED = 12  # guesses fitted properly at each step
+_LEAST = 150.0  # gain of a first effect
+_SECOND = 220.0  # and of every further one
+_CHANCE = 1.2  # over what nominal flights reach by chance
+_SHARE = 0.02  # of the first one's gain a further one must bring
+_FINE, _COARSE = 0.02, 0.15  # tie: by the accelerometer; by plain telemetry, whose baseline is wrong by about as much
+_LEAST_TIE = 20.0
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Named:
+    """One effect found.
+
+    Attributes:
+        found: the guess and its gain
+        rivals: guesses that explain as much, best first
+    """
+
+    found: Found
+    rivals: tuple[Found, ...]
+
+
+def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: None) -> list[Named]:
+    """Find what explains the flight; `sight` ends with everything found taken for granted.
+
+    Args:
+        sight: the flight with nothing but its weather granted
+        weather: granted throughout
+        say: takes words of progress
+    """
+    named: list[Named] = []
+    while len(named) < MOST:
+        say(f"effect {len(named) + 1}")
+        found = best(sight, [one.found.guess for one in named])
+        found = [one for one in found if one.gain > needed(sight, named, one)]
+        if not found:
+            break
+        named.append(choose(sight, found))
+        if len(named) > 1:
+            named = _again(sight, named, weather)
+        sight.grant((*weather, *(one.found.guess for one in named)))
+    return named
+
+
+def best(sight: Sight, beside: Sequence[Guess], only: tuple[str, ...] = ()) -> list[Found]:
+    """Scan, and fit the most promising properly; best first."""
+    taken = {guess.label for guess in beside}
+    tried: list[Found] = []
+    for found in scan(sight, only=only):
+        if found.guess.label in taken or found.gain < 40.0:
+            continue
+        if sum(other.guess.label == found.guess.label for other in tried) < 2:
+            tried.append(found)
+        if len(tried) >= _TRIED:
+            break
+    return sorted((refine(sight, found.guess) for found in tried), key=lambda found: -rank(sight, found))
+
+
+def rank(sight: Sight, found: Found) -> float:
+    """Give what a guess is worth: each number beyond the first must earn its price, and its share."""
+    extra = found.guess.effect.size - 1
+    share = 0.0 if sight.base.vane else _COARSE * extra
+    return found.gain * (1.0 - share) - PRICE * found.guess.size
+
+
+def tie(sight: Sight, found: Found) -> float:
+    """Give how much less another guess may be worth and still not be told apart."""
+    return max(_LEAST_TIE, (_FINE if sight.base.vane else _COARSE) * found.gain)
+
+
+def choose(sight: Sight, found: list[Found]) -> Named:
+    """Choose the guess of fewest numbers among the best that tie; the others are its rivals."""
+    first = found[0]
+    close = [one for one in found if rank(sight, one) > rank(sight, first) - tie(sight, first)]
+    chosen = min(close, key=lambda one: (one.guess.size, -rank(sight, one)))
+    rivals: dict[str, Found] = {}
+    for one in close:
+        if one.guess.effect.name != chosen.guess.effect.name:
+            rivals.setdefault(one.guess.effect.name, one)
+    return Named(chosen, tuple(rivals.values()))
+
+
+def needed(sight: Sight, named: list[Named], found: Found) -> float:
+    """Give the gain a guess must reach: more than chance, and a share of the first one's."""
+    chance = _CHANCE * sight.base.chance.get(found.kind, 0.0)
+    if not named:
+        return max(_LEAST, chance)
+    return max(_SECOND, chance, (_SHARE if sight.base.vane else 0.25) * named[0].found.gain)
+
+
+def _again(sight: Sight, named: list[Named], weather: tuple[Guess, ...]) -> list[Named]:
+    """Choose each effect anew with the others granted, for the first choice was made alone."""
+    for i in range(len(named)):
+        others = [one.found.guess for k, one in enumerate(named) if k != i]
+        sight.grant((*weather, *others))
+        found = best(sight, others)
+        kept = refine(sight, named[i].found.guess)
+        if found:
+            named[i] = choose(sight, sorted([kept, *found], key=lambda one: -rank(sight, one)))
+    return named
+
+
+def turbulent(sight: Sight) -> tuple[float, float]:
+    """Give gain and share of variance of gusts: sideslip, lift and airspeed scatter together, two sensors agree."""
+    kept = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
+    calm = [CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z", "gyro_roll", "gyro_pitch", "gyro_yaw")]
+    left = sight.left() / sight.base.usual
+    ratio = left[kept]
+    if ratio.min() < 1.5 or left[calm].mean() > 1.5:
+        return 0.0, 1.0
+    rows = int(sight.ok.sum())
+    return float(sum(rows * (x - 1 - np.log(x)) for x in ratio)), float(np.median(ratio))
+
+
+def variance_effects() -> list[str]:
+    """List the effects that show only in the scatter."""
+    return [name for name, effect in catalogue().items() if effect.variance]

@@ -1,0 +1,148 @@
+"""Fit the baseline's coefficients to nominal flights, the wind of each flight beside them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fleet.effects import catalogue
+from twin_worker.diagnose import equations as eq
+from twin_worker.diagnose.baseline import Baseline, Timing
+from twin_worker.diagnose.card import Card
+from twin_worker.diagnose.flight import Flight
+from twin_worker.diagnose.guess import Guess
+from twin_worker.diagnose.residual import RHO_0, Case, Terms
+
+_RIDGE = 1e-3  # pull of a coefficient towards zero, as a share of its term's length
+_RIDGE_FLOW = 2e-2  # the same of the flow angles, whose terms are nearly parallel
+_ROUNDS = 2
+_SHEAR = 1.0  # usual growth of wind with height [m/s per 100 m]
+_CORRELATED = 50.0  # residual rows that count as one
+_SIDE = 0.5  # weight of sideslip in the wind fit [-]
+_LAGS, _DELAYS, _ENGINES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3), (0.0, 0.04), (0.1, 0.25, 0.5)
+
+
+def wind(w: np.ndarray) -> tuple[Guess, ...]:
+    """Give a flight's own weather as guesses: wind, (2,) [m/s], and its growth with height, (2,) [m/s per 100 m]."""
+    known = catalogue()
+    return Guess(known["wind_steady"], "", tuple(w[:2].tolist())), Guess(known["wind_shear"], "", tuple(w[2:].tolist()))
+
+
+def fit(flights: Sequence[Flight], card: Card, timing: Timing, vane: bool) -> tuple[Baseline, list[np.ndarray]]:
+    """Fit every equation, and the weather of each flight, (4,).
+
+    Raises:
+        ValueError: when the flights do not excite an equation at all.
+    """
+    speed = float(np.median(np.concatenate([np.hypot(f.readings["v_n"], f.readings["v_e"])[f.ok] for f in flights])))
+    base = Baseline(card, {}, speed, timing=timing, vane=vane, flights=tuple(f.name for f in flights))
+    winds = [np.zeros(4) for _ in flights]
+    for _ in range(_ROUNDS):
+        cases = [Case(flight, base) for flight in flights]
+        winds = [fit_wind(case, w) for case, w in zip(cases, winds, strict=True)]
+        made = [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)]
+        base = replace(base, airspeed=_airspeed(cases, made))
+        flow = {name: _solve(*_stack(cases, made, name), _RIDGE_FLOW) for name in ("alpha", "beta")}
+        base = replace(base, coef=flow)
+        cases = [Case(flight, base) for flight in flights]
+        base = _moments(cases, [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)], base)
+    return base, winds
+
+
+def _moments(cases: list[Case], made: list[Terms], base: Baseline) -> Baseline:
+    """Fit forces and moments, the flow angles given."""
+    coef, r2 = dict(base.coef), {}
+    y, A = _stack(cases, made, "X", more=lambda m: m.terms["T"])[::-1]
+    both = _solve(A, y, _RIDGE)
+    coef["X"], coef["T"] = both[: len(eq.X)], both[len(eq.X) :]
+    r2["X"] = _r2(A @ both, y)
+    A, y = _stack(cases, made, "M", more=lambda m: (coef["T"] @ m.terms["T"])[None])
+    coef["M"] = _solve(A, y, _RIDGE)
+    r2["M"] = _r2(A @ coef["M"], y)
+    for name in ("L", "N", "alpha", "beta"):
+        A, y = _stack(cases, made, name)
+        coef[name] = coef[name] if name in coef else _solve(A, y, _RIDGE)
+        r2[name] = _r2(A @ coef[name], y)
+    return replace(base, coef=coef, r2=r2)
+
+
+def _stack(
+    cases: list[Case], made: list[Terms], name: str, more: Callable[[Terms], np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stack terms, dimensional, (n, k), and the measured side, (n,), over all flights' trusted rows."""
+    A, y = [], []
+    for case, m in zip(cases, made, strict=True):
+        rows = m.terms[name] * m.scale.get(name, 1.0)
+        rows = rows if more is None else np.concatenate([rows, more(m)])
+        A.append(rows[:, case.ok].T)
+        y.append(m.measured[name][case.ok])
+    return np.concatenate(A), np.concatenate(y)
+
+
+def _solve(A: np.ndarray, y: np.ndarray, ridge: float) -> np.ndarray:
+    length = np.linalg.norm(A, axis=0) + 1e-12
+    k = A.shape[1]
+    stacked = np.vstack([A / length, ridge * np.eye(k)])
+    return np.linalg.lstsq(stacked, np.concatenate([y, np.zeros(k)]), rcond=None)[0] / length
+
+
+def _r2(fitted: np.ndarray, y: np.ndarray) -> float:
+    return float(1.0 - ((y - fitted) ** 2).sum() / max(((y - y.mean()) ** 2).sum(), 1e-12))
+
+
+def _airspeed(cases: list[Case], made: list[Terms]) -> float:
+    """Give reported over indicated airspeed."""
+    if any("Va" not in case.flight.readings for case in cases):
+        return 1.0
+    rows = zip(cases, made, strict=True)
+    x, y = np.concatenate(
+        [np.stack([m.flow.Va * np.sqrt(m.flow.rho / RHO_0), m.measured["airspeed"]])[:, c.ok] for c, m in rows], axis=1
+    )
+    return float((x @ y) / (x @ x))
+
+
+def fit_wind(case: Case, w: np.ndarray) -> np.ndarray:
+    """Fit a flight's weather, (4,) as in `wind`, to airspeed (it needs turns) and sideslip; robustly."""
+    if "Va" not in case.flight.readings and "beta" not in case.base.coef:
+        return w
+
+    def miss(w: np.ndarray) -> np.ndarray:
+        m = case.terms(wind(w))
+        out = []
+        if "Va" in case.flight.readings:
+            out.append(m.measured["airspeed"] / case.base.airspeed - m.flow.Va * np.sqrt(m.flow.rho / RHO_0))
+        if "beta" in case.base.coef:
+            out.append(_SIDE * (m.flow.beta - case.base.coef["beta"] @ m.terms["beta"]) * m.flow.Va)
+        return np.concatenate([x[case.ok] for x in out])
+
+    for _ in range(8):
+        r = miss(w)
+        J = np.stack([(miss(w + 0.3 * e) - r) / 0.3 for e in np.eye(4)], axis=1)
+        weight = 1.0 / (1.0 + r * r)
+        pull = np.diag([1e-6, 1e-6, *(2 * [(weight * r * r).mean() * _CORRELATED / _SHEAR**2])])
+        change = -np.linalg.solve((J.T * weight) @ J + pull, (J.T * weight) @ r + pull @ w)
+        w = w + np.clip(change, -4.0, 4.0)
+        if np.abs(change).max() < 0.01:
+            break
+    return w
+
+
+def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
+    """Find the lags and the delay that explain most; one after the other, twice."""
+    best = Timing()
+
+    def worth(timing: Timing) -> float:
+        r2 = fit(flights, card, timing, vane)[0].r2
+        return sum(float(np.log(max(1.0 - r2[name], 1e-6))) for name in ("X", "L", "M"))
+
+    now = worth(best)
+    for _ in range(2):
+        for name, grid in (("servo", _LAGS), ("engine", _ENGINES), ("delay", _DELAYS)):
+            for value in grid:
+                if value == getattr(best, name):
+                    continue
+                trial = replace(best, **{name: value})
+                found = worth(trial)
+                if found < now - 0.01:
+                    best, now = trial, found
+    return best

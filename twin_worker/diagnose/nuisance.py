@@ -1,0 +1,91 @@
+"""What differs from flight to flight without being missing physics: turn-on biases, weather, trim, small scatter.
+
+Each has a spread: of the sensor's specification, or learnt from nominal flights left out. Within it a difference is
+absorbed; past it the difference is handed to the hypotheses.
+"""
+
+from dataclasses import dataclass
+
+from fleet.effects import Effect, Parameter, Stage, catalogue
+from twin_worker.diagnose.guess import ALWAYS, Guess
+
+RELEASED = 2.5  # spreads past which a difference is no nuisance any more
+WEATHER_MPS = 1.0  # nominal flights that differ by more had weather: a mean wind is then never a finding
+
+_SHARES = ("L:delta_a", "L:p", "L:beta", "M:delta_e", "M:c_z", "M:q", "N:delta_r", "N:r", "N:beta")
+_OFFSETS = ("C_L", "C_D", "C_l", "C_m", "C_n", "thrust", "rho")
+
+
+def _act(flow: object, x: object, of: str) -> dict[str, object]:
+    return {of: x}
+
+
+SCATTER = Effect(
+    name="scatter",
+    stage=Stage.WRENCH,
+    channel="",
+    equation="coefficient (1 + share), or coefficient + offset",
+    source="spread of nominal flights",
+    parameters=(Parameter("x", "-", "share or offset", step=0.01, low=-1.0, high=1.0),),
+    act=_act,
+    examples=((0.01,),),
+    of=(*_SHARES, *_OFFSETS),
+)
+DENSITY = Effect(**{**SCATTER.__dict__, "stage": Stage.AIR})
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """One number that may differ.
+
+    Attributes:
+        name: for the spreads
+        effect, of, index: what it is a parameter of
+        floor: least spread
+        step: for slopes
+    """
+
+    name: str
+    effect: Effect
+    of: str
+    index: int
+    floor: float
+    step: float
+
+    def guess(self, x: float) -> Guess:
+        """Give it at work."""
+        par = [0.0] * self.effect.size
+        par[self.index] = x
+        return Guess(self.effect, self.of, tuple(par), ALWAYS)
+
+    @property
+    def weather(self) -> bool:
+        """Tell whether this is weather, of which any amount may be nominal."""
+        return self.effect.name in ("wind_steady", "wind_shear")
+
+
+def nuisances() -> tuple[Nuisance, ...]:
+    """List them all."""
+    known = catalogue()
+    out = []
+
+    def add(name: str, floor: float, of: tuple[str, ...] = ("",)) -> None:
+        effect = known[name]
+        for one in of:
+            for k, parameter in enumerate(effect.parameters):
+                label = ":".join(filter(None, (name, one, parameter.name)))
+                out.append(Nuisance(label, effect, one, k, floor, 0.3 * parameter.step))
+
+    add("accel_bias", 0.02, known["accel_bias"].of)
+    add("gyro_bias", 0.0008, known["gyro_bias"].of)
+    add("heading_bias", 0.012)
+    add("wind_steady", 0.35)
+    add("wind_shear", 0.2)
+    add("imu_misalignment", 0.002)
+    add("airspeed_scale", 0.003)
+    for of in _SHARES:
+        out.append(Nuisance(of, SCATTER, of, 0, 0.01, 0.01))
+    floors = {"C_L": 0.004, "C_D": 0.0005, "C_l": 0.0001, "C_m": 0.0003, "C_n": 0.0001, "thrust": 0.005, "rho": 0.003}
+    for of in _OFFSETS:
+        out.append(Nuisance(of, DENSITY if of == "rho" else SCATTER, of, 0, floors[of], floors[of]))
+    return tuple(out)

@@ -1,0 +1,124 @@
+"""Whitened residuals of one flight, the nuisances profiled out: what every hypothesis is measured by."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from twin_worker.diagnose.baseline import CHANNELS, Baseline
+from twin_worker.diagnose.guess import Guess
+from twin_worker.diagnose.nuisance import RELEASED, WEATHER_MPS, Nuisance, nuisances
+from twin_worker.diagnose.residual import Case
+
+CLIP = 6.0  # whitened residuals beyond count as much [-]
+_TIGHT = 1e14  # precision of a nuisance that was handed to the hypotheses
+_QUIETEST = 0.45  # a flight may be quieter than the nominal ones by this much
+_LOUDEST = 3.0  # and, where weather is nominal, louder in the air's channels by this
+_AIR = [CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed")]
+_AIR += [CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z")]
+
+
+class Sight:
+    """One case with some guesses taken for granted.
+
+    Args:
+        case: the flight
+        granted: guesses at work in everything that follows
+        span: which residual rows count, (n,) bool; None: all that are trusted
+    """
+
+    def __init__(self, case: Case, granted: tuple[Guess, ...] = (), span: np.ndarray | None = None) -> None:
+        self.case, self.base = case, case.base
+        ok = case.ok.copy()
+        ok[2:] &= case.ok[1:-1] & case.ok[:-2]
+        ok[:2] = False
+        self.ok = ok if span is None else ok & span
+        self.noise = self._scaled()
+        self.weather = is_weather(self.base)
+        self.nuisances: tuple[Nuisance, ...] = nuisances()
+        self.grant(granted)
+
+    def _scaled(self):  # type: ignore[no-untyped-def]
+        """Scale the noise to this flight's own: quieter always, louder only where weather is nominal."""
+        noise = self.base.noise
+        e = noise.whiten(self.case.residuals())[self.ok]
+        if not len(e):
+            return noise
+        scatter = 1.4826 * np.median(np.abs(e - np.median(e, axis=0)), axis=0)
+        highest = np.ones(len(CHANNELS))
+        if is_weather(self.base):
+            highest[_AIR] = _LOUDEST
+        return replace(noise, sigma=noise.sigma * np.clip(scatter, _QUIETEST, highest))
+
+    def whitened(self, guesses: Sequence[Guess]) -> np.ndarray:
+        """Give whitened residuals with these beside the granted guesses, zero where not trusted, (n, c)."""
+        e = self.noise.whiten(self.case.residuals((*self.granted, *guesses)))
+        e[~self.ok] = 0.0
+        return e
+
+    def clipped(self, guesses: Sequence[Guess]) -> np.ndarray:
+        """Give the same, no row counting more than `CLIP`."""
+        return np.clip(self.whitened(guesses), -CLIP, CLIP)
+
+    def grant(self, granted: tuple[Guess, ...]) -> None:
+        """Take guesses for granted from now on."""
+        self.granted = granted
+        self.raw = self.whitened(())
+        self.e = np.clip(self.raw, -CLIP, CLIP)
+        steps = [self.whitened((n.guess(n.step),)) for n in self.nuisances]
+        self.Jn = np.stack([(e - self.raw) / n.step for e, n in zip(steps, self.nuisances, strict=True)], axis=2)
+        self._profile()
+
+    def _profile(self) -> None:
+        """Find the nuisances, and hand those that leave their spread to the hypotheses."""
+        self.precision = np.array([1.0 / self._spread(n) ** 2 for n in self.nuisances])
+        free = np.array([self.weather and n.weather for n in self.nuisances])
+        flat = self.Jn.reshape(-1, len(self.nuisances))
+        G, self.bn = flat.T @ flat, -flat.T @ self.e.ravel()
+        for _ in range(6):
+            self.Ann = G + np.diag(self.precision)
+            self.xn = np.linalg.solve(self.Ann, self.bn)
+            held = self.precision < 0.1 * _TIGHT
+            past = np.abs(self.xn) * np.sqrt(self.precision) * held * ~free
+            worst = int(np.argmax(past))
+            if past[worst] < RELEASED:
+                break
+            self.precision[worst] = _TIGHT
+        self.gain_n = float(self.bn @ self.xn)
+
+    def _spread(self, n: Nuisance) -> float:
+        spread = self.base.spread.get(n.name, n.floor)
+        return max(spread, 2.5) if self.weather and n.effect.name == "wind_steady" else spread
+
+    def cost(self, guesses: Sequence[Guess]) -> float:
+        """Give the sum of squares with these guesses, the nuisances profiled out."""
+        return self.cost_of(self.clipped(guesses))
+
+    def cost_of(self, e: np.ndarray) -> float:
+        """Give the sum of squares of whitened residuals, the nuisances profiled out."""
+        b = -np.einsum("tci,tc->i", self.Jn, e)
+        return float((e * e).sum() - b @ np.linalg.solve(self.Ann, b))
+
+    def slopes(self, guess: Guess, step: np.ndarray) -> np.ndarray:
+        """Give how the whitened residuals change with each parameter about a guess, (n, c, k)."""
+        here = self.whitened((guess,))
+        out = []
+        for k, h in enumerate(step):
+            par = np.array(guess.par)
+            moved = guess.at(par + h * np.eye(len(par))[k])
+            h = moved.par[k] - par[k]
+            if not h:  # at the upper bound
+                moved = guess.at(par - step[k] * np.eye(len(par))[k])
+                h = moved.par[k] - par[k]
+            out.append((self.whitened((moved,)) - here) / (h or 1.0))
+        return np.stack(out, axis=2)
+
+    def left(self) -> np.ndarray:
+        """Give the mean square of each channel's whitened residual, nuisances taken off, (c,)."""
+        e = self.e + self.Jn @ self.xn
+        return (e[self.ok] ** 2).mean(axis=0) if self.ok.any() else np.zeros(len(CHANNELS))
+
+
+def is_weather(base: Baseline) -> bool:
+    """Tell whether the nominal flights had wind, so that a mean wind is nobody's finding."""
+    return max(base.spread.get(f"wind_steady:{axis}", 0.0) for axis in ("w_n", "w_e")) > WEATHER_MPS

@@ -1,0 +1,214 @@
+"""Fly the calibrated simulation, with any effects at work: many runs side by side, commands recorded or from a pilot.
+
+    m a = m g + R (X, Y, Z)      J omega' = moments, inertia coupled where the card tells it      (NED, FRD)
+
+Forces are the calibration's equations turned round: c_z from alpha, c_y from beta.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Flow, Stage
+from fleet.frames import G
+from twin_worker.diagnose import equations as eq
+from twin_worker.diagnose.baseline import Baseline
+from twin_worker.diagnose.guess import Guess
+from twin_worker.diagnose.residual import RHO_0, density, rotation, shared
+from twin_worker.diagnose.smooth import DT
+
+STATE = ("v_n", "v_e", "v_d", "p", "q", "r", "phi", "theta", "psi", "h")
+_STEEP = 1.45  # pitch is not integrated beyond [rad]
+_SLOWEST = 3.0  # airspeed the equations are used down to [m/s]
+_WILDEST = 8.0  # body rates beyond which a run counts as lost [rad/s]
+
+Pilot = Callable[[int, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Runs:
+    """What was flown: states (n, 10, runs), specific force FRD (n, 3, runs), commands (n, 4, runs), Va (n, runs)."""
+
+    states: np.ndarray
+    force: np.ndarray
+    commands: np.ndarray
+    Va: np.ndarray
+
+
+class Simulation:
+    """Several runs of one aircraft, each with effects of its own.
+
+    Args:
+        base: the calibrated simulation
+        guesses: effects at work, for each run
+        begins: time of each run's start, (runs,) [s]
+        ground: height of the ground [m]
+    """
+
+    def __init__(
+        self, base: Baseline, guesses: Sequence[Sequence[Guess]], begins: np.ndarray, ground: float = 0.0
+    ) -> None:
+        self.base, self.begins, self.ground = base, np.asarray(begins, float), ground
+        self.runs = len(guesses)
+        self._groups = _grouped(guesses)
+        self._servos = [(run, g) for run, all_ in enumerate(guesses) for g in all_ if g.effect.stage is Stage.DELTA]
+
+    def fly(self, start: np.ndarray, pilot: Pilot, n: int) -> Runs:
+        """Fly n steps of `DT`.
+
+        Args:
+            start: states in the order of `STATE`, (10, runs)
+            pilot: `(step, states (10, runs))` to commands delta_a delta_e delta_r delta_t, (4, runs)
+        """
+        x = np.array(start, float)
+        states, force = np.empty((n, len(STATE), self.runs)), np.empty((n, 3, self.runs))
+        commands, speed = np.empty((n, 4, self.runs)), np.empty((n, self.runs))
+        memories: dict[tuple[int, int], np.ndarray] = {}
+        acting: np.ndarray | None = None
+        used = np.zeros(self.runs)
+        for k in range(n):
+            t = self.begins + k * DT
+            states[k], commands[k] = x, pilot(k, x)
+            moved = self._moved(commands[k], t, memories)
+            acting = moved if acting is None else acting + self._share() * (moved - acting)
+            used += commands[k, 3] * DT
+            delta = self._angles(acting)
+            k1, force[k], speed[k] = self.rates(x, delta, t, used)
+            k2 = self.rates(x + 0.5 * DT * k1, delta, t, used)[0]
+            k3 = self.rates(x + 0.5 * DT * k2, delta, t, used)[0]
+            k4 = self.rates(x + DT * k3, delta, t, used)[0]
+            x = x + DT / 6.0 * (k1 + 2 * k2 + 2 * k3 + k4)
+            lost = ~(np.abs(x[3:6]).max(axis=0) < _WILDEST)
+            x[:, lost] = np.where(np.isfinite(states[k][:, lost]), states[k][:, lost], 0.0)
+        return Runs(states, force, commands, speed)
+
+    def _share(self) -> np.ndarray:
+        timing = self.base.timing
+        tau = np.array([timing.servo + timing.delay] * 3 + [timing.engine + timing.delay])
+        return (1.0 - np.exp(-DT / np.maximum(tau, 1e-3)))[:, None]
+
+    def _moved(self, commands: np.ndarray, t: np.ndarray, memories: dict[tuple[int, int], np.ndarray]) -> np.ndarray:
+        """Have faulty servos do to the commands what they do."""
+        out = commands.copy()
+        for run, guess in self._servos:
+            for column, name in enumerate(SURFACES):
+                if guess.of not in (name, ALL_SURFACES):
+                    continue
+                u = out[column, run : run + 1].copy()
+                memory = memories.setdefault((run, column, id(guess)), np.full(MEMORY, u[0]))  # type: ignore[arg-type]
+                par = np.asarray(guess.par)[:, None] * guess.when.gate(t[run : run + 1])
+                guess.effect.act(u, memory, DT, par)
+                out[column, run] = u[0]
+        return out
+
+    def _increments(self, flow: Flow, stages: tuple[Stage, ...]) -> dict[str, np.ndarray]:
+        total: dict[str, np.ndarray] = {}
+        for guesses, rows in self._groups:
+            first = guesses[0]
+            if first.effect.stage not in stages:
+                continue
+            gates = np.array([g.when.gate(flow.t[row : row + 1])[0] for g, row in zip(guesses, rows, strict=True)])
+            par = np.array([g.par for g in guesses]).T * gates
+            more = first.effect.act(_part(flow, rows), *par, **({"of": first.of} if first.of else {}))
+            for name, x in more.items():
+                total.setdefault(name, np.zeros(self.runs))[rows] += x
+        return total
+
+    def _angles(self, u: np.ndarray) -> np.ndarray:
+        return np.stack([*(self.base.card.angles(i)(u[i]) for i in range(3)), u[3]])
+
+    def rates(
+        self, x: np.ndarray, delta: np.ndarray, t: np.ndarray, used: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Give d state / dt (10, runs), specific force FRD (3, runs) [m/s2] and airspeed (runs,) [m/s].
+
+        Args:
+            x: states, (10, runs)
+            delta: surfaces as they stand [rad] and throttle, (4, runs)
+            t: time [s]; used: throttle integrated over time [s]; each (runs,)
+        """
+        base, body = self.base, self.base.card.body
+        v, (p, q, r), (phi, theta, psi), h = x[:3], x[3:6], x[6:9], x[9]
+        theta = np.clip(theta, -_STEEP, _STEEP)
+        d_a, d_e, d_r, d_t = delta
+        flow = Flow(t, h, h - self.ground, body, p=p, q=q, r=r, delta_t=d_t, used=used)
+        air = self._increments(flow, (Stage.AIR,))
+        R = rotation(phi, theta, psi)
+        moving = v - np.stack([air.get(name, np.zeros(self.runs)) for name in ("w_n", "w_e", "w_d")])
+        ua, va, wa = np.einsum("ijn,in->jn", R, moving)
+        flow.Va = np.maximum(np.sqrt(ua * ua + va * va + wa * wa), _SLOWEST)
+        flow.alpha, flow.beta = np.arctan2(wa, ua), np.arcsin(np.clip(va / flow.Va, -1, 1))
+        flow.rho = density(h) * (1.0 + air.get("rho", 0.0))
+        flow.q_bar = 0.5 * flow.rho * flow.Va**2
+        span, chord = body.b / (2 * flow.Va), body.c / (2 * flow.Va)
+        p_hat, q_hat, r_hat, q_S = p * span, q * chord, r * span, flow.q_bar * body.S
+        thrust = eq.thrust_terms(d_t, flow.Va, flow.rho / RHO_0, base.speed)
+        flow.T = base.coef["T"] @ thrust
+        flow.pitch, flow.yaw = base.coef["M"][3] * d_e, base.coef["N"][5] * d_r
+        A, B = base.coef["alpha"], base.coef["beta"]
+        c_z = _lift(A, flow.alpha - A[0] - A[3] * q_hat - A[5] * d_e)
+        c_y = (flow.beta - B[0] - B[2] * p_hat - B[3] * r_hat - B[4] * d_r) / B[1]
+        flow.C_L = -c_z
+        add = self._increments(flow, (Stage.WRENCH, Stage.MASS))
+        coef, zero = shared(base, add), np.zeros(self.runs)
+        T = flow.T * (1.0 + add.get("thrust", zero))
+        lift = add.get("lift", zero) * -c_z + add.get("C_L", zero)
+        X = coef("X", eq.force_terms(c_z, d_e, flow.beta)) + lift * np.sin(flow.alpha)
+        X = q_S * (X - add.get("C_D", zero) * np.cos(flow.alpha)) + T
+        force = np.stack([X, q_S * (c_y + add.get("C_Y", zero)), q_S * (c_z - lift)])
+        lateral = eq.lateral_terms(flow.beta, (p_hat, r_hat), (d_a, d_r), c_z)
+        L = q_S * body.b * (coef("L", lateral) + add.get("C_l", zero)) + add.get("L", zero)
+        N = q_S * body.b * (coef("N", lateral) + add.get("C_n", zero)) + add.get("N", zero)
+        M = q_S * body.c * (coef("M", eq.pitch_terms(c_z, q_hat, d_e, zero)) + add.get("C_m", zero))
+        M = M + flow.T * base.coef["M"][6] + add.get("M", zero)
+        x_cg, y_cg = add.get("x_cg", zero), add.get("y_cg", zero)
+        M, N, L = M + x_cg * force[2], N - x_cg * force[1] + y_cg * force[0], L - y_cg * force[2]
+        f = force / (body.mass * (1.0 + add.get("mass", zero)))
+        return np.concatenate([self._moving(R, f), self._turning(x, (L, M, N)), -v[2:3]]), f, flow.Va
+
+    @staticmethod
+    def _moving(R: np.ndarray, f: np.ndarray) -> np.ndarray:
+        out = np.einsum("ijn,jn->in", R, f)
+        out[2] += G
+        return out
+
+    def _turning(self, x: np.ndarray, moments: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+        (L, M, N), (p, q, r), phi = moments, x[3:6], x[6]
+        theta = np.clip(x[7], -_STEEP, _STEEP)
+        J_x, J_y, J_z, _ = self.base.card.inertia
+        known = float(self.base.card.known)
+        sf, cf = np.sin(phi), np.cos(phi)
+        turn = (q * sf + r * cf) / np.cos(theta)
+        return np.stack(
+            [
+                (L - known * (J_z - J_y) * q * r) / J_x,
+                (M - known * (J_x - J_z) * p * r) / J_y,
+                (N - known * (J_y - J_x) * p * q) / J_z,
+                p + np.sin(theta) * turn,
+                q * cf - r * sf,
+                turn,
+            ]
+        )
+
+
+def _lift(A: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Solve A1 c_z + A2 c_z2 = rest for c_z, the root near zero."""
+    c_z = rest / A[1]
+    for _ in range(3):
+        c_z = c_z - (A[1] * c_z + A[2] * c_z**2 - rest) / (A[1] + 2 * A[2] * c_z)
+    return c_z
+
+
+def _grouped(guesses: Sequence[Sequence[Guess]]) -> list[tuple[list[Guess], np.ndarray]]:
+    """Collect guesses of one effect on one thing over the runs."""
+    groups: dict[str, list[tuple[Guess, int]]] = {}
+    for run, all_ in enumerate(guesses):
+        for guess in all_:
+            if guess.effect.stage in (Stage.AIR, Stage.WRENCH, Stage.MASS):
+                groups.setdefault(f"{guess.effect.stage}:{guess.label}", []).append((guess, run))
+    return [([g for g, _ in group], np.array([run for _, run in group])) for group in groups.values()]
+
+
+def _part(flow: Flow, rows: np.ndarray) -> Flow:
+    return Flow(**{name: x[rows] if isinstance(x, np.ndarray) else x for name, x in flow.__dict__.items()})
