@@ -87,6 +87,8 @@ COLUMNS: dict[str, tuple[tuple[str, str], ...]] = {
     "leg": (("seq", "mission item in force"),),
     "wind": (("w_n", "m/s"), ("w_e", "m/s")),
     "target": (("lat", "1e-7 deg"), ("lon", "1e-7 deg"), ("alt", "mm above mean sea level")),
+    "pressure": (("static", "Pa"),),
+    "gnss": (("alt", "mm above mean sea level, as the receiver says"),),
 }
 """Columns of each `Rows` field of a `Sample`: name and unit, in wire order. Specific force and rates are FRD."""
 UNTOLD = {"command": 2}
@@ -118,6 +120,8 @@ class Sample(Message, frozen=True, kw_only=True):
     leg: Rows | None = None
     wind: Annotated[Rows | None, Meta(description="as the autopilot says, where it blows to [m/s]")] = None
     target: Annotated[Rows | None, Meta(description="the point the autopilot says it steers for")] = None
+    pressure: Annotated[Rows | None, Meta(description="as the barometer says, no estimator in between [Pa]")] = None
+    gnss: Annotated[Rows | None, Meta(description="as the satellite receiver says, no estimator in between")] = None
 
 
 class Link(StrEnum):

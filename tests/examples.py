@@ -34,7 +34,7 @@ UAV, T = 7, 1_700_000_000.25
 
 def _rows(name: str) -> Rows:
     k = len(COLUMNS[name])
-    dtype = "<i4" if name == "position" else "<f4"
+    dtype = "<i4" if name in ("position", "gnss") else "<f4"
     return Rows(t=Array.of([T - 0.1, T], "<f8"), x=Array.of(np.arange(2 * k).reshape(2, k) * 0.5, dtype))
 
 

@@ -53,6 +53,10 @@ CASES: tuple[tuple[str, tuple[Any, ...], str, str, tuple[float, ...]], ...] = (
      (1.0, 0.0, 0.0, 2.5, 3.5, 0.0, -1.5, -35.363261, 149.16523, 58412, 2200), "target", "NTUN", POSITION),
     ("NTUN QfcccfffLLee TimeUS,Dist,TBrg,NavBrg,AltE,XT,XTi,AsE,TLat,TLng,TAlt,TAsp",
      (1.0, 0.0, 0.0, 2.5, 3.5, 0.0, -1.5, -35.363261, 149.16523, 584.12, 22.0), "target", "NTUN", POSITION),
+    ("BARO QBffc TimeUS,I,Alt,Press,Temp", (0, 100.0, 94501.5, 25.0), "pressure", "BARO", (94501.5,)),
+    ("BARO Iffc TimeMS,Alt,Press,Temp", (100.0, 94501.5, 25.0), "pressure", "BARO", (94501.5,)),
+    ("GPS BIHBcLLeeEefI Status,TimeMS,Week,NSats,HDop,Lat,Lng,RelAlt,Alt,Spd,GCrs,VZ,T",
+     (3, 1000, 1871, 9, 1.5, -35.363261, 149.16523, 3.0, 584.12, 2.0, 90.0, -0.5), "gnss", "GPS", POSITION[2:]),
 )  # fmt: skip
 
 

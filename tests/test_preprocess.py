@@ -7,6 +7,7 @@ from flights import T0
 
 from fleet.airframe import servo_map
 from fleet.contract import Array, Rows, Sample
+from fleet.telemetry.dialects.row import HIGHEST
 from twin_worker.history import History
 from twin_worker.preprocess import fill, lagrange, preprocess
 
@@ -30,6 +31,13 @@ def test_rows_come_out_sorted_once_and_finite():
     t, x = history.rows("leg")
     assert (t - T0).tolist() == [0.0, 2.0, 3.0, 4.0]
     assert x[:, 0].tolist() == [0.0, 2.0, 3.0, 4.0]  # the first heard of two rows at one time stays
+
+
+def test_every_kind_has_room_for_what_the_dialects_believe():
+    history = History()
+    for name, highest in HIGHEST.items():
+        history.add(f.sample(**{name: ([T0], [highest])}))
+        assert history.rows(name)[1].tolist() == [list(highest)], name
 
 
 def test_rows_since():

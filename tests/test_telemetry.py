@@ -62,6 +62,46 @@ def test_position_stays_integer_and_velocity_becomes_metres():
     assert got == pytest.approx({"v_n": 12.34, "v_e": -5.67, "v_d": 0.89})
 
 
+def heard(*sent) -> Sample:
+    """What an aircraft's rows are after one heartbeat, one attitude and these."""
+    intake, talker = Intake(), Talker()
+    intake.hear(T0, talker.heartbeat() + talker.attitude(5.0) + b"".join(map(talker.pack, sent)))
+    (sample,) = of(Sample, intake.flush(T0 + 0.1))
+    return sample
+
+
+def highres(pressure: float, flags: int) -> mav.MAVLink_highres_imu_message:
+    return mav.MAVLink_highres_imu_message(5_010_000, 0, 0, -9.5, *[0.0] * 6, pressure, 0.0, 0.0, 0.0, flags)
+
+
+def test_static_pressure_becomes_pascal():
+    got = columns("SCALED_PRESSURE", "pressure", mav.MAVLink_scaled_pressure_message(5010, 945.5, 20.0, 2540))
+    assert got == {"static": 94550.0}
+    assert heard(mav.MAVLink_scaled_pressure_message(5010, 0.0, 20.0, 2540)).pressure is None, "no barometer"
+
+
+@pytest.mark.parametrize(
+    ("pressure", "flags", "told"),
+    [(945.5, 63 | 512, True), (945.5, 63, False), (0.0, 575, False), (math.nan, 575, False)],
+)
+def test_pressure_beside_an_imu_counts_where_it_is_filled(pressure, flags, told):
+    sample = heard(highres(pressure, flags))
+    assert sample.imu is not None
+    assert (sample.pressure.x.numpy().tolist() if sample.pressure else None) == ([[94550.0]] if told else None)
+
+
+@pytest.mark.parametrize("fix_type", range(7))
+def test_the_receivers_height_counts_with_a_fix_in_three_dimensions(fix_type):
+    epoch_us = 1_700_000_000_000_000  # the receiver's own clock must not upset that of the inertial unit
+    sent = mav.MAVLink_gps_raw_int_message(epoch_us, fix_type, -353632610, 1491652301, 584123, 0, 0, 0, 0, 9)
+    sample = heard(highres(0.0, 63), sent, highres(0.0, 63))
+    assert len(sample.imu.t.numpy()) == 1 and sample.imu.t.numpy() == pytest.approx(T0 + 0.01, abs=1e-3)
+    if fix_type < 3:
+        assert sample.gnss is None
+    else:
+        assert sample.gnss.x.dtype == "<i4" and sample.gnss.x.numpy().tolist() == [[584123]]
+
+
 def test_hud_throttle_is_a_share():
     got = columns("VFR_HUD", "air", mav.MAVLink_vfr_hud_message(22.5, 20.0, 90, 55, 100.0, -1.5))
     assert got == pytest.approx({"Va": 22.5, "delta_t": 0.55, "climb": -1.5})

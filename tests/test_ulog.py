@@ -48,6 +48,7 @@ def test_the_sample_has_980_parameters(sample):
 def test_the_sample_has_its_rates(sample):
     rates = {field: (len(t) - 1) / (t[-1] - t[0]) for field, (t, _) in rows(sample).items()}
     expected = {"attitude": 205, "imu": 200, "position": 5.2, "velocity": 5.2, "air": 94, "servo": 10}
+    expected |= {"pressure": 18.35, "gnss": 5.0}
     assert rates == pytest.approx(expected, rel=0.05)
 
 
@@ -246,7 +247,7 @@ def test_the_table_reads_the_columns_of_a_px4_1_13_flight(recordings):
         f"flight3_{name}_0.csv": name for name in ("vehicle_global_position", "airspeed_validated", "airspeed_wind")
     }
     names |= {f"flight3_{n}_0.csv": n for n in ("vehicle_local_position", "actuator_controls_0", "actuator_outputs")}
-    names |= {"flight3_sensor_gps_0.csv": "sensor_gps"}
+    names |= {f"flight3_{name}_0.csv": name for name in ("sensor_gps", "sensor_baro", "vehicle_air_data")}
     topics: dict[str, Topic] = {}
     with tarfile.open(recordings / "real/dawn_seaway_flight3_px4_csv.tar.xz") as tar:
         for member in tar:
@@ -258,9 +259,13 @@ def test_the_table_reads_the_columns_of_a_px4_1_13_flight(recordings):
                 topics[names[member.name.rpartition("/")[2]]] = Topic(fields["timestamp"] * 1e-6, fields, topics)
     best = {field: next((x for x in _all(ROWS[field], topics) if len(x[0])), None) for field in ROWS}
     airborne = {f: v[1][(v[0] > 1140) & (v[0] < 1360)] for f, v in best.items() if v is not None}
-    assert set(airborne) == {"position", "velocity", "air", "wind"}  # outputs are all zero: nothing was driven
+    flown = {"position", "velocity", "air", "wind", "pressure", "gnss"}  # outputs are all zero: nothing was driven
+    assert set(airborne) == flown
     np.testing.assert_allclose(airborne["position"].mean(axis=0)[:2], (423.6e6, -710.9e6), atol=2e5)
     assert 5e3 < airborne["position"][:, 2].mean() < 2e5
+    assert airborne["gnss"].mean() == pytest.approx(airborne["position"][:, 2].mean(), abs=1e4)
+    fused, raw = (np.median(values) for _, values, _ in _all(ROWS["pressure"], topics))
+    assert fused == pytest.approx(raw, abs=100.0)  # one in pascal, the other in millibar
     assert 6 < np.median(airborne["air"][:, 0]) < 15
     assert np.hypot(*airborne["velocity"][:, :2].T).mean() == pytest.approx(np.median(airborne["air"][:, 0]), abs=4)
 

@@ -86,6 +86,8 @@ TRUTH = {
     "leg": (3.0,),
     "wind": (2.0, -1.0),
     "target": (474100000, 85100000, 520000),
+    "pressure": (95500.0,),
+    "gnss": (500000,),
 }
 
 
@@ -128,6 +130,7 @@ def flight(version: tuple[int, int], seconds: float = 5.0) -> dict:
     outputs = [1600.0, 1400.0, 1500.0, 2000.0] + [0.0] * 12
     wind = {"windspeed_north": 2.0, "windspeed_east": -1.0}
     sixteen, fourteen, eleven = version >= (1, 16), version >= (1, 14), version >= (1, 11)
+    barometer = {"pressure": 95500.0 if fourteen else 955.0}
     said = {
         "sensor_combined": {"gyro_rad": rates, "accelerometer_m_s2": acc},
         "vehicle_local_position": local,
@@ -141,7 +144,10 @@ def flight(version: tuple[int, int], seconds: float = 5.0) -> dict:
         "vehicle_attitude_setpoint": {"q_d": quaternion(0.15, 0.05, 0.3)},
         "mission": {"current_seq": ("i4", 3)},
         "vehicle_global_position": place,
+        "sensor_baro": barometer,
     }
+    if version >= (1, 8):
+        said["vehicle_air_data"] = {"baro_pressure_pa": 95500.0}
     if not sixteen:
         said["vehicle_attitude_setpoint"] |= {"roll_body": 0.15, "pitch_body": 0.05}
     if eleven:

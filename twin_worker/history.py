@@ -7,7 +7,7 @@ from fleet.contract import COLUMNS, UNTOLD, Rows, Sample
 _AHEAD_S = 1.0  # rows newer than their message by more are refused [s]
 _CHUNKS = 40  # chunks of one kind before they are joined
 _MOST = 1e5  # values beyond are noise [m/s, rad, us, ...]
-_MOST_POSITION = 2e9  # the same [1e-7 deg, mm]
+_MOST_OF = {"position": 2e9, "target": 2e9, "gnss": 2e9, "pressure": 1e6}  # the same [1e-7 deg, mm, Pa]
 
 
 class History:
@@ -61,8 +61,7 @@ class History:
             return np.empty(0), np.empty((0, len(COLUMNS[name])))
         t = np.concatenate([chunk[0] for chunk in found])
         x = np.concatenate([chunk[1] for chunk in found]).astype(float)
-        most = _MOST_POSITION if name in ("position", "target") else _MOST
-        good = (t >= since) & (np.abs(x[:, : UNTOLD.get(name)]) < most).all(axis=1)  # nan is not
+        good = (t >= since) & (np.abs(x[:, : UNTOLD.get(name)]) < _MOST_OF.get(name, _MOST)).all(axis=1)  # nan is not
         t, x = t[good], x[good]
         if (np.diff(t) > 0).all():
             return t, x

@@ -8,7 +8,7 @@ import numpy as np
 from fleet.contract import COLUMNS, Array, Rows, Sample
 
 MOST_ROWS = 2_000  # rows of one kind in one publication; more is a flood
-_DTYPE = {"position": "<i4", "leg": "<i4", "target": "<i4"}
+_DTYPE = {"position": "<i4", "leg": "<i4", "target": "<i4", "gnss": "<i4"}
 
 
 class _Pile:

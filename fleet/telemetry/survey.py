@@ -34,7 +34,7 @@ class Event(NamedTuple):
 
 
 def _thinned(name: str) -> Thinned:
-    return Thinned(LONGEST_S.get(name, 1.0), MOST, "<f8" if name in ("position", "target") else "<f4")
+    return Thinned(LONGEST_S.get(name, 1.0), MOST, "<f8" if name in ("position", "target", "gnss") else "<f4")
 
 
 @dataclass

@@ -175,6 +175,10 @@ TABLE: tuple[Row, ...] = (
         rank=1,
         when=_has_target,
     ),
+    Row("BARO", "pressure", lambda m: (m.Press,), rank=2, when=lambda m: (m.I == 0) & (m.Press > 0)),
+    Row("BARO", "pressure", lambda m: (m.Press,), rank=1, when=lambda m: m.Press > 0),
+    Row("GPS", "gnss", lambda m: (np.rint(m.Alt * 1e3),), rank=2, when=lambda m: (m.I == 0) & _fix(m)),
+    Row("GPS", "gnss", lambda m: (np.rint(m.Alt * 1e3),), rank=1, when=_fix),
 )
 
 ROWS: dict[str, tuple[Row, ...]] = {

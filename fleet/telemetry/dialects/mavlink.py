@@ -31,6 +31,7 @@ def _servo(m: Any) -> tuple[Any, ...]:
 
 
 _NO_ITEM = 65535
+_FIX_3D = 3
 _NO_FIX_E7 = 100_000  # a kilometre round zero, zero [1e-7 deg]
 
 
@@ -40,6 +41,13 @@ def _has_fix(m: Any) -> Any:
 
 def _somewhere(lat: Any, lon: Any) -> Any:
     return (abs(lat) > _NO_FIX_E7) | (abs(lon) > _NO_FIX_E7)
+
+
+_ABS_PRESSURE = 1 << 9  # HIGHRES_IMU_UPDATED_FLAGS
+
+
+def _measured(m: Any) -> Any:
+    return ((m.fields_updated & _ABS_PRESSURE) != 0) & np.isfinite(m.abs_pressure) & (m.abs_pressure > 0)
 
 
 def _wind(m: Any) -> tuple[Any, ...]:
@@ -105,6 +113,16 @@ TABLE: tuple[Row, ...] = (
         BOOT,
         when=lambda m: ((m.coordinate_frame == 0) | (m.coordinate_frame == 5)) & _somewhere(m.lat_int, m.lon_int),
     ),
+    Row("HIGHRES_IMU", "pressure", lambda m: (m.abs_pressure * 1e2,), USEC, rank=1, when=_measured),
+    Row(
+        "SCALED_PRESSURE",
+        "pressure",
+        lambda m: (m.press_abs * 1e2,),
+        BOOT,
+        when=lambda m: m.press_abs != 0,  # zero: no barometer
+    ),
+    # its time is since boot here, of the receiver there: it would upset the clock that other messages share
+    Row("GPS_RAW_INT", "gnss", lambda m: (m.alt,), NONE, when=lambda m: m.fix_type >= _FIX_3D),
 )
 
 _OWN_TIME = {BOOT: lambda m: m.time_boot_ms * 1e-3, USEC: lambda m: m.time_usec * 1e-6, NONE: lambda m: 0.0}

@@ -36,6 +36,8 @@ HIGHEST: dict[str, tuple[float, ...]] = {
     "leg": (65535.0,),
     "wind": (150.0, 150.0),
     "target": _PLACE,
+    "pressure": (120_000.0,),
+    "gnss": _PLACE[2:],
 }
 """Largest believable magnitude per column, in the units of `contract.COLUMNS`; beyond it (or not finite) is refused."""
 

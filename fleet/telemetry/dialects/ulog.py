@@ -17,6 +17,7 @@ from fleet.telemetry.dialects.row import Row, euler
 DEG = pi / 180  # [rad/deg]
 _NO_FIX_DEG = 0.01  # a kilometre round zero, zero [deg]
 _FIX_3D = 3
+_RAREST_PA = 2_000.0  # at 26 km; no air is 2,000 millibar dense
 _IDLE = 5  # position_setpoint.type: nothing to steer for
 _EARTH_M = 6_371_000.0  # the sphere on which PX4 projects its local frame
 _SHORTEST_US, _LONGEST_US = 700.0, 2300.0  # pulse widths a servo knows
@@ -165,6 +166,17 @@ def _command_row(attitude: Columns, path: str, errors: Columns, rank: int) -> Ro
     return Row("vehicle_attitude_setpoint", "command", columns, rank=rank)
 
 
+# --- pressure and satellites --------------------------------------------------------------------------------------
+
+
+def _baro(m: Any) -> tuple[Any, ...]:
+    return (m.pressure * np.where(m.pressure < _RAREST_PA, 100.0, 1.0),)  # millibar until 1.13
+
+
+def _fix(m: Any) -> Any:
+    return m.fix_type >= _FIX_3D
+
+
 # --- the table ----------------------------------------------------------------------------------------------------
 
 TABLE: tuple[Row, ...] = (
@@ -201,9 +213,9 @@ TABLE: tuple[Row, ...] = (
                 "position",
                 lambda m: _place(m.latitude_deg, m.longitude_deg, m.altitude_msl_m),  # since 1.14
                 rank=rank + 1,
-                when=lambda m: m.fix_type >= _FIX_3D,
+                when=_fix,
             ),
-            Row(topic, "position", lambda m: (m.lat, m.lon, m.alt), rank=rank, when=lambda m: m.fix_type >= _FIX_3D),
+            Row(topic, "position", lambda m: (m.lat, m.lon, m.alt), rank=rank, when=_fix),
         )
     ),
     Row(
@@ -245,6 +257,16 @@ TABLE: tuple[Row, ...] = (
         "target",
         lambda m: _place(m.current.lat, m.current.lon, m.current.alt),
         when=lambda m: (m.current.valid != 0) & (m.current.type != _IDLE) & _somewhere(m.current.lat, m.current.lon),
+    ),
+    Row("vehicle_air_data", "pressure", lambda m: (m.baro_pressure_pa,), rank=2, when=lambda m: m.baro_pressure_pa > 0),
+    Row("sensor_baro", "pressure", _baro, rank=1, when=lambda m: m.pressure > 0),
+    *(
+        row
+        for topic, rank in (("vehicle_gps_position", 3), ("sensor_gps", 1))
+        for row in (
+            Row(topic, "gnss", lambda m: (np.rint(m.altitude_msl_m * 1e3),), rank=rank + 1, when=_fix),  # since 1.14
+            Row(topic, "gnss", lambda m: (m.alt,), rank=rank, when=_fix),
+        )
     ),
 )
 
