@@ -10,6 +10,7 @@ from fleet.telemetry.decode import IDS, Decoder
 from fleet.telemetry.dialects.mavlink import TABLE, own_seconds
 from fleet.telemetry.dialects.row import HIGHEST, believable
 from fleet.telemetry.intake import Intake
+from fleet.telemetry.settle import RANKS, YIELD_S
 
 
 def columns(message: str, field: str, sent, autopilot: str = "ardupilot") -> dict[str, float]:
@@ -28,6 +29,7 @@ def test_every_row_names_a_message_and_fills_its_columns():
         frame = _frame(7, kind, bytes([1]) * kind.unpacker.size)
         fields = Decoder().feed([(T0, None, frame)]).fields(np.array([0]), row.message)
         assert len(row.columns(fields)) == len(COLUMNS[row.field]) == len(HIGHEST[row.field])
+        assert 0 <= row.rank < RANKS and row.given in ("", *COLUMNS)
         assert np.isfinite(own_seconds(row, fields)).all()
 
 
@@ -159,6 +161,66 @@ def test_the_better_imu_wins_and_the_other_returns_after_a_silence():
     intake.hear(T0 + 4.0, raw(9.0))
     (sample,) = of(Sample, intake.flush(T0 + 4.1))
     assert sample.imu.x.numpy()[:, 2] == pytest.approx([-9.5, -9.80665], abs=1e-5)
+
+
+def ground(t: float, v_n: float, *, rounded: bool, lat: int = 474_000_000):
+    """A velocity of one source or the other, for one boot time [s]."""
+    if rounded:
+        return mav.MAVLink_global_position_int_message(
+            round(t * 1e3), lat, lat and 85_000_000, 0, 0, round(v_n * 1e2), 0, 0, 0
+        )
+    return mav.MAVLink_local_position_ned_message(round(t * 1e3), 0.0, 0.0, 0.0, v_n, 0.0, 0.0)
+
+
+def flown(messages) -> tuple[np.ndarray, list[float], int]:
+    """Boot times [s] and north velocities [m/s] made of (boot time, message); and how many rows were rejected."""
+    intake, talker = Intake(), Talker()
+    intake.hear(T0, talker.heartbeat() + talker.attitude(5.0))
+    for t, message in messages:
+        intake.hear(T0 + t - 5.0, talker.pack(message))
+    news = intake.flush(T0 + 20.0)
+    rows = [s.velocity for s in of(Sample, news) if s.velocity is not None]
+    t = np.concatenate([r.t.numpy() for r in rows]) - T0 + 5.0 if rows else np.empty(0)
+    v_n = [float(x) for r in rows for x in r.x.numpy()[:, 0]]
+    return t, v_n, of(Status, news)[-1].rejected
+
+
+@pytest.mark.parametrize(
+    ("rounded_hz", "whole_hz", "whole_wins"), [(5, 10, True), (10, 10, True), (10, 4, False), (5, 1, False)]
+)
+def test_velocity_that_is_not_rounded_wins_unless_it_trickles(rounded_hz, whole_hz, whole_wins):
+    said = [(t, ground(t, 12.346, rounded=True)) for t in 5.0 + np.arange(1, 8 * rounded_hz) / rounded_hz]
+    said += [(t, ground(t, 12.344, rounded=False)) for t in 5.0 + np.arange(1, 8 * whole_hz) / whole_hz]
+    t, v_n, rejected = flown(sorted(said, key=lambda one: one[0]))
+    late = t > 6.5
+    assert np.array(v_n)[late] == pytest.approx(12.344 if whole_wins else 12.35, abs=1e-5)
+    assert np.diff(t[late]) == pytest.approx(1 / (whole_hz if whole_wins else rounded_hz), abs=2e-3)
+    assert np.diff(t).max() < 1 / rounded_hz + 0.01 and rejected == 0
+
+
+def test_velocity_that_ceases_is_taken_from_the_other_source_again():
+    t = 5.0 + np.arange(1, 100) / 10
+    said = [(at, ground(at, 1.0, rounded=True)) for at in t]
+    said += [(at, ground(at, 2.0, rounded=False)) for at in t if at < 8.0]
+    t, v_n, rejected = flown(sorted(said, key=lambda one: one[0]))
+    assert v_n[-1] == 1.0 and 2.0 in v_n and rejected == 0
+    assert t[v_n.index(2.0) + v_n.count(2.0)] == pytest.approx(7.9 + YIELD_S, abs=0.11)
+
+
+@pytest.mark.parametrize("whole", [0.0, math.nan])
+def test_velocity_of_an_estimator_that_has_not_started_is_no_truth(whole):
+    said = [(t, ground(t, whole, rounded=False)) for t in 5.0 + np.arange(1, 30) / 10]
+    said += [(t, ground(t, 3.0, rounded=True)) for t in 5.0 + np.arange(1, 30) / 5]
+    t, v_n, rejected = flown(sorted(said, key=lambda one: one[0]))
+    assert len(t) == 29 and set(v_n) == {3.0} and rejected == 0
+
+
+def test_velocity_without_a_fix_is_not_taken():
+    """Indoors, and before the first fix, there is no place the velocity could belong to."""
+    said = [(t, ground(t, 0.5, rounded=False)) for t in 5.0 + np.arange(1, 100) / 10]
+    said += [(t, ground(t, 0.5, rounded=True, lat=0)) for t in 5.0 + np.arange(1, 100) / 10]
+    t, _, rejected = flown(sorted(said, key=lambda one: one[0]))
+    assert len(t) == 0 and rejected == 0
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30])

@@ -13,7 +13,7 @@ from fleet.telemetry.dialects.row import Row
 from fleet.telemetry.onboard_log import Said
 from fleet.telemetry.params import ParamBook
 from fleet.telemetry.route import MESSAGES, RouteBook
-from fleet.telemetry.settle import FIELDS, KEPT, REFUSED, Memory, settle
+from fleet.telemetry.settle import FIELDS, KEPT, NO_FIELD, REFUSED, Memory, settle
 from fleet.telemetry.shelf import Shelf
 
 LOST_S = 3.0  # silence after which the link is called lost [s]
@@ -88,10 +88,10 @@ class Craft:
 
     def lay(self, laid: Laid) -> None:
         """Take rows: give them their time, put them in order."""
-        ticks, ranks, fields = (np.array(part) for part in zip(*map(_codes, laid.rows), strict=True))
+        ticks, ranks, fields, given = (np.array(part) for part in zip(*map(_codes, laid.rows), strict=True))
         n, memory = len(laid.row), self._memory
         t, fate, field = np.empty(n), np.empty(n, np.int8), fields[laid.row]
-        order = (ticks[laid.row], laid.raw_s, laid.arrival, field, ranks[laid.row])
+        order = (ticks[laid.row], laid.raw_s, laid.arrival, field, ranks[laid.row], given[laid.row])
         jumped = settle(memory.clocks, memory.fields, *order, t, fate)
         for number in np.unique(field[fate == KEPT]).tolist():
             which = (field == number) & (fate == KEPT)
@@ -236,5 +236,5 @@ class Craft:
         return self._sentence if now - self._said < REMEMBER_S else ""
 
 
-def _codes(row: Row) -> tuple[int, int, int]:
-    return row.tick, row.rank, FIELDS.index(row.field)
+def _codes(row: Row) -> tuple[int, int, int, int]:
+    return row.tick, row.rank, FIELDS.index(row.field), FIELDS.index(row.given) if row.given else NO_FIELD

@@ -46,6 +46,11 @@ def _somewhere(lat: Any, lon: Any) -> Any:
 _ABS_PRESSURE = 1 << 9  # HIGHRES_IMU_UPDATED_FLAGS
 
 
+def _started(m: Any) -> Any:
+    """Tell where there is a velocity: an estimator that has none says zero to the last digit, or not a number."""
+    return np.isfinite(m.vx + m.vy + m.vz) & ((m.vx != 0) | (m.vy != 0) | (m.vz != 0))
+
+
 def _measured(m: Any) -> Any:
     return ((m.fields_updated & _ABS_PRESSURE) != 0) & np.isfinite(m.abs_pressure) & (m.abs_pressure > 0)
 
@@ -71,6 +76,15 @@ TABLE: tuple[Row, ...] = (
         lambda m: (m.vx * 1e-2, m.vy * 1e-2, m.vz * 1e-2),
         BOOT,
         when=_has_fix,
+    ),
+    Row(
+        "LOCAL_POSITION_NED",  # the same estimator without rounding, and often faster
+        "velocity",
+        lambda m: (m.vx, m.vy, m.vz),
+        BOOT,
+        rank=1,
+        when=_started,
+        given="position",  # without a fix PX4 sends what drifts, in a frame that need not face north
     ),
     Row("VFR_HUD", "air", lambda m: (m.airspeed, m.throttle * 1e-2, m.climb), NONE),
     Row("SERVO_OUTPUT_RAW", "servo", _servo, USEC32, when=lambda m: m.port == 0),

@@ -18,9 +18,10 @@ class Row(NamedTuple):
     field: str  # field of `Sample`; columns as in `contract.COLUMNS`
     columns: Callable[[Any], tuple[Any, ...]]
     tick: int = 0  # MAVLink: the clock its time comes from, BOOT, USEC, USEC32 or NONE of `telemetry.clock`
-    rank: int = 0  # among rows of one field the highest rank that flows wins
+    rank: int = 0  # among rows of one field the highest rank that flows wins; in MAVLink's table below `settle.RANKS`
     autopilots: tuple[str, ...] = ()  # empty: any
     when: Callable[[Any], Any] | None = None  # which messages of that name count
+    given: str = ""  # MAVLink: it counts only while rows of this field flow
 
 
 _RATES = (100.0,) * 3  # [rad/s]
