@@ -89,6 +89,7 @@ COLUMNS: dict[str, tuple[tuple[str, str], ...]] = {
     "target": (("lat", "1e-7 deg"), ("lon", "1e-7 deg"), ("alt", "mm above mean sea level")),
     "pressure": (("static", "Pa"),),
     "gnss": (("alt", "mm above mean sea level, as the receiver says"),),
+    "height": (("above_home", "m"),),
 }
 """Columns of each `Rows` field of a `Sample`: name and unit, in wire order. Specific force and rates are FRD."""
 UNTOLD = {"command": 2}
@@ -122,6 +123,7 @@ class Sample(Message, frozen=True, kw_only=True):
     target: Annotated[Rows | None, Meta(description="the point the autopilot says it steers for")] = None
     pressure: Annotated[Rows | None, Meta(description="as the barometer says, no estimator in between [Pa]")] = None
     gnss: Annotated[Rows | None, Meta(description="as the satellite receiver says, no estimator in between")] = None
+    height: Annotated[Rows | None, Meta(description="above home, as the autopilot says [m]")] = None
 
 
 class Link(StrEnum):

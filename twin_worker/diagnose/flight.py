@@ -33,7 +33,7 @@ class Flight:
         readings: by the names in `fleet.effects.READINGS`, (n,) each; psi unwrapped
         commands: delta_a delta_e delta_r delta_t as commanded, (n, 4) [-]
         place: north and east from the first position, (n, 2) [m]
-        ground: height of the ground at the start [m]
+        ground: height of home above mean sea level [m]
         ok: trusted, (n,) bool
         vane: the accelerometer is fast enough to be the vane
         lacks: what power is lost for want of data, in sentences
@@ -112,7 +112,7 @@ def lay(name: str, history: History, params: dict[str, float], card: Card) -> Fl
     horizontal = np.column_stack([np.interp(t, t_p - zero, ned[:, i]) for i in (0, 1)])
     commands = card.commands(_on(t, rows["servo"], zero), params)
     commands[:, 3] = np.clip(commands[:, 3], 0.0, 1.0)
-    ground = float(readings["h"][0])
+    ground = _ground(history, readings["h"], t, zero)
     ok = _trusted(rows, readings, t, zero, ground)
     flight = Flight(name, t, zero, readings, commands, horizontal, ground, ok, vane, tuple(lacks))
     if flight.seconds < _LEAST_S:
@@ -152,7 +152,7 @@ def _readings(
         out["Va"] = np.interp(t, air_t - zero, air[:, 0])
     else:
         lacks.append("no airspeed: wind, air density and the airspeed sensor cannot be told apart, nor wind from none")
-    pressure_t, pressure = history.rows("pressure") if _has(history, "pressure") else (np.empty(0), np.empty((0, 1)))
+    pressure_t, pressure = history.rows("pressure")
     if len(pressure_t) > 20:
         height = (1.0 - (np.clip(pressure[:, 0], 2e4, 1.2e5) / _SEA_LEVEL) ** (1 / _POWER)) / _LAPSE
         out["baro"] = np.interp(t, pressure_t - zero, height)
@@ -161,10 +161,12 @@ def _readings(
     return out, vane
 
 
-def _has(history: History, kind: str) -> bool:
-    from fleet.contract import COLUMNS
-
-    return kind in COLUMNS
+def _ground(history: History, h: np.ndarray, t: np.ndarray, zero: float) -> float:
+    """Give the height of home above mean sea level, else the least height flown [m]."""
+    at, above = history.rows("height")
+    if len(at) < 50:
+        return float(h.min())
+    return float(np.median(h - np.interp(t, at - zero, above[:, 0])))
 
 
 def _trusted(

@@ -128,6 +128,7 @@ TABLE: tuple[Row, ...] = (
         when=lambda m: ((m.coordinate_frame == 0) | (m.coordinate_frame == 5)) & _somewhere(m.lat_int, m.lon_int),
     ),
     Row("HIGHRES_IMU", "pressure", lambda m: (m.abs_pressure * 1e2,), USEC, rank=1, when=_measured),
+    Row("GLOBAL_POSITION_INT", "height", lambda m: (m.relative_alt * 1e-3,), BOOT, when=_has_fix),
     Row(
         "SCALED_PRESSURE",
         "pressure",

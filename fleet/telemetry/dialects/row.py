@@ -39,6 +39,7 @@ HIGHEST: dict[str, tuple[float, ...]] = {
     "target": _PLACE,
     "pressure": (120_000.0,),
     "gnss": _PLACE[2:],
+    "height": (9e4,),
 }
 """Largest believable magnitude per column, in the units of `contract.COLUMNS`; beyond it (or not finite) is refused."""
 
