@@ -1,0 +1,29 @@
+"""An accelerometer that reads a force where there is none: temperature, a mount under stress."""
+
+from typing import Any
+
+from fleet.effects import Effect, Onset, Parameter, Stage
+
+
+def act(readings: dict[str, Any], bias: Any, of: str = "x") -> dict[str, Any]:
+    """Add the bias to one axis."""
+    return {f"a_{of}": readings[f"a_{of}"] + bias}
+
+
+EFFECT = Effect(
+    name="accel_bias",
+    stage=Stage.SENSOR,
+    channel="accel",
+    equation="f_reported = f + bias",
+    source="Beard & McLain 2012, section 7.1 (accelerometers)",
+    parameters=(Parameter("bias_mps2", "m/s2", "specific force added", step=0.1, low=-5.0, high=5.0),),
+    act=act,
+    onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
+    of=("x", "y", "z"),
+    examples=((0.2,), (-0.4,), (0.8,)),
+    confused={
+        "imu_misalignment": "turns with what is felt: fly turns and pull-ups",
+        "mass_change": "follows the load, and leaves what the velocity says: fly turns",
+        "drag_increase": "slows the aircraft, a bias only says so",
+    },
+)

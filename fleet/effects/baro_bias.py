@@ -1,0 +1,24 @@
+"""A height by static pressure that is off: a blocked port, a wrong pressure setting, weather that moved on."""
+
+from typing import Any
+
+from fleet.effects import Effect, Onset, Parameter, Stage
+
+
+def act(readings: dict[str, Any], bias: Any) -> dict[str, Any]:
+    """Add the bias."""
+    return {"baro": readings["baro"] + bias}
+
+
+EFFECT = Effect(
+    name="baro_bias",
+    stage=Stage.SENSOR,
+    channel="baro",
+    equation="h_reported = h + bias",
+    source="Beard & McLain 2012, section 7.3 (absolute pressure)",
+    parameters=(Parameter("bias_m", "m", "height added", step=2.0, low=-300.0, high=300.0),),
+    act=act,
+    onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
+    examples=((5.0,), (-12.0,), (30.0,)),
+    confused={"gps_latency": "vanishes in level flight", "air_density": "shows in airspeed and moments too"},
+)

@@ -1,0 +1,29 @@
+"""A battery that empties: thrust at the same throttle falls with the charge used."""
+
+from typing import Any
+
+from fleet.effects import Effect, Flow, Onset, Parameter, Stage
+
+
+def act(flow: Flow, sag: Any) -> dict[str, Any]:
+    """Lessen thrust by what was used."""
+    return {"thrust": -sag * flow.used / 100.0}
+
+
+EFFECT = Effect(
+    name="battery_sag",
+    stage=Stage.WRENCH,
+    channel="thrust",
+    equation="T = (1 - sag used / 100 s) T_full, used = integral of delta_t",
+    source="Traub 2011, J. Aircraft 48(2) (discharge of batteries), to first order",
+    parameters=(
+        Parameter("sag_per_100s", "-", "share of thrust lost in 100 s of full throttle", step=0.03, low=-0.1, high=1.0),
+    ),
+    act=act,
+    onsets=(Onset.ALWAYS,),
+    examples=((0.05,), (0.1,), (0.2,)),
+    confused={
+        "thrust_loss": "comes at once or with time, not with the charge used",
+        "drag_increase": "drag grows with dynamic pressure, not with the charge used",
+    },
+)

@@ -1,0 +1,27 @@
+"""A centre of gravity moved forward or aft: a payload that slid, a tank that emptied."""
+
+from typing import Any
+
+from fleet.effects import Effect, Flow, Parameter, Stage
+
+
+def act(flow: Flow, dx: Any) -> dict[str, Any]:
+    """Move the centre of gravity forward."""
+    return {"x_cg": dx}
+
+
+EFFECT = Effect(
+    name="cg_shift",
+    stage=Stage.MASS,
+    channel="pitch",
+    equation="M = M_0 + dx Z, N = N_0 - dx Y",
+    source="Stevens, Lewis & Johnson 2016, section 2.4 (moments about another point)",
+    parameters=(Parameter("dx_m", "m", "moved forward", step=0.01, low=-0.5, high=0.5),),
+    act=act,
+    examples=((0.01,), (-0.03,), (0.06,)),
+    confused={
+        "mass_change": "shows in lift too; what drops out often does both: fly pull-ups",
+        "actuator_offset": "an offset of the elevator grows with dynamic pressure: fly at two speeds",
+        "slipstream_tail": "follows the throttle",
+    },
+)

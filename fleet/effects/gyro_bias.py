@@ -1,0 +1,33 @@
+"""A gyro that reads a rate where there is none: temperature, vibration, a start while moving."""
+
+from typing import Any
+
+import numpy as np
+
+from fleet.effects import Body, Effect, Onset, Parameter, Stage
+
+
+def act(readings: dict[str, Any], bias: Any, of: str = "p") -> dict[str, Any]:
+    """Add the bias to one axis."""
+    return {of: readings[of] + bias}
+
+
+def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
+    """Give degrees per second."""
+    return {"bias_dps": float(np.degrees(par[0]))}
+
+
+EFFECT = Effect(
+    name="gyro_bias",
+    stage=Stage.SENSOR,
+    channel="gyro",
+    equation="omega_reported = omega + bias",
+    source="Beard & McLain 2012, section 7.2 (rate gyros)",
+    parameters=(Parameter("bias", "rad/s", "rate added", step=0.005, low=-0.3, high=0.3),),
+    act=act,
+    told=told,
+    onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
+    of=("p", "q", "r"),
+    examples=((0.01,), (-0.02,), (0.05,)),
+    confused={"imu_misalignment": "vanishes without turning", "heading_bias": "a constant angle, not a rate"},
+)

@@ -1,0 +1,36 @@
+"""A compass that points beside north: iron near by, a current, a declination set wrong."""
+
+from typing import Any
+
+import numpy as np
+
+from fleet.effects import Body, Effect, Onset, Parameter, Stage
+
+
+def act(readings: dict[str, Any], bias: Any) -> dict[str, Any]:
+    """Add the bias."""
+    return {"psi": readings["psi"] + bias}
+
+
+def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
+    """Give degrees."""
+    return {"bias_deg": float(np.degrees(par[0]))}
+
+
+EFFECT = Effect(
+    name="heading_bias",
+    stage=Stage.SENSOR,
+    channel="heading",
+    equation="psi_reported = psi + bias",
+    source="Beard & McLain 2012, section 7.4 (digital compasses)",
+    parameters=(Parameter("bias", "rad", "heading added", step=0.02, low=-1.0, high=1.0),),
+    act=act,
+    told=told,
+    onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
+    examples=((0.05,), (-0.12,), (0.25,)),
+    confused={
+        "wind_steady": "wind keeps its direction over ground, a wrong compass turns along: fly a full turn",
+        "actuator_offset": "true sideslip is felt sideways, a wrong compass is not",
+        "gyro_bias": "a rate, not a constant angle",
+    },
+)

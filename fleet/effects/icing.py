@@ -1,0 +1,32 @@
+"""Ice on the wing: lift lost by a share, and drag added, more and more of both."""
+
+from typing import Any
+
+from fleet.effects import Effect, Flow, Onset, Parameter, Stage
+
+
+def act(flow: Flow, lift_loss: Any, dCD: Any) -> dict[str, Any]:
+    """Take lift, add drag."""
+    return {"lift": -lift_loss, "C_D": dCD}
+
+
+EFFECT = Effect(
+    name="icing",
+    stage=Stage.WRENCH,
+    channel="lift",
+    equation="C_L = (1 - lift_loss) C_L_clean, C_D = C_D_clean + dCD",
+    source="Bragg, Broeren & Blumenthal 2005, Progress in Aerospace Sciences 41 (iced airfoils)",
+    parameters=(
+        Parameter("lift_loss", "-", "share of lift lost", step=0.03, low=-0.1, high=0.7),
+        Parameter("dCD", "-", "drag coefficient added", step=0.005, low=-0.02, high=0.3),
+    ),
+    act=act,
+    onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
+    examples=((0.06, 0.01), (0.12, 0.02), (0.2, 0.04)),
+    confused={
+        "drag_increase": "without a loss of lift: look at the angle of attack",
+        "air_density": "thin air takes moments along",
+        "mass_change": "more weight takes no more drag at the same lift",
+        "flap_deployed": "a flap adds lift and pitches",
+    },
+)

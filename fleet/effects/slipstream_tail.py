@@ -1,0 +1,33 @@
+"""The propeller blows on the tail: elevator and rudder do more the more thrust there is."""
+
+from typing import Any
+
+import numpy as np
+
+from fleet.effects import Effect, Flow, Parameter, Stage
+
+SLOW = 20.0  # dynamic pressure below which momentum theory is not believed [Pa]
+MILLING = -0.5  # a windmilling propeller cannot take more than this from the flow
+
+
+def act(flow: Flow, share: Any) -> dict[str, Any]:
+    """Let the surfaces' moments grow with the dynamic pressure the propeller adds."""
+    disc = np.pi * flow.body.D**2 / 4.0
+    jet = share * np.maximum(flow.T / (np.maximum(flow.q_bar, SLOW) * disc), MILLING)
+    return {"C_m": flow.pitch * jet, "C_n": flow.yaw * jet}
+
+
+EFFECT = Effect(
+    name="slipstream_tail",
+    stage=Stage.WRENCH,
+    channel="pitch",
+    equation="C_m = (1 + share T / (q_bar A)) C_m_delta_e delta_e, C_n alike by rudder, A = pi D^2 / 4",
+    source="McCormick 1995, chapter 6 (momentum theory); Selig 2014, J. Aircraft 51(6) (surfaces in the slipstream)",
+    parameters=(Parameter("share", "-", "share of the tail in the slipstream", step=0.1, low=-1.0, high=3.0),),
+    act=act,
+    examples=((0.3,), (0.6,), (1.0,)),
+    confused={
+        "control_effectiveness_loss": "does not follow the throttle: fly inputs at two powers",
+        "cg_shift": "does not follow the throttle",
+    },
+)

@@ -1,0 +1,38 @@
+"""Flow that separates: above some angle of attack the wing lifts less than its slope says, and drags more."""
+
+from typing import Any
+
+import numpy as np
+
+from fleet.effects import Effect, Flow, Onset, Parameter, Stage
+
+BREAKS = {f"{angle} deg": np.radians(angle) for angle in (8, 10, 12, 14)}  # alpha_s
+
+
+def act(flow: Flow, slope_lost: Any, drag_slope: Any, of: str = "12 deg") -> dict[str, Any]:
+    """Take lift and add drag in proportion to the angle beyond the break."""
+    over = np.maximum(flow.alpha - BREAKS[of], 0.0)
+    return {"C_L": -slope_lost * over, "C_D": drag_slope * over}
+
+
+EFFECT = Effect(
+    name="stall",
+    stage=Stage.WRENCH,
+    channel="lift",
+    equation="over = max(alpha - alpha_s, 0), C_L = C_L_clean - slope_lost over, C_D = C_D_clean + drag_slope over",
+    source="Beard & McLain 2012, eq. 4.9 (lift beyond the stall), here with straight lines",
+    parameters=(
+        Parameter("slope_lost_per_rad", "1/rad", "lift slope lost beyond the break", step=0.5, low=0.0, high=15.0),
+        Parameter("drag_slope_per_rad", "1/rad", "drag slope gained beyond the break", step=0.2, low=0.0, high=5.0),
+    ),
+    act=act,
+    onsets=(Onset.ALWAYS,),
+    of=tuple(BREAKS),
+    starts=((2.0, 0.5), (5.0, 1.0), (8.0, 2.0)),
+    examples=((1.5, 0.3), (3.0, 0.8), (5.0, 1.5)),
+    confused={
+        "drag_increase": "drag at every angle of attack",
+        "icing": "lift lost at every angle of attack",
+        "mass_change": "more weight at every angle of attack",
+    },
+)

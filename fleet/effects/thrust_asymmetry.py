@@ -1,0 +1,27 @@
+"""Thrust beside the middle: one of two engines weaker, a mount that is bent."""
+
+from typing import Any
+
+from fleet.effects import Effect, Flow, Parameter, Stage
+
+
+def act(flow: Flow, arm: Any) -> dict[str, Any]:
+    """Add the yawing moment of thrust on an arm."""
+    return {"N": arm * flow.T}
+
+
+EFFECT = Effect(
+    name="thrust_asymmetry",
+    stage=Stage.WRENCH,
+    channel="yaw",
+    equation="N = arm T",
+    source="Stevens, Lewis & Johnson 2016, section 2.5 (moments of thrust); Etkin & Reid 1996, section 3.5",
+    parameters=(Parameter("arm_m", "m", "thrust line left of the centre of gravity", step=0.02, low=-3.0, high=3.0),),
+    act=act,
+    examples=((0.03,), (-0.08,), (0.2,)),
+    confused={
+        "p_factor": "follows the angle of attack: fly slow and fast at one power",
+        "actuator_offset": "an offset of the rudder does not follow the throttle",
+        "thrust_loss": "without a moment",
+    },
+)

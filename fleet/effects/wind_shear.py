@@ -1,0 +1,41 @@
+"""A wind that changes with height: calm at 100 m, where a mean wind is given, and stronger away from it."""
+
+from typing import Any
+
+import numpy as np
+
+from fleet.effects import Body, Effect, Flow, Onset, Parameter, Stage
+
+REFERENCE = 100.0  # height at which it is nothing, so that a mean wind is not counted twice [m]
+
+
+def act(flow: Flow, w_n: Any, w_e: Any) -> dict[str, Any]:
+    """Add wind in proportion to height."""
+    up = (flow.height - REFERENCE) / 100.0
+    return {"w_n": w_n * up, "w_e": w_e * up}
+
+
+def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
+    """Give the change every 100 m, and where what is added higher up blows from."""
+    w_n, w_e = map(float, par[:2])
+    return {"mps_per_100m": float(np.hypot(w_n, w_e)), "from_deg": float(np.degrees(np.arctan2(-w_e, -w_n)) % 360.0)}
+
+
+EFFECT = Effect(
+    name="wind_shear",
+    stage=Stage.AIR,
+    channel="air",
+    equation="w = w_100 (height - 100 m) / 100 m",
+    source="MIL-F-8785C 1980, section 3.7.3 (wind shear), to first order about 100 m",
+    parameters=(
+        Parameter("w_n", "m/s", "wind to the north gained in 100 m of height", step=0.5, low=-20.0, high=20.0),
+        Parameter("w_e", "m/s", "wind to the east gained in 100 m of height", step=0.5, low=-20.0, high=20.0),
+    ),
+    act=act,
+    told=told,
+    onsets=(Onset.ALWAYS,),
+    examples=((1.5, -1.0), (0.7, -4.0), (5.0, 4.0)),
+    confused={
+        "wind_steady": "a mean wind is the same at every height: climb and descend",
+    },
+)
