@@ -25,7 +25,7 @@ EFFECT = Effect(
     name="wind_shear",
     stage=Stage.AIR,
     channel="air",
-    equation="w = w_100 (height - 100 m) / 100 m",
+    equation="w = w_per_100m (height - 100 m) / 100 m",
     source="MIL-F-8785C 1980, section 3.7.3 (wind shear), to first order about 100 m",
     parameters=(
         Parameter("w_n", "m/s", "wind to the north gained in 100 m of height", step=0.5, low=-20.0, high=20.0),
