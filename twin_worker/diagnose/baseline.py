@@ -1,6 +1,6 @@
 """The calibrated simulation: coefficients of every equation, timing, noise, spread from flight to flight."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -59,6 +59,7 @@ class Baseline:
         noise: of the residuals
         spread: nuisance -> how much it varies from flight to flight, in its own unit
         chance: guess and kind of onset -> gain that nominal flights left out reach
+        others: coefficients with each nominal flight left out, less those of all: how far they may be trusted
         usual: mean square of each whitened residual on nominal flights, (c,)
         flights: names of the nominal flights
     """
@@ -73,5 +74,11 @@ class Baseline:
     noise: Noise = field(default_factory=no_noise)
     spread: dict[str, float] = field(default_factory=dict)
     chance: dict[str, float] = field(default_factory=dict)
+    others: tuple[dict[str, np.ndarray], ...] = ()
     usual: np.ndarray = field(default_factory=lambda: np.ones(len(CHANNELS)))
     flights: tuple[str, ...] = ()
+
+    def varied(self, k: int, by: float = 1.0) -> "Baseline":
+        """Give the baseline with its coefficients moved towards those of the k-th left out."""
+        coef = {name: x + by * self.others[k][name] for name, x in self.coef.items()}
+        return replace(self, coef=coef)

@@ -10,7 +10,7 @@ from twin_worker.diagnose.card import Card
 from twin_worker.diagnose.fit import fit, fit_timing, fit_wind, wind
 from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.guess import Guess
-from twin_worker.diagnose.nuisance import nuisances
+from twin_worker.diagnose.nuisance import WIDEST, nuisances
 from twin_worker.diagnose.residual import Case
 from twin_worker.diagnose.decide import best
 from twin_worker.diagnose.sight import Sight, is_weather
@@ -43,6 +43,8 @@ def calibrate(flights: Sequence[Flight], card: Card, say: Say = lambda word: Non
     parts = list(flights) if len(flights) > 1 else halves(flights[0])
     left = [fit([f for f in parts if f is not one], card, timing, vane)[0] for one in parts]
     cases = [Case(one, without) for one, without in zip(parts, left, strict=True)]
+    others = tuple({name: b.coef[name] - x for name, x in base.coef.items()} for b in left)
+    base = replace(base, others=others)
     base = _with_noise(base, cases)
     cases = [replaced(case, base) for case in cases]
     say("what nominal flights reach by chance")
@@ -64,7 +66,7 @@ def halves(flight: Flight) -> list[Flight]:
 
 def replaced(case: Case, base: Baseline) -> Case:
     """Give a case with the noise and spread of another baseline."""
-    own = replace(case.base, noise=base.noise, spread=base.spread, usual=base.usual, chance=base.chance)
+    own = replace(case.base, noise=base.noise, spread=base.spread, usual=base.usual, chance=base.chance, others=base.others)
     return Case(case.flight, own)
 
 
@@ -114,7 +116,7 @@ def _spreads(
         inverse = [np.linalg.inv(A + np.diag(spread**-2.0)) for A, _ in parts]
         means = [P @ b for P, (_, b) in zip(inverse, parts, strict=True)]
         spread = np.sqrt(np.mean([m * m + np.diag(P) for m, P in zip(means, inverse, strict=True)], axis=0))
-        spread = np.maximum(spread, floors)
+        spread = np.clip(spread, floors, WIDEST * floors)
     return spread, means
 
 

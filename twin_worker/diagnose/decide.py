@@ -88,10 +88,12 @@ def tie(sight: Sight, found: Found) -> float:
 def choose(sight: Sight, found: list[Found]) -> Named:
     """Choose the guess of fewest numbers among the best that tie; the others are its rivals."""
     first = found[0]
-    close = [one for one in found if rank(sight, one) > rank(sight, first) - tie(sight, first)]
-    chosen = min(close, key=lambda one: (one.guess.size, -rank(sight, one)))
+    near = [one for one in found if rank(sight, one) > rank(sight, first) - max(_LEAST_TIE, _FINE * first.gain)]
+    chosen = min(near, key=lambda one: (one.guess.size, -rank(sight, one)))
     rivals: dict[str, Found] = {}
-    for one in close:
+    for one in found:
+        if rank(sight, one) < rank(sight, first) - tie(sight, first):
+            continue
         if one.guess.effect.name != chosen.guess.effect.name:
             rivals.setdefault(one.guess.effect.name, one)
     return Named(chosen, tuple(rivals.values()))

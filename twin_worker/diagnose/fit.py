@@ -13,8 +13,8 @@ from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.residual import RHO_0, Case, Terms
 
-_RIDGE = 1e-3  # pull of a coefficient towards zero, as a share of its term's length
-_RIDGE_FLOW = 2e-2  # the same of the flow angles, whose terms are nearly parallel
+_RIDGE = 3e-4  # pull of a coefficient towards zero, as a share of its term's length
+_ORDER, _WHITENINGS = 3, 5  # of the residuals' autoregression; rounds
 _ROUNDS = 2
 _SHEAR = 1.0  # usual growth of wind with height [m/s per 100 m]
 _CORRELATED = 50.0  # residual rows that count as one
@@ -42,7 +42,7 @@ def fit(flights: Sequence[Flight], card: Card, timing: Timing, vane: bool) -> tu
         winds = [fit_wind(case, w) for case, w in zip(cases, winds, strict=True)]
         made = [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)]
         base = replace(base, airspeed=_airspeed(cases, made))
-        flow = {name: _solve(*_stack(cases, made, name), _RIDGE_FLOW) for name in ("alpha", "beta")}
+        flow = {name: _solve(_Rows(cases, made, name), 0)[0] for name in ("alpha", "beta")}
         base = replace(base, coef=flow)
         cases = [Case(flight, base) for flight in flights]
         base = _moments(cases, [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)], base)
@@ -52,42 +52,64 @@ def fit(flights: Sequence[Flight], card: Card, timing: Timing, vane: bool) -> tu
 def _moments(cases: list[Case], made: list[Terms], base: Baseline) -> Baseline:
     """Fit forces and moments, the flow angles given."""
     coef, r2 = dict(base.coef), {}
-    y, A = _stack(cases, made, "X", more=lambda m: m.terms["T"])[::-1]
-    both = _solve(A, y, _RIDGE)
+    both, r2["X"] = _solve(_Rows(cases, made, "X", more=lambda m: m.terms["T"]), 0)
     coef["X"], coef["T"] = both[: len(eq.X)], both[len(eq.X) :]
-    r2["X"] = _r2(A @ both, y)
-    A, y = _stack(cases, made, "M", more=lambda m: (coef["T"] @ m.terms["T"])[None])
-    coef["M"] = _solve(A, y, _RIDGE)
-    r2["M"] = _r2(A @ coef["M"], y)
+    coef["M"], r2["M"] = _solve(_Rows(cases, made, "M", more=lambda m: (coef["T"] @ m.terms["T"])[None]))
     for name in ("L", "N", "alpha", "beta"):
-        A, y = _stack(cases, made, name)
-        coef[name] = coef[name] if name in coef else _solve(A, y, _RIDGE)
-        r2[name] = _r2(A @ coef[name], y)
+        found, r2[name] = _solve(_Rows(cases, made, name), 0 if name in coef else _WHITENINGS)
+        coef.setdefault(name, found)
     return replace(base, coef=coef, r2=r2)
 
 
-def _stack(
-    cases: list[Case], made: list[Terms], name: str, more: Callable[[Terms], np.ndarray] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Stack terms, dimensional, (n, k), and the measured side, (n,), over all flights' trusted rows."""
-    A, y = [], []
-    for case, m in zip(cases, made, strict=True):
-        rows = m.terms[name] * m.scale.get(name, 1.0)
-        rows = rows if more is None else np.concatenate([rows, more(m)])
-        A.append(rows[:, case.ok].T)
-        y.append(m.measured[name][case.ok])
-    return np.concatenate(A), np.concatenate(y)
+class _Rows:
+    """An equation's terms, dimensional, (n, k), and its measured side, (n,), over all flights; and which follow trusted ones."""
+
+    def __init__(
+        self, cases: list[Case], made: list[Terms], name: str, more: Callable[[Terms], np.ndarray] | None = None
+    ) -> None:
+        A, y, ok, whole = [], [], [], []
+        for case, m in zip(cases, made, strict=True):
+            rows = m.terms[name] * m.scale.get(name, 1.0)
+            A.append((rows if more is None else np.concatenate([rows, more(m)])).T)
+            y.append(m.measured[name])
+            ok.append(case.ok)
+            good = case.ok.copy()
+            for k in range(1, _ORDER + 1):
+                good[k:] &= case.ok[:-k]
+            good[:_ORDER] = False
+            whole.append(good)
+        self.A, self.y = np.concatenate(A), np.concatenate(y)
+        self.ok, self.whole = np.concatenate(ok), np.concatenate(whole)
 
 
-def _solve(A: np.ndarray, y: np.ndarray, ridge: float) -> np.ndarray:
+def _solve(rows: _Rows, whitenings: int = _WHITENINGS) -> tuple[np.ndarray, float]:
+    """Solve by generalised least squares; give coefficients and the share of variance explained.
+
+    The residuals of a flight in gusts, under an autopilot that answers them, are coloured, and plain least squares
+    shrinks the derivatives: both sides are filtered by the residuals' own autoregression until that stays.
+    Source: Clarke 1967 (generalised least squares); Klein & Morelli 2006, section 5.2.
+    """
+    x = _ridge(rows.A[rows.ok], rows.y[rows.ok])
+    fitted = rows.A[rows.ok] @ x
+    y = rows.y[rows.ok]
+    r2 = float(1.0 - ((y - fitted) ** 2).sum() / max(((y - y.mean()) ** 2).sum(), 1e-12))
+    for _ in range(whitenings):
+        e = rows.y - rows.A @ x
+        lags = np.stack([np.roll(e, k) for k in range(1, _ORDER + 1)], axis=1)
+        ar = np.linalg.lstsq(lags[rows.whole], e[rows.whole], rcond=None)[0]
+
+        def white(z: np.ndarray, ar: np.ndarray = ar) -> np.ndarray:
+            return z - sum(a * np.roll(z, k + 1, axis=0) for k, a in enumerate(ar))  # type: ignore[no-any-return]
+
+        x = _ridge(white(rows.A)[rows.whole], white(rows.y)[rows.whole])
+    return x, r2
+
+
+def _ridge(A: np.ndarray, y: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(A, axis=0) + 1e-12
     k = A.shape[1]
-    stacked = np.vstack([A / length, ridge * np.eye(k)])
+    stacked = np.vstack([A / length, _RIDGE * np.eye(k)])
     return np.linalg.lstsq(stacked, np.concatenate([y, np.zeros(k)]), rcond=None)[0] / length
-
-
-def _r2(fitted: np.ndarray, y: np.ndarray) -> float:
-    return float(1.0 - ((y - fitted) ** 2).sum() / max(((y - y.mean()) ** 2).sum(), 1e-12))
 
 
 def _airspeed(cases: list[Case], made: list[Terms]) -> float:

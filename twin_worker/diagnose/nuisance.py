@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from fleet.effects import Effect, Parameter, Stage, catalogue
 from twin_worker.diagnose.guess import ALWAYS, Guess
 
+WIDEST = 4.0  # a learnt spread over its floor
 RELEASED = 2.5  # spreads past which a difference is no nuisance any more
 WEATHER_MPS = 1.0  # nominal flights that differ by more had weather: a mean wind is then never a finding
 
-_SHARES = ("L:delta_a", "L:p", "L:beta", "M:delta_e", "M:c_z", "M:q", "N:delta_r", "N:r", "N:beta")
 _OFFSETS = ("C_L", "C_D", "C_l", "C_m", "C_n", "thrust", "rho")
 
 
@@ -24,12 +24,12 @@ SCATTER = Effect(
     name="scatter",
     stage=Stage.WRENCH,
     channel="",
-    equation="coefficient (1 + share), or coefficient + offset",
+    equation="coefficient + offset",
     source="spread of nominal flights",
-    parameters=(Parameter("x", "-", "share or offset", step=0.01, low=-1.0, high=1.0),),
+    parameters=(Parameter("x", "-", "offset", step=0.01, low=-1.0, high=1.0),),
     act=_act,
     examples=((0.01,),),
-    of=(*_SHARES, *_OFFSETS),
+    of=_OFFSETS,
 )
 DENSITY = Effect(**{**SCATTER.__dict__, "stage": Stage.AIR})
 
@@ -83,8 +83,6 @@ def nuisances() -> tuple[Nuisance, ...]:
     add("wind_shear", 0.2)
     add("imu_misalignment", 0.002)
     add("airspeed_scale", 0.003)
-    for of in _SHARES:
-        out.append(Nuisance(of, SCATTER, of, 0, 0.01, 0.01))
     floors = {"C_L": 0.004, "C_D": 0.0005, "C_l": 0.0001, "C_m": 0.0003, "C_n": 0.0001, "thrust": 0.005, "rho": 0.003}
     for of in _OFFSETS:
         out.append(Nuisance(of, DENSITY if of == "rho" else SCATTER, of, 0, floors[of], floors[of]))

@@ -43,8 +43,10 @@ class Terms:
 class Case:
     """One flight seen through one baseline."""
 
-    def __init__(self, flight: Flight, base: Baseline) -> None:
+    def __init__(self, flight: Flight, base: Baseline, like: "Case | None" = None) -> None:
         self.flight, self.base = flight, base
+        if like is not None:  # the same flight and timing: what was filtered is filtered
+            self._smooth, self._delta = like._smooth, like._delta
         self.t = thinned(flight.t)
         self.ok = whole(flight.ok)
         self.used = thinned(np.cumsum(flight.commands[:, 3]) * DT)
@@ -183,16 +185,15 @@ class Case:
 def channels(case: Case, made: Terms) -> np.ndarray:
     """Give every channel's residual of what was laid out, (n, channels)."""
     base, flow, add, aside = case.base, made.flow, made.add, made.aside
-    coef = shared(base, add)
     q_S = made.scale["X"]
     T = (base.coef["T"] @ made.terms["T"]) * (1.0 + add.get("thrust", 0.0))
-    alpha, beta = coef("alpha", made.terms["alpha"]), coef("beta", made.terms["beta"])
+    alpha, beta = base.coef["alpha"] @ made.terms["alpha"], base.coef["beta"] @ made.terms["beta"]
     c_z = aside["c_z"]
     lift = add.get("lift", 0.0) * -c_z + add.get("C_L", 0.0)  # what effects added to the clean lift coefficient
-    X = q_S * (coef("X", made.terms["X"]) + lift * np.sin(alpha) - add.get("C_D", 0.0) * np.cos(alpha)) + T
-    L = made.scale["L"] * (coef("L", made.terms["L"]) + add.get("C_l", 0.0)) + add.get("L", 0.0)
-    N = made.scale["N"] * (coef("N", made.terms["N"]) + add.get("C_n", 0.0)) + add.get("N", 0.0)
-    M = made.scale["M"] * (coef("M", made.terms["M"]) + add.get("C_m", 0.0)) + T * base.coef["M"][6] + add.get("M", 0.0)
+    X = q_S * (base.coef["X"] @ made.terms["X"] + lift * np.sin(alpha) - add.get("C_D", 0.0) * np.cos(alpha)) + T
+    L = made.scale["L"] * (base.coef["L"] @ made.terms["L"] + add.get("C_l", 0.0)) + add.get("L", 0.0)
+    N = made.scale["N"] * (base.coef["N"] @ made.terms["N"] + add.get("C_n", 0.0)) + add.get("N", 0.0)
+    M = made.scale["M"] * (base.coef["M"][:6] @ made.terms["M"] + add.get("C_m", 0.0)) + T * base.coef["M"][6] + add.get("M", 0.0)
     if "x_cg" in add or "y_cg" in add:
         x, y, force = add.get("x_cg", 0.0), add.get("y_cg", 0.0), aside["force"]
         # gravity passes through the centre of gravity; the air's force no longer does
@@ -215,21 +216,6 @@ def channels(case: Case, made: Terms) -> np.ndarray:
         out[:, 13] = _detrended(aside["baro"] - aside["h"], aside["h"], case.ok)
     out[:, 7:13] = slow(out[:, 7:13])
     return out
-
-
-def shared(base: Baseline, add: Series):  # type: ignore[no-untyped-def]
-    """Give the function from equation and its terms to its value, derivatives changed by shares where so said."""
-
-    def value(equation: str, terms: np.ndarray) -> np.ndarray:
-        coef = base.coef[equation][: len(terms)]
-        out = coef @ terms
-        for k, name in enumerate(eq.TERMS[equation][: len(terms)]):
-            share = add.get(f"{equation}:{name}")
-            if share is not None:
-                out = out + share * coef[k] * terms[k]
-        return out
-
-    return value
 
 
 def _turning(flow: Flow, aside: Series) -> np.ndarray:

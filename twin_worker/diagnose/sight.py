@@ -52,7 +52,10 @@ class Sight:
 
     def whitened(self, guesses: Sequence[Guess]) -> np.ndarray:
         """Give whitened residuals with these beside the granted guesses, zero where not trusted, (n, c)."""
-        e = self.noise.whiten(self.case.residuals((*self.granted, *guesses)))
+        return self._white(self.case, guesses)
+
+    def _white(self, case: Case, guesses: Sequence[Guess]) -> np.ndarray:
+        e = self.noise.whiten(case.residuals((*self.granted, *guesses)))
         e[~self.ok] = 0.0
         return e
 
@@ -66,14 +69,21 @@ class Sight:
         self.raw = self.whitened(())
         self.e = np.clip(self.raw, -CLIP, CLIP)
         steps = [self.whitened((n.guess(n.step),)) for n in self.nuisances]
-        self.Jn = np.stack([(e - self.raw) / n.step for e, n in zip(steps, self.nuisances, strict=True)], axis=2)
+        columns = [(e - self.raw) / n.step for e, n in zip(steps, self.nuisances, strict=True)]
+        columns += [self._varied(k) - self.raw for k in range(len(self.base.others))]
+        self.Jn = np.stack(columns, axis=2)
         self._profile()
+
+    def _varied(self, k: int) -> np.ndarray:
+        """Give the whitened residuals under coefficients of fewer flights."""
+        return self._white(Case(self.case.flight, self.base.varied(k), like=self.case), ())
 
     def _profile(self) -> None:
         """Find the nuisances, and hand those that leave their spread to the hypotheses."""
-        self.precision = np.array([1.0 / self._spread(n) ** 2 for n in self.nuisances])
-        free = np.array([self.weather and n.weather for n in self.nuisances])
-        flat = self.Jn.reshape(-1, len(self.nuisances))
+        more = np.ones(len(self.base.others))
+        self.precision = np.array([*(1.0 / self._spread(n) ** 2 for n in self.nuisances), *more])
+        free = np.array([*(self.weather and n.weather for n in self.nuisances), *(more > 0)])
+        flat = self.Jn.reshape(-1, self.Jn.shape[2])
         G, self.bn = flat.T @ flat, -flat.T @ self.e.ravel()
         for _ in range(6):
             self.Ann = G + np.diag(self.precision)

@@ -15,7 +15,7 @@ from fleet.frames import G
 from twin_worker.diagnose import equations as eq
 from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.guess import Guess
-from twin_worker.diagnose.residual import RHO_0, density, rotation, shared
+from twin_worker.diagnose.residual import RHO_0, density, rotation
 from twin_worker.diagnose.smooth import DT
 
 STATE = ("v_n", "v_e", "v_d", "p", "q", "r", "phi", "theta", "psi", "h")
@@ -151,16 +151,16 @@ class Simulation:
         c_y = (flow.beta - B[0] - B[2] * p_hat - B[3] * r_hat - B[4] * d_r) / B[1]
         flow.C_L = -c_z
         add = self._increments(flow, (Stage.WRENCH, Stage.MASS))
-        coef, zero = shared(base, add), np.zeros(self.runs)
+        coef, zero = base.coef, np.zeros(self.runs)
         T = flow.T * (1.0 + add.get("thrust", zero))
         lift = add.get("lift", zero) * -c_z + add.get("C_L", zero)
-        X = coef("X", eq.force_terms(c_z, d_e, flow.beta)) + lift * np.sin(flow.alpha)
+        X = coef["X"] @ eq.force_terms(c_z, d_e, flow.beta) + lift * np.sin(flow.alpha)
         X = q_S * (X - add.get("C_D", zero) * np.cos(flow.alpha)) + T
         force = np.stack([X, q_S * (c_y + add.get("C_Y", zero)), q_S * (c_z - lift)])
         lateral = eq.lateral_terms(flow.beta, (p_hat, r_hat), (d_a, d_r), c_z)
-        L = q_S * body.b * (coef("L", lateral) + add.get("C_l", zero)) + add.get("L", zero)
-        N = q_S * body.b * (coef("N", lateral) + add.get("C_n", zero)) + add.get("N", zero)
-        M = q_S * body.c * (coef("M", eq.pitch_terms(c_z, q_hat, d_e, zero)) + add.get("C_m", zero))
+        L = q_S * body.b * (coef["L"] @ lateral + add.get("C_l", zero)) + add.get("L", zero)
+        N = q_S * body.b * (coef["N"] @ lateral + add.get("C_n", zero)) + add.get("N", zero)
+        M = q_S * body.c * (coef["M"][:6] @ eq.pitch_terms(c_z, q_hat, d_e, zero) + add.get("C_m", zero))
         M = M + flow.T * base.coef["M"][6] + add.get("M", zero)
         x_cg, y_cg = add.get("x_cg", zero), add.get("y_cg", zero)
         M, N, L = M + x_cg * force[2], N - x_cg * force[1] + y_cg * force[0], L - y_cg * force[2]
