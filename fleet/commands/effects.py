@@ -61,13 +61,13 @@ def as_rows(effect: Effect) -> list[str]:
         [effect.name],
         [f"{effect.stage}, {effect.channel}"],
         [f"{p.name} [{p.unit}]" for p in effect.parameters],
-        textwrap.wrap(effect.equation, WIDTHS[-1]),
+        textwrap.wrap(effect.equation, WIDTHS[-1] - 1),
     )
     return [_columns(row) for row in zip_longest(*cells, fillvalue="")]
 
 
 def _columns(row: tuple[str, ...]) -> str:
-    return "".join(f"{cell:{width}}" for cell, width in zip(row, WIDTHS, strict=True)).rstrip()
+    return "".join(f"{cell:{width - 1}} " for cell, width in zip(row, WIDTHS, strict=True)).rstrip()
 
 
 def as_text(effect: Effect) -> str:
@@ -82,7 +82,7 @@ def as_text(effect: Effect) -> str:
         "examples": "; ".join(", ".join(f"{x:g}" for x in example) for example in effect.examples),
         "search from": "; ".join(", ".join(f"{x:g}" for x in start) for start in effect.starts) or "zero",
     }
-    lines = [f"{effect.name}   {summary(effect)}", ""]
+    lines = [*_wrapped(f"{effect.name}   ", summary(effect)), ""]
     lines += [row for name, fact in facts.items() for row in _wrapped(f"  {name:12} ", fact)]
     lines += ["", "  parameters, all zero when there is nothing:", *map(_parameter, effect.parameters)]
     if effect.confused:
