@@ -88,6 +88,7 @@ class Parameter:
         unit, meaning: for people
         step: a change that shows but is small, for slopes
         low, high: what is physically possible
+        aside: it comes along with the others and is no evidence: where a force acts is seldom known
     """
 
     name: str
@@ -96,6 +97,7 @@ class Parameter:
     step: float
     low: float
     high: float
+    aside: bool = False
 
 
 @dataclass(frozen=True)
@@ -191,6 +193,11 @@ class Effect:
     def size(self) -> int:
         """Give the number of parameters."""
         return len(self.parameters)
+
+    @property
+    def price(self) -> int:
+        """Give the number of parameters that are evidence."""
+        return sum(not p.aside for p in self.parameters)
 
 
 @cache

@@ -10,14 +10,14 @@ from fleet.physics.kernel import kernel
 
 @kernel
 def act(u: np.ndarray, memory: np.ndarray, dt: float, par: np.ndarray) -> None:
-    """Lag the commands; memory[0] is the surface."""
+    """Lag the commands, straight between two of them; memory: the surface, and the command before."""
     for i in range(len(u)):
-        tau = par[0, i]
+        tau, now = par[0, i], u[i]
         if tau > 0.0:
-            memory[0] += (u[i] - memory[0]) * (1.0 - exp(-dt / tau))
-            u[i] = memory[0]
-        else:
-            memory[0] = u[i]
+            fade = exp(-dt / tau)
+            mean = (1.0 - fade) * tau / dt
+            u[i] = fade * memory[0] + (1.0 - mean) * now + (mean - fade) * memory[1]
+        memory[0], memory[1] = u[i], now
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:

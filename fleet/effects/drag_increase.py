@@ -5,9 +5,9 @@ from typing import Any
 from fleet.effects import Effect, Flow, Onset, Parameter, Stage
 
 
-def act(flow: Flow, dCD: Any) -> dict[str, Any]:
-    """Add drag."""
-    return {"C_D": dCD}
+def act(flow: Flow, dCD: Any, dCm: Any) -> dict[str, Any]:
+    """Add drag, and the moment of it acting above or below the centre of gravity."""
+    return {"C_D": dCD, "C_m": dCm}
 
 
 EFFECT = Effect(
@@ -16,9 +16,14 @@ EFFECT = Effect(
     channel="drag",
     equation="C_D = C_D0 + dCD",
     source="Beard & McLain 2012, eq. 4.11",
-    parameters=(Parameter("dCD", "-", "drag coefficient added", step=0.005, low=-0.05, high=0.5),),
+    parameters=(
+        Parameter("dCD", "-", "drag coefficient added", step=0.005, low=-0.05, high=0.5),
+        Parameter(
+            "dCm", "-", "pitching moment coefficient that comes along", step=0.002, low=-0.3, high=0.3, aside=True
+        ),
+    ),
     act=act,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
-    examples=((0.01,), (0.03,), (0.08,)),
+    examples=((0.01, 0.0), (0.03, 0.002), (0.08, -0.004)),
     confused={"thrust_loss": "drag grows with dynamic pressure, thrust with throttle: fly at two speeds"},
 )

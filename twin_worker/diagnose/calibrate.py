@@ -66,7 +66,9 @@ def halves(flight: Flight) -> list[Flight]:
 
 def replaced(case: Case, base: Baseline) -> Case:
     """Give a case with the noise and spread of another baseline."""
-    own = replace(case.base, noise=base.noise, spread=base.spread, usual=base.usual, chance=base.chance, others=base.others)
+    own = replace(
+        case.base, noise=base.noise, spread=base.spread, usual=base.usual, chance=base.chance, others=base.others
+    )
     return Case(case.flight, own)
 
 

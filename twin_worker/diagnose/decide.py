@@ -15,6 +15,7 @@ from twin_worker.diagnose.sight import Sight
 MOST = 3  # effects named together
 _TRIED = 12  # guesses fitted properly at each step
 _LEAST = 150.0  # gain of a first effect
+_CANCEL = 1.5  # an effect that gains this much more beside the others than all together only undoes one of them
 _SECOND = 220.0  # and of every further one
 _CHANCE = 1.2  # over what nominal flights reach by chance
 _SHARE = 0.02  # of the first one's gain a further one must bring
@@ -46,17 +47,40 @@ def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: Non
         say: takes words of progress
     """
     named: list[Named] = []
+    first = Joint(sight, weather)
     while len(named) < MOST:
         say(f"effect {len(named) + 1}")
         found = best(sight, [one.found.guess for one in named])
         found = [one for one in found if one.gain > needed(sight, named, one)]
         if not found:
             break
-        named.append(choose(sight, found))
-        if len(named) > 1:
-            named = _again(sight, named, weather)
+        more = [*named, choose(sight, found)]
+        if len(more) > 1:
+            more = _again(sight, more, weather)
+            if not first.better(more, named):
+                break
+        named = more
         sight.grant((*weather, *(one.found.guess for one in named)))
+    sight.grant((*weather, *(one.found.guess for one in named)))
     return named
+
+
+class Joint:
+    """What several effects gain together, all reckoned alike."""
+
+    def __init__(self, sight: Sight, weather: tuple[Guess, ...]) -> None:
+        self._sight = Sight(sight.case, weather)
+        self._none = self._sight.cost(())
+
+    def gain(self, named: list[Named]) -> float:
+        """Give the gain of all."""
+        return self._none - self._sight.cost([one.found.guess for one in named])
+
+    def better(self, more: list[Named], fewer: list[Named]) -> bool:
+        """Tell whether one more is worth it: together they gain enough, and do not merely cancel each other."""
+        gain = self.gain(more)
+        cancelling = max(one.found.gain for one in more) > _CANCEL * gain
+        return not cancelling and gain - self.gain(fewer) > needed(self._sight, fewer, more[-1].found)
 
 
 def best(sight: Sight, beside: Sequence[Guess], only: tuple[str, ...] = ()) -> list[Found]:
@@ -75,7 +99,7 @@ def best(sight: Sight, beside: Sequence[Guess], only: tuple[str, ...] = ()) -> l
 
 def rank(sight: Sight, found: Found) -> float:
     """Give what a guess is worth: each number beyond the first must earn its price, and its share."""
-    extra = found.guess.effect.size - 1
+    extra = found.guess.effect.price - 1
     share = 0.0 if sight.base.vane else _COARSE * extra
     return found.gain * (1.0 - share) - PRICE * found.guess.size
 

@@ -2,10 +2,10 @@
 
     alpha = A . (1, c_z, c_z2, q^, c_z'^, delta_e)     beta = B . (1, c_y, p^, r^, delta_r)
     m f_x = q_bar S X . (1, c_z, c_z2, delta_e, |beta|) + T . thrust terms
-    J_x p' + (J_z - J_y) q r = q_bar S b L . (1, beta, p^, r^, delta_a, delta_r, c_z r^, c_z p^)      N as L
-    J_y q' + (J_x - J_z) p r = q_bar S c M . (1, c_z, q^, delta_e, c_z'^, c_z2) + M_T T
+    J_x p' + (J_z - J_y) q r = q_bar S b L . (1, beta, p^, r^, delta_a, delta_r, c_z r^, c_z p^, c_z)   N as L
+    J_y q' + (J_x - J_z) p r = q_bar S c M . (1, c_z, q^, delta_e, c_z'^, c_z2, c_x) + M_T T
 
-    c_z = m f_z / (q_bar S), c_y = m f_y / (q_bar S); ^: made dimensionless by b / 2 Va, c / 2 Va
+    c_z = m f_z / (q_bar S), c_x and c_y likewise; ^: made dimensionless by b / 2 Va, c / 2 Va
 
 Regressing moments on flow angles from inertial velocity fails (noise, trim); forces per dynamic pressure feel the same
 air as the moments do.  Source: Klein & Morelli 2006, section 5.2 (equation error); Beard & McLain 2012, chapter 4.
@@ -18,8 +18,8 @@ import numpy as np
 ALPHA = ("1", "c_z", "c_z2", "q", "c_z_dot", "delta_e")
 BETA = ("1", "c_y", "p", "r", "delta_r")
 X = ("1", "c_z", "c_z2", "delta_e", "beta")
-LATERAL = ("1", "beta", "p", "r", "delta_a", "delta_r", "c_z r", "c_z p")
-M = ("1", "c_z", "q", "delta_e", "c_z_dot", "c_z2")
+LATERAL = ("1", "beta", "p", "r", "delta_a", "delta_r", "c_z r", "c_z p", "c_z")
+M = ("1", "c_z", "q", "delta_e", "c_z_dot", "c_z2", "c_x")
 THRUST = ("t", "t2", "t3", "tv", "t2v", "t3v")
 
 TERMS = {"alpha": ALPHA, "beta": BETA, "X": X, "T": THRUST, "L": LATERAL, "M": (*M, "T"), "N": LATERAL}
@@ -42,14 +42,14 @@ def force_terms(c_z: Any, delta_e: Any, beta: Any) -> np.ndarray:
 
 
 def lateral_terms(beta: Any, rates: tuple[Any, Any], deltas: tuple[Any, Any], c_z: Any) -> np.ndarray:
-    """Stack the terms of rolling and yawing moment coefficients, (8, n)."""
+    """Stack the terms of rolling and yawing moment coefficients, (9, n); c_z for weight beside the middle."""
     p, r = rates
-    return np.stack([np.ones_like(c_z), beta, p, r, *deltas, c_z * r, c_z * p])
+    return np.stack([np.ones_like(c_z), beta, p, r, *deltas, c_z * r, c_z * p, c_z])
 
 
-def pitch_terms(c_z: Any, q_hat: Any, delta_e: Any, c_z_dot: Any) -> np.ndarray:
-    """Stack the terms of the pitching moment coefficient, (6, n)."""
-    return np.stack([np.ones_like(c_z), c_z, q_hat, delta_e, c_z_dot, c_z * c_z])
+def pitch_terms(c_z: Any, q_hat: Any, delta_e: Any, c_z_dot: Any, c_x: Any) -> np.ndarray:
+    """Stack the terms of the pitching moment coefficient, (7, n); c_x for drag above or below the centre of gravity."""
+    return np.stack([np.ones_like(c_z), c_z, q_hat, delta_e, c_z_dot, c_z * c_z, c_x])
 
 
 def thrust_terms(delta_t: Any, Va: Any, density: Any, speed: float) -> np.ndarray:

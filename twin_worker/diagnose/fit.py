@@ -14,12 +14,12 @@ from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.residual import RHO_0, Case, Terms
 
 _RIDGE = 3e-4  # pull of a coefficient towards zero, as a share of its term's length
-_ORDER, _WHITENINGS = 3, 5  # of the residuals' autoregression; rounds
+_ORDER, _WHITENINGS = 3, 1  # of the residuals' autoregression; rounds
 _ROUNDS = 2
 _SHEAR = 1.0  # usual growth of wind with height [m/s per 100 m]
 _CORRELATED = 50.0  # residual rows that count as one
 _SIDE = 0.5  # weight of sideslip in the wind fit [-]
-_LAGS, _DELAYS, _ENGINES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3), (0.0, 0.04), (0.1, 0.25, 0.5)
+_LAGS, _DELAYS, _ENGINES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3), (0.0, 0.02, 0.04, 0.06), (0.1, 0.25, 0.5)
 
 
 def wind(w: np.ndarray) -> tuple[Guess, ...]:
@@ -42,8 +42,7 @@ def fit(flights: Sequence[Flight], card: Card, timing: Timing, vane: bool) -> tu
         winds = [fit_wind(case, w) for case, w in zip(cases, winds, strict=True)]
         made = [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)]
         base = replace(base, airspeed=_airspeed(cases, made))
-        flow = {name: _solve(_Rows(cases, made, name), 0)[0] for name in ("alpha", "beta")}
-        base = replace(base, coef=flow)
+        base = replace(base, coef={"alpha": _solve(_Rows(cases, made, "alpha"), 0)[0], "beta": _side(cases, made, vane)})
         cases = [Case(flight, base) for flight in flights]
         base = _moments(cases, [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)], base)
     return base, winds
@@ -55,10 +54,28 @@ def _moments(cases: list[Case], made: list[Terms], base: Baseline) -> Baseline:
     both, r2["X"] = _solve(_Rows(cases, made, "X", more=lambda m: m.terms["T"]), 0)
     coef["X"], coef["T"] = both[: len(eq.X)], both[len(eq.X) :]
     coef["M"], r2["M"] = _solve(_Rows(cases, made, "M", more=lambda m: (coef["T"] @ m.terms["T"])[None]))
-    for name in ("L", "N", "alpha", "beta"):
-        found, r2[name] = _solve(_Rows(cases, made, name), 0 if name in coef else _WHITENINGS)
-        coef.setdefault(name, found)
+    for name in ("L", "N"):
+        coef[name], r2[name] = _solve(_Rows(cases, made, name))
+    for name in ("alpha", "beta"):
+        rows = _Rows(cases, made, name)
+        r2[name] = _r2(rows.A[rows.ok] @ coef[name], rows.y[rows.ok])
     return replace(base, coef=coef, r2=r2)
+
+
+def _side(cases: list[Case], made: list[Terms], vane: bool) -> np.ndarray:
+    """Fit sideslip: by the accelerometer, side force on measured sideslip, turned round.
+
+    Sideslip over the ground lacks the gusts that the side force feels: regressed on the force it would be shrunk. A
+    side force taken from the velocity is noisy itself: there sideslip is regressed on it.
+    """
+    rows = _Rows(cases, made, "beta")
+    if not vane:
+        return _solve(rows, 0)[0]
+    force = rows.A[:, 1].copy()
+    rows.A[:, 1] = np.concatenate([m.measured["beta"] for m in made])
+    rows.y = force
+    c = _solve(rows)[0]
+    return np.array([-c[0], 1.0, *(-c[2:])]) / c[1]
 
 
 class _Rows:
@@ -90,9 +107,7 @@ def _solve(rows: _Rows, whitenings: int = _WHITENINGS) -> tuple[np.ndarray, floa
     Source: Clarke 1967 (generalised least squares); Klein & Morelli 2006, section 5.2.
     """
     x = _ridge(rows.A[rows.ok], rows.y[rows.ok])
-    fitted = rows.A[rows.ok] @ x
-    y = rows.y[rows.ok]
-    r2 = float(1.0 - ((y - fitted) ** 2).sum() / max(((y - y.mean()) ** 2).sum(), 1e-12))
+    r2 = _r2(rows.A[rows.ok] @ x, rows.y[rows.ok])
     for _ in range(whitenings):
         e = rows.y - rows.A @ x
         lags = np.stack([np.roll(e, k) for k in range(1, _ORDER + 1)], axis=1)
@@ -103,6 +118,10 @@ def _solve(rows: _Rows, whitenings: int = _WHITENINGS) -> tuple[np.ndarray, floa
 
         x = _ridge(white(rows.A)[rows.whole], white(rows.y)[rows.whole])
     return x, r2
+
+
+def _r2(fitted: np.ndarray, y: np.ndarray) -> float:
+    return float(1.0 - ((y - fitted) ** 2).sum() / max(((y - y.mean()) ** 2).sum(), 1e-12))
 
 
 def _ridge(A: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -64,8 +64,8 @@ class Guess:
 
     @property
     def size(self) -> int:
-        """Give how many numbers it takes, those of its course included."""
-        return len(self.par) + self.when.size
+        """Give how many numbers it is charged for, those of its course included."""
+        return self.effect.price + self.when.size
 
     def at(self, par: np.ndarray, when: When | None = None) -> "Guess":
         """Give the same with other parameters, kept within what is physically possible."""

@@ -13,7 +13,7 @@ WIDEST = 4.0  # a learnt spread over its floor
 RELEASED = 2.5  # spreads past which a difference is no nuisance any more
 WEATHER_MPS = 1.0  # nominal flights that differ by more had weather: a mean wind is then never a finding
 
-_OFFSETS = ("C_L", "C_D", "C_l", "C_m", "C_n", "thrust", "rho")
+_OFFSETS = ("C_L", "C_D", "C_l", "C_m", "C_n", "thrust", "rho", "side")
 
 
 def _act(flow: object, x: object, of: str) -> dict[str, object]:
@@ -83,7 +83,7 @@ def nuisances() -> tuple[Nuisance, ...]:
     add("wind_shear", 0.2)
     add("imu_misalignment", 0.002)
     add("airspeed_scale", 0.003)
-    floors = {"C_L": 0.004, "C_D": 0.0005, "C_l": 0.0001, "C_m": 0.0003, "C_n": 0.0001, "thrust": 0.005, "rho": 0.003}
+    floors = {"C_L": 0.004, "C_D": 0.0005, "C_l": 0.0001, "C_m": 0.0003, "C_n": 0.0001, "thrust": 0.005, "rho": 0.003, "side": 0.05}
     for of in _OFFSETS:
         out.append(Nuisance(of, DENSITY if of == "rho" else SCATTER, of, 0, floors[of], floors[of]))
     return tuple(out)

@@ -80,7 +80,9 @@ def by_flying(case: Case, guesses: tuple[Guess, ...], seconds: float = BLOCK_S) 
     first = np.ceil(t[0] / seconds) * seconds
     starts = np.rint((np.arange(first, t[-1] - 1.0, seconds) - t[0]) / DT).astype(int)
     starts = np.unique(starts // EVERY * EVERY)
-    x = np.stack([s[name][starts // EVERY] for name in ("v_n", "v_e", "v_d", "p", "q", "r", "phi", "theta", "psi", "h")])
+    x = np.stack(
+        [s[name][starts // EVERY] for name in ("v_n", "v_e", "v_d", "p", "q", "r", "phi", "theta", "psi", "h")]
+    )
     acting = [g for g in guesses if g.effect.stage is not Stage.SENSOR]
     sim = Simulation(case.base, [acting] * len(starts), t[starts], case.flight.ground)
     commands = np.pad(case.flight.commands, ((0, n), (0, 0)), mode="edge")
@@ -89,5 +91,3 @@ def by_flying(case: Case, guesses: tuple[Guess, ...], seconds: float = BLOCK_S) 
     for run, start in enumerate(starts):
         out[start : start + n] = runs.force[:, :, run]
     return out[: len(t)]
-
-

@@ -74,10 +74,12 @@ class Case:
             par = np.asarray(guess.par)[:, None] * guess.when.gate(self.flight.t)
             guess.effect.act(u, memory, DT, np.ascontiguousarray(par))
         tau = timing.engine if column == 3 else timing.servo
-        if tau > 1e-3:
+        if tau > 1e-3:  # exact between commands joined by straight lines
             a = exp(-DT / tau)
-            u = lfilter([1 - a], [1, -a], u, zi=[a * u[0]])[0]
-        if timing.delay:
+            mean = (1 - a) * tau / DT
+            b = [1 - mean, mean - a]
+            u = lfilter(b, [1, -a], u, zi=[(1 - b[0]) * u[0]])[0]
+        if timing.delay and column != 3:
             u = np.interp(self.flight.t - timing.delay, self.flight.t, u)
         return u if column == 3 else self.base.card.angles(column)(u)
 
@@ -124,7 +126,9 @@ class Case:
         flow = Flow(self.t, s["h"], s["h"] - self.flight.ground, body, delta_t=d_t, used=self.used)
         air = self._increments(flow, guesses, (Stage.AIR,))
         R = rotation(s["phi"], s["theta"], s["psi"])
-        ground = np.stack([s["v_n"] - air.get("w_n", 0.0), s["v_e"] - air.get("w_e", 0.0), s["v_d"] - air.get("w_d", 0.0)])
+        ground = np.stack(
+            [s["v_n"] - air.get("w_n", 0.0), s["v_e"] - air.get("w_e", 0.0), s["v_d"] - air.get("w_d", 0.0)]
+        )
         u, v, w = np.einsum("ijn,in->jn", R, ground)
         lift_off = np.stack([s["v_n_dot"], s["v_e_dot"], s["v_d_dot"] - G])
         derived = np.einsum("ijn,in->jn", R, lift_off)
@@ -148,7 +152,7 @@ class Case:
         force = mass * f
         # what the clean aircraft must do: lift gained and added by effects is taken off first
         c_z = (force[2] / q_S + add.get("C_L", 0.0)) / (1.0 + add.get("lift", 0.0))
-        c_y = force[1] / q_S - add.get("C_Y", 0.0)
+        c_y = (force[1] / q_S - add.get("C_Y", 0.0)) * (1.0 + add.get("side", 0.0))
         c_z_dot = np.gradient(c_z, STEP_S) * chord
         terms = {
             "alpha": eq.alpha_terms(c_z, c_z_dot, q_hat, d_e),
@@ -158,7 +162,7 @@ class Case:
         beta = base.coef["beta"] @ terms["beta"] if "beta" in base.coef else flow.beta
         terms["X"] = eq.force_terms(c_z, d_e, beta)
         terms["L"] = terms["N"] = eq.lateral_terms(beta, (p_hat, r_hat), (d_a, d_r), c_z)
-        terms["M"] = eq.pitch_terms(c_z, q_hat, d_e, c_z_dot)
+        terms["M"] = eq.pitch_terms(c_z, q_hat, d_e, c_z_dot, force[0] / q_S)
         J_x, J_y, J_z, _ = base.card.inertia
         coupled = base.card.known
         measured = {
@@ -193,7 +197,11 @@ def channels(case: Case, made: Terms) -> np.ndarray:
     X = q_S * (base.coef["X"] @ made.terms["X"] + lift * np.sin(alpha) - add.get("C_D", 0.0) * np.cos(alpha)) + T
     L = made.scale["L"] * (base.coef["L"] @ made.terms["L"] + add.get("C_l", 0.0)) + add.get("L", 0.0)
     N = made.scale["N"] * (base.coef["N"] @ made.terms["N"] + add.get("C_n", 0.0)) + add.get("N", 0.0)
-    M = made.scale["M"] * (base.coef["M"][:6] @ made.terms["M"] + add.get("C_m", 0.0)) + T * base.coef["M"][6] + add.get("M", 0.0)
+    M = (
+        made.scale["M"] * (base.coef["M"][:-1] @ made.terms["M"] + add.get("C_m", 0.0))
+        + T * base.coef["M"][-1]
+        + add.get("M", 0.0)
+    )
     if "x_cg" in add or "y_cg" in add:
         x, y, force = add.get("x_cg", 0.0), add.get("y_cg", 0.0), aside["force"]
         # gravity passes through the centre of gravity; the air's force no longer does

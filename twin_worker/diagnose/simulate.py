@@ -85,7 +85,7 @@ class Simulation:
 
     def _share(self) -> np.ndarray:
         timing = self.base.timing
-        tau = np.array([timing.servo + timing.delay] * 3 + [timing.engine + timing.delay])
+        tau = np.array([timing.servo + timing.delay] * 3 + [timing.engine])
         return (1.0 - np.exp(-DT / np.maximum(tau, 1e-3)))[:, None]
 
     def _moved(self, commands: np.ndarray, t: np.ndarray, memories: dict[tuple[int, int], np.ndarray]) -> np.ndarray:
@@ -160,8 +160,8 @@ class Simulation:
         lateral = eq.lateral_terms(flow.beta, (p_hat, r_hat), (d_a, d_r), c_z)
         L = q_S * body.b * (coef["L"] @ lateral + add.get("C_l", zero)) + add.get("L", zero)
         N = q_S * body.b * (coef["N"] @ lateral + add.get("C_n", zero)) + add.get("N", zero)
-        M = q_S * body.c * (coef["M"][:6] @ eq.pitch_terms(c_z, q_hat, d_e, zero) + add.get("C_m", zero))
-        M = M + flow.T * base.coef["M"][6] + add.get("M", zero)
+        M = q_S * body.c * (coef["M"][:-1] @ eq.pitch_terms(c_z, q_hat, d_e, zero, X / q_S) + add.get("C_m", zero))
+        M = M + flow.T * base.coef["M"][-1] + add.get("M", zero)
         x_cg, y_cg = add.get("x_cg", zero), add.get("y_cg", zero)
         M, N, L = M + x_cg * force[2], N - x_cg * force[1] + y_cg * force[0], L - y_cg * force[2]
         f = force / (body.mass * (1.0 + add.get("mass", zero)))
