@@ -82,7 +82,7 @@ def _with_noise(base: Baseline, cases: list[Case]) -> Baseline:
     winds = [fit_wind(case, np.zeros(4)) for case in cases]
     granted = [wind(w) for w in winds]
     rows = [case.residuals(g) for case, g in zip(cases, granted, strict=True)]
-    several = nuisances()
+    several = nuisances(base.vane)
     slopes = [_slopes(case, g, x) for case, g, x in zip(cases, granted, rows, strict=True)]
     noise = _noise(rows, cases)
     for _ in range(2):
@@ -97,7 +97,7 @@ def _with_noise(base: Baseline, cases: list[Case]) -> Baseline:
 
 def _slopes(case: Case, granted: tuple[Guess, ...], rows: np.ndarray) -> np.ndarray:
     """Give how residuals change with each nuisance, (n, c, nuisances)."""
-    return np.stack([(case.residuals((*granted, n.guess(n.step))) - rows) / n.step for n in nuisances()], axis=2)
+    return np.stack([(case.residuals((*granted, n.guess(n.step))) - rows) / n.step for n in nuisances(case.base.vane)], axis=2)
 
 
 def _spreads(
@@ -107,7 +107,7 @@ def _spreads(
 
     A nuisance that a flight says nothing about leaves its spread where it was.  Source: Dempster, Laird & Rubin 1977.
     """
-    floors = np.array([n.floor for n in nuisances()])
+    floors = np.array([n.floor for n in nuisances(cases[0].base.vane)])
     parts = []
     for case, x, J in zip(cases, rows, slopes, strict=True):
         white = np.stack([noise.whiten(J[:, :, k]) for k in range(J.shape[2])], axis=2)[case.ok]

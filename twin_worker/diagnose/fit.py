@@ -19,7 +19,8 @@ _ROUNDS = 2
 _SHEAR = 1.0  # usual growth of wind with height [m/s per 100 m]
 _CORRELATED = 50.0  # residual rows that count as one
 _SIDE = 0.5  # weight of sideslip in the wind fit [-]
-_LAGS, _DELAYS, _ENGINES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.3), (0.0, 0.02, 0.04, 0.06), (0.1, 0.25, 0.5)
+_LAGS = (0.0, 0.03, 0.06, 0.1, 0.14, 0.18, 0.22, 0.28, 0.35)  # [s]
+_DELAYS, _ENGINES = (0.0, 0.02, 0.04, 0.06), (0.1, 0.25, 0.5)  # [s]
 
 
 def wind(w: np.ndarray) -> tuple[Guess, ...]:
@@ -51,9 +52,9 @@ def fit(flights: Sequence[Flight], card: Card, timing: Timing, vane: bool) -> tu
 def _moments(cases: list[Case], made: list[Terms], base: Baseline) -> Baseline:
     """Fit forces and moments, the flow angles given."""
     coef, r2 = dict(base.coef), {}
-    both, r2["X"] = _solve(_Rows(cases, made, "X", more=lambda m: m.terms["T"]), 0)
+    both, r2["X"] = _solve(_axial(cases, made), 0)
     coef["X"], coef["T"] = both[: len(eq.X)], both[len(eq.X) :]
-    coef["M"], r2["M"] = _solve(_Rows(cases, made, "M", more=lambda m: (coef["T"] @ m.terms["T"])[None]))
+    coef["M"], r2["M"] = _solve(_pitch(cases, made, coef))
     for name in ("L", "N"):
         coef[name], r2[name] = _solve(_Rows(cases, made, name))
     for name in ("alpha", "beta"):
@@ -98,26 +99,33 @@ class _Rows:
         self.A, self.y = np.concatenate(A), np.concatenate(y)
         self.ok, self.whole = np.concatenate(ok), np.concatenate(whole)
 
+    def whitener(self, x: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """Give the filter that whitens the residuals of these coefficients."""
+        e = self.y - self.A @ x
+        lags = np.stack([np.roll(e, k) for k in range(1, _ORDER + 1)], axis=1)
+        ar = np.linalg.lstsq(lags[self.whole], e[self.whole], rcond=None)[0]
+        return lambda z: z - sum(a * np.roll(z, k + 1, axis=0) for k, a in enumerate(ar))
+
 
 def _solve(rows: _Rows, whitenings: int = _WHITENINGS) -> tuple[np.ndarray, float]:
     """Solve by generalised least squares; give coefficients and the share of variance explained.
 
     The residuals of a flight in gusts, under an autopilot that answers them, are coloured, and plain least squares
-    shrinks the derivatives: both sides are filtered by the residuals' own autoregression until that stays.
+    shrinks the derivatives: both sides are filtered by the residuals' own autoregression.
     Source: Clarke 1967 (generalised least squares); Klein & Morelli 2006, section 5.2.
     """
     x = _ridge(rows.A[rows.ok], rows.y[rows.ok])
     r2 = _r2(rows.A[rows.ok] @ x, rows.y[rows.ok])
     for _ in range(whitenings):
-        e = rows.y - rows.A @ x
-        lags = np.stack([np.roll(e, k) for k in range(1, _ORDER + 1)], axis=1)
-        ar = np.linalg.lstsq(lags[rows.whole], e[rows.whole], rcond=None)[0]
-
-        def white(z: np.ndarray, ar: np.ndarray = ar) -> np.ndarray:
-            return z - sum(a * np.roll(z, k + 1, axis=0) for k, a in enumerate(ar))  # type: ignore[no-any-return]
-
+        white = rows.whitener(x)
         x = _ridge(white(rows.A)[rows.whole], white(rows.y)[rows.whole])
     return x, r2
+
+
+def _surprise(rows: _Rows) -> float:
+    """Give the logarithm of the innovations' variance after the fit."""
+    x, _ = _solve(rows)
+    return float(np.log(np.var(rows.whitener(x)(rows.y - rows.A @ x)[rows.whole])))
 
 
 def _r2(fitted: np.ndarray, y: np.ndarray) -> float:
@@ -169,21 +177,29 @@ def fit_wind(case: Case, w: np.ndarray) -> np.ndarray:
 
 
 def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
-    """Find the lags and the delay that explain most; one after the other, twice."""
+    """Find the lags and the delay that leave the least innovations, one after the other, twice.
+
+    Pitch tells of the servos: in roll, damping and lag look alike within the band. Axial force tells of the engine.
+    """
     best = Timing()
-
-    def worth(timing: Timing) -> float:
-        r2 = fit(flights, card, timing, vane)[0].r2
-        return sum(float(np.log(max(1.0 - r2[name], 1e-6))) for name in ("X", "L", "M"))
-
-    now = worth(best)
     for _ in range(2):
-        for name, grid in (("servo", _LAGS), ("engine", _ENGINES), ("delay", _DELAYS)):
-            for value in grid:
-                if value == getattr(best, name):
-                    continue
-                trial = replace(best, **{name: value})
-                found = worth(trial)
-                if found < now - 0.01:
-                    best, now = trial, found
+        for name, grid, equation in (("servo", _LAGS, "M"), ("delay", _DELAYS, "M"), ("engine", _ENGINES, "X")):
+            trials = [replace(best, **{name: value}) for value in grid]
+            best = min(trials, key=lambda timing: _left(flights, card, timing, vane)[equation])
     return best
+
+
+def _left(flights: Sequence[Flight], card: Card, timing: Timing, vane: bool) -> dict[str, float]:
+    """Give what the pitch and axial equations leave unexplained."""
+    base, winds = fit(flights, card, timing, vane)
+    cases = [Case(flight, base) for flight in flights]
+    made = [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)]
+    return {"M": _surprise(_pitch(cases, made, base.coef)), "X": _surprise(_axial(cases, made))}
+
+
+def _pitch(cases: list[Case], made: list[Terms], coef: dict[str, np.ndarray]) -> _Rows:
+    return _Rows(cases, made, "M", more=lambda m: (coef["T"] @ m.terms["T"])[None])
+
+
+def _axial(cases: list[Case], made: list[Terms]) -> _Rows:
+    return _Rows(cases, made, "X", more=lambda m: m.terms["T"])

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from fleet.effects import Effect, Parameter, Stage, catalogue
 from twin_worker.diagnose.guess import ALWAYS, Guess
 
+_SHARE = 0.03  # least scatter of a derivative without the vane [-]
 WIDEST = 4.0  # a learnt spread over its floor
 RELEASED = 2.5  # spreads past which a difference is no nuisance any more
 WEATHER_MPS = 1.0  # nominal flights that differ by more had weather: a mean wind is then never a finding
 
+_SHARES = ("L:delta_a", "L:p", "L:beta", "M:delta_e", "M:c_z", "M:q", "N:delta_r", "N:r", "N:beta")
 _OFFSETS = ("C_L", "C_D", "C_l", "C_m", "C_n", "thrust", "rho", "side")
 
 
@@ -29,7 +31,7 @@ SCATTER = Effect(
     parameters=(Parameter("x", "-", "offset", step=0.01, low=-1.0, high=1.0),),
     act=_act,
     examples=((0.01,),),
-    of=_OFFSETS,
+    of=(*_SHARES, *_OFFSETS),
 )
 DENSITY = Effect(**{**SCATTER.__dict__, "stage": Stage.AIR})
 
@@ -64,8 +66,8 @@ class Nuisance:
         return self.effect.name in ("wind_steady", "wind_shear")
 
 
-def nuisances() -> tuple[Nuisance, ...]:
-    """List them all."""
+def nuisances(vane: bool) -> tuple[Nuisance, ...]:
+    """List them all; without the vane derivatives scatter too, for they are known less well."""
     known = catalogue()
     out = []
 
@@ -86,4 +88,6 @@ def nuisances() -> tuple[Nuisance, ...]:
     floors = {"C_L": 0.004, "C_D": 0.0005, "C_l": 0.0001, "C_m": 0.0003, "C_n": 0.0001, "thrust": 0.005, "rho": 0.003, "side": 0.05}
     for of in _OFFSETS:
         out.append(Nuisance(of, DENSITY if of == "rho" else SCATTER, of, 0, floors[of], floors[of]))
+    if not vane:
+        out += [Nuisance(of, SCATTER, of, 0, _SHARE, _SHARE) for of in _SHARES]
     return tuple(out)

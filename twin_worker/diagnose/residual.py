@@ -194,11 +194,11 @@ def channels(case: Case, made: Terms) -> np.ndarray:
     alpha, beta = base.coef["alpha"] @ made.terms["alpha"], base.coef["beta"] @ made.terms["beta"]
     c_z = aside["c_z"]
     lift = add.get("lift", 0.0) * -c_z + add.get("C_L", 0.0)  # what effects added to the clean lift coefficient
-    X = q_S * (base.coef["X"] @ made.terms["X"] + lift * np.sin(alpha) - add.get("C_D", 0.0) * np.cos(alpha)) + T
-    L = made.scale["L"] * (base.coef["L"] @ made.terms["L"] + add.get("C_l", 0.0)) + add.get("L", 0.0)
-    N = made.scale["N"] * (base.coef["N"] @ made.terms["N"] + add.get("C_n", 0.0)) + add.get("N", 0.0)
+    X = q_S * (valued(base, add, "X", made.terms["X"]) + lift * np.sin(alpha) - add.get("C_D", 0.0) * np.cos(alpha)) + T
+    L = made.scale["L"] * (valued(base, add, "L", made.terms["L"]) + add.get("C_l", 0.0)) + add.get("L", 0.0)
+    N = made.scale["N"] * (valued(base, add, "N", made.terms["N"]) + add.get("C_n", 0.0)) + add.get("N", 0.0)
     M = (
-        made.scale["M"] * (base.coef["M"][:-1] @ made.terms["M"] + add.get("C_m", 0.0))
+        made.scale["M"] * (valued(base, add, "M", made.terms["M"]) + add.get("C_m", 0.0))
         + T * base.coef["M"][-1]
         + add.get("M", 0.0)
     )
@@ -223,6 +223,16 @@ def channels(case: Case, made: Terms) -> np.ndarray:
     if "baro" in readings:
         out[:, 13] = _detrended(aside["baro"] - aside["h"], aside["h"], case.ok)
     out[:, 7:13] = slow(out[:, 7:13])
+    return out
+
+
+def valued(base: Baseline, add: Series, equation: str, terms: np.ndarray) -> np.ndarray:
+    """Give an equation's value, derivatives scattered by shares where so said, (n,)."""
+    coef = base.coef[equation][: len(terms)]
+    out = coef @ terms
+    for k, name in enumerate(eq.TERMS[equation][: len(terms)]):
+        if (share := add.get(f"{equation}:{name}")) is not None:
+            out = out + share * coef[k] * terms[k]
     return out
 
 

@@ -6,10 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.effects import Effect, Onset, catalogue
+from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.guess import ALWAYS, Guess, When
 from twin_worker.diagnose.sight import Sight
 
 PRICE = 9.0  # what a parameter must gain to be worth having [-]
+WELL = 0.6  # share of variance from which an equation counts as calibrated
+_SURFACE = {"aileron": "L", "elevator": "M", "rudder": "N"}
+_SHOWS_IN = {"roll": "L", "pitch": "M", "yaw": "N", "thrust": "X", "drag": "X", "lift": "alpha"}
 _EDGE_S = 15.0, 20.0  # no onset is sought nearer to the start and the end [s]
 _EVERY = 5  # rows between two onsets tried
 _RAMPS_S = (20.0, 40.0, 60.0, 90.0, 130.0)
@@ -52,11 +56,20 @@ def scan(sight: Sight, skip: tuple[str, ...] = (), only: tuple[str, ...] = ()) -
 
 
 def candidates(sight: Sight) -> Iterator[tuple[Effect, str]]:
-    """Give every effect and what it may befall, those that show only in the scatter left out."""
+    """Give every effect and what it may befall that this calibration can judge; those of the scatter left out."""
     for effect in catalogue().values():
         if not effect.variance:
             for of in effect.of or ("",):
-                yield effect, of
+                if covered(sight.base, effect, of):
+                    yield effect, of
+
+
+def covered(base: Baseline, effect: Effect, of: str) -> bool:
+    """Tell whether the equation an effect shows in was calibrated well enough to judge it."""
+    if effect.channel in ("gyro", "imu"):
+        return base.vane  # an estimator's rates and velocity have lost the fault
+    equation = _SURFACE.get(of) or _SHOWS_IN.get(effect.channel)
+    return equation is None or base.r2.get(equation, 1.0) > WELL
 
 
 def _by_slope(sight: Sight, effect: Effect, of: str) -> list[Found]:

@@ -35,7 +35,7 @@ class Sight:
         self.ok = ok if span is None else ok & span
         self.noise = self._scaled()
         self.weather = is_weather(self.base)
-        self.nuisances: tuple[Nuisance, ...] = nuisances()
+        self.nuisances: tuple[Nuisance, ...] = nuisances(self.base.vane)
         self.grant(granted)
 
     def _scaled(self):  # type: ignore[no-untyped-def]
