@@ -7,12 +7,12 @@ import numpy as np
 
 from twin_worker.diagnose.baseline import CHANNELS, Baseline, Noise
 from twin_worker.diagnose.card import Card
+from twin_worker.diagnose.decide import best
 from twin_worker.diagnose.fit import fit, fit_timing, fit_wind, wind
 from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.nuisance import WIDEST, nuisances
 from twin_worker.diagnose.residual import Case
-from twin_worker.diagnose.decide import best
 from twin_worker.diagnose.sight import Sight, is_weather
 
 _ROUNDS = 10  # of expectation and maximisation
@@ -38,6 +38,7 @@ def calibrate(flights: Sequence[Flight], card: Card, say: Say = lambda word: Non
     vane = all(flight.vane for flight in flights)
     say("timing of servos and engine")
     timing = fit_timing(flights, card, vane)
+    card = replace(card, body=replace(card.body, lag=timing.servo + timing.delay))
     base, _ = fit(flights, card, timing, vane)
     say("leaving each flight out in turn")
     parts = list(flights) if len(flights) > 1 else halves(flights[0])
@@ -97,7 +98,9 @@ def _with_noise(base: Baseline, cases: list[Case]) -> Baseline:
 
 def _slopes(case: Case, granted: tuple[Guess, ...], rows: np.ndarray) -> np.ndarray:
     """Give how residuals change with each nuisance, (n, c, nuisances)."""
-    return np.stack([(case.residuals((*granted, n.guess(n.step))) - rows) / n.step for n in nuisances(case.base.vane)], axis=2)
+    return np.stack(
+        [(case.residuals((*granted, n.guess(n.step))) - rows) / n.step for n in nuisances(case.base.vane)], axis=2
+    )
 
 
 def _spreads(

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.effects import catalogue
 from twin_worker.diagnose.baseline import CHANNELS
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.refine import refine
@@ -14,7 +13,7 @@ from twin_worker.diagnose.sight import Sight
 
 MOST = 3  # effects named together
 _TRIED = 12  # guesses fitted properly at each step
-_LEAST = 150.0  # gain of a first effect
+_LEAST, _LEAST_COARSE = 150.0, 400.0  # gain of a first effect, by the accelerometer and without
 _CANCEL = 1.5  # an effect that gains this much more beside the others than all together only undoes one of them
 _SECOND = 220.0  # and of every further one
 _CHANCE = 1.2  # over what nominal flights reach by chance
@@ -126,9 +125,10 @@ def choose(sight: Sight, found: list[Found]) -> Named:
 def needed(sight: Sight, named: list[Named], found: Found) -> float:
     """Give the gain a guess must reach: more than chance, and a share of the first one's."""
     chance = _CHANCE * sight.base.chance.get(found.kind, 0.0)
+    least = _LEAST if sight.base.vane else _LEAST_COARSE
     if not named:
-        return max(_LEAST, chance)
-    return max(_SECOND, chance, (_SHARE if sight.base.vane else 0.25) * named[0].found.gain)
+        return max(least, chance)
+    return max(_SECOND, least, chance, (_SHARE if sight.base.vane else 0.25) * named[0].found.gain)
 
 
 def _again(sight: Sight, named: list[Named], weather: tuple[Guess, ...]) -> list[Named]:
@@ -153,8 +153,3 @@ def turbulent(sight: Sight) -> tuple[float, float]:
         return 0.0, 1.0
     rows = int(sight.ok.sum())
     return float(sum(rows * (x - 1 - np.log(x)) for x in ratio)), float(np.median(ratio))
-
-
-def variance_effects() -> list[str]:
-    """List the effects that show only in the scatter."""
-    return [name for name, effect in catalogue().items() if effect.variance]

@@ -43,7 +43,9 @@ def fit(flights: Sequence[Flight], card: Card, timing: Timing, vane: bool) -> tu
         winds = [fit_wind(case, w) for case, w in zip(cases, winds, strict=True)]
         made = [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)]
         base = replace(base, airspeed=_airspeed(cases, made))
-        base = replace(base, coef={"alpha": _solve(_Rows(cases, made, "alpha"), 0)[0], "beta": _side(cases, made, vane)})
+        base = replace(
+            base, coef={"alpha": _solve(_Rows(cases, made, "alpha"), 0)[0], "beta": _side(cases, made, vane)}
+        )
         cases = [Case(flight, base) for flight in flights]
         base = _moments(cases, [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)], base)
     return base, winds

@@ -85,7 +85,16 @@ def nuisances(vane: bool) -> tuple[Nuisance, ...]:
     add("wind_shear", 0.2)
     add("imu_misalignment", 0.002)
     add("airspeed_scale", 0.003)
-    floors = {"C_L": 0.004, "C_D": 0.0005, "C_l": 0.0001, "C_m": 0.0003, "C_n": 0.0001, "thrust": 0.005, "rho": 0.003, "side": 0.05}
+    floors = {
+        "C_L": 0.004,
+        "C_D": 0.0005,
+        "C_l": 0.0001,
+        "C_m": 0.0003,
+        "C_n": 0.0001,
+        "thrust": 0.005,
+        "rho": 0.003,
+        "side": 0.05,
+    }
     for of in _OFFSETS:
         out.append(Nuisance(of, DENSITY if of == "rho" else SCATTER, of, 0, floors[of], floors[of]))
     if not vane:

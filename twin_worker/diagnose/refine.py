@@ -1,4 +1,4 @@
-"""Fit one guess properly: Gauss-Newton on its parameters, onset by halving steps, an honest spread."""
+"""Fit one guess properly: Gauss-Newton on its parameters, its onset by halving steps."""
 
 import numpy as np
 
@@ -9,20 +9,19 @@ from twin_worker.diagnose.sight import Sight
 
 _ROUNDS = 5
 _ENOUGH = 0.5  # gain below which fitting stops
-_BLOCK = 50  # rows of a block of the sandwich, 10 s
 _MOVES_S = (8.0, 4.0, 2.0, 1.0, 0.5, 0.2)
 _STRETCH = (1.5, 1.2, 1.1)
 
 
-def refine(sight: Sight, guess: Guess, rounds: int = _ROUNDS) -> Found:
-    """Give the guess fitted, and its gain."""
+def refine(sight: Sight, guess: Guess, rounds: int = _ROUNDS, move: bool = True) -> Found:
+    """Give the guess fitted, and its gain; `move` its onset too."""
     before = sight.cost(())
     now = sight.cost((guess,))
     if now > before:
         half = guess.at(0.5 * np.array(guess.par))
         now, guess = min((now, guess), (sight.cost((half,)), half), key=lambda found: found[0])
     guess, now = _newton(sight, guess, now, rounds)
-    moved, cost = _onset(sight, guess, now)
+    moved, cost = _onset(sight, guess, now) if move else (guess, now)
     if moved is not guess:
         guess, now = _newton(sight, moved, cost, 2)
     return Found(before - now, guess)
@@ -78,21 +77,3 @@ def _onset(sight: Sight, guess: Guess, now: float) -> tuple[Guess, float]:
             if cost < now - 1e-9:
                 best, now = trial, cost
     return best, now
-
-
-def covariance(sight: Sight, guess: Guess) -> np.ndarray:
-    """Give the covariance of a fitted guess's parameters, (k, k): a sandwich over blocks of 10 s.
-
-    Honest under residuals that stay coloured or change their scatter.  Source: Newey & West 1987; White 1982.
-    """
-    J = sight.slopes(guess, steps(guess))
-    e = sight.clipped((guess,))
-    C = np.einsum("tci,tcj->ij", J, sight.Jn)
-    J = J - sight.Jn @ np.linalg.solve(sight.Ann, C.T)
-    k = J.shape[2]
-    inverse = np.linalg.pinv(np.einsum("tci,tcj->ij", J, J) + 1e-12 * np.eye(k))
-    score = np.einsum("tci,tc->ti", J, e)
-    blocks = np.add.reduceat(score, np.arange(0, len(score), _BLOCK), axis=0)
-    sandwich = inverse @ (blocks.T @ blocks) @ inverse
-    grow = np.sqrt(np.maximum(np.diag(inverse) / np.maximum(np.diag(sandwich), 1e-300), 1.0))
-    return sandwich * np.outer(grow, grow)

@@ -175,6 +175,7 @@ class Case:
             "airspeed": s.get("Va", np.zeros_like(Va)),
         }
         aside = {"mass": mass, "force": force, "c_z": c_z, "derived": derived, "f": f}
+        aside["delta"] = np.stack([d_a, d_e, d_r, d_t])
         aside |= {name: s.get(name, np.zeros_like(Va)) for name in ("a_x", "a_y", "a_z", "baro", "h")}
         aside |= {name: s[name] for name in ("phi", "theta", "phi_dot", "theta_dot", "psi_dot")}
         scale = {"X": q_S, "L": q_S * body.b, "N": q_S * body.b, "M": q_S * body.c}

@@ -147,7 +147,7 @@ class Simulation:
         flow.T = base.coef["T"] @ thrust
         flow.pitch, flow.yaw = base.coef["M"][3] * d_e, base.coef["N"][5] * d_r
         A, B = base.coef["alpha"], base.coef["beta"]
-        c_z = _lift(A, flow.alpha - A[0] - A[3] * q_hat - A[5] * d_e)
+        c_z = lift_of(A, flow.alpha - A[0] - A[3] * q_hat - A[5] * d_e)
         c_y = (flow.beta - B[0] - B[2] * p_hat - B[3] * r_hat - B[4] * d_r) / B[1]
         flow.C_L = -c_z
         add = self._increments(flow, (Stage.WRENCH, Stage.MASS))
@@ -192,7 +192,7 @@ class Simulation:
         )
 
 
-def _lift(A: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def lift_of(A: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Solve A1 c_z + A2 c_z2 = rest for c_z, the root near zero."""
     c_z = rest / A[1]
     for _ in range(3):

@@ -1,0 +1,183 @@
+"""One flight against the calibrated simulation: locate, name, model, prove."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from fleet.effects import Onset, Stage, catalogue
+from twin_worker.diagnose import foretell, prove
+from twin_worker.diagnose.baseline import CHANNELS, Baseline
+from twin_worker.diagnose.calibrate import own_weather
+from twin_worker.diagnose.decide import Named, decide, turbulent
+from twin_worker.diagnose.flight import Flight
+from twin_worker.diagnose.guess import ALWAYS, Guess
+from twin_worker.diagnose.prove import Proof
+from twin_worker.diagnose.report import Finding, Outcome, Report, Series, Tried
+from twin_worker.diagnose.residual import Case
+from twin_worker.diagnose.sight import Sight
+from twin_worker.diagnose.spread import covariances, told_sigma
+from twin_worker.diagnose.unexplained import free_form, stretches
+from twin_worker.diagnose.words import sentence
+
+HELD = 0.03  # share of the residual that must go on held-out data for a name
+_KEPT = 0.25  # of an effect's gain that must show on held-out data too
+_STRANGE = 3.0  # a channel's residual over its usual that is not let pass unexplained
+_LEFT = 2.6  # and the same beside named effects
+_EXPLAINED = 0.6  # share of the excess that names must explain
+_GUSTY = 450.0  # gain of turbulence
+_TELLING = [CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed", "baro")]
+
+Say = Callable[[str], None]
+
+
+def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Report:
+    """Diagnose one flight.
+
+    Args:
+        flight: as read; base: as calibrated
+        say: takes words of progress
+    """
+    begun = time.perf_counter()
+    case = Case(flight, base)
+    weather = own_weather(case)
+    sight = Sight(case, weather)
+    before, white_before = sight.left() / base.usual, _profiled(sight)
+    gusts, louder = turbulent(sight)
+    say("naming")
+    named = decide(sight, weather, say)
+    if gusts > _GUSTY and gusts > sum(one.found.gain for one in named):
+        named = []
+        sight.grant(weather)
+    guesses = tuple(one.found.guess for one in named)
+    after, white_after = sight.left() / base.usual, _profiled(sight)
+    ranking = tuple(Tried(f.guess.label, f.guess.when.kind, f.gain) for one in named for f in (one.found, *one.rivals))
+    say("proving")
+    proof = prove.held_out(case, weather, guesses, before) if named else Proof(np.nan, np.nan, (), ())
+    findings = _findings(sight, weather, named, proof)
+    if (gust := _gusts(sight, not named)) is not None:
+        findings = (*findings, gust)
+    outcome = _outcome(base, findings, proof, before, after)
+    force = foretell.forces(case, weather, proof.fitted)
+    series = _series(case, white_before, white_after, force)
+    where, terms = ("", ()), {}
+    if outcome is Outcome.UNKNOWN:
+        channel = _TELLING[int(np.argmax(after[_TELLING]))]
+        where = (CHANNELS[channel], stretches(case.t, white_after[:, channel], sight.ok))
+        terms = free_form(case, weather, channel)
+    report = Report(
+        flight=flight.name,
+        outcome=outcome,
+        sentence="",
+        findings=findings,
+        ratio_before=dict(zip(CHANNELS, before.tolist(), strict=True)),
+        ratio_after=dict(zip(CHANNELS, after.tolist(), strict=True)),
+        fit_before=proof.before,
+        fit_after=proof.after,
+        force_before=foretell.rms(case, force.measured - force.base),
+        force_after=foretell.rms(case, force.measured - force.model),
+        where=where,
+        terms=terms,
+        tried=ranking,
+        lacks=(*flight.lacks, *uncovered(base)),
+        series=series,
+        seconds=time.perf_counter() - begun,
+    )
+    return sentence(report)
+
+
+def uncovered(base: Baseline) -> tuple[str, ...]:
+    """Say which axes the nominal flights did not calibrate."""
+    from twin_worker.diagnose.scan import WELL
+
+    doublets = {"L": "roll", "M": "pitch", "N": "yaw"}
+    cure = {"L": "aileron", "M": "elevator", "N": "rudder"}
+    return tuple(
+        f"{doublets[name]} not covered: the nominal flights explain {base.r2.get(name, 0.0):.0%} of it; "
+        f"it needs {cure[name]} doublets"
+        for name in doublets
+        if base.r2.get(name, 1.0) <= WELL
+    )
+
+
+def _profiled(sight: Sight) -> np.ndarray:
+    e = sight.raw + sight.Jn @ sight.xn
+    return np.where(sight.ok[:, None], e, np.nan)
+
+
+def _findings(sight: Sight, weather: tuple[Guess, ...], named: list[Named], proof: Proof) -> tuple[Finding, ...]:
+    guesses = [one.found.guess for one in named]
+    if not named:
+        return ()
+    body = sight.base.card.body
+    out = []
+    for i, (one, covariance) in enumerate(zip(named, covariances(sight, weather, guesses), strict=True)):
+        guess = one.found.guess
+        surface = guess.of if guess.effect.stage is Stage.DELTA else ""
+        out.append(
+            Finding(
+                guess=guess,
+                gain=one.found.gain,
+                told=guess.effect.told(guess.effect, np.array(guess.par), body),
+                sigma=told_sigma(guess, covariance, body),
+                rivals=tuple(dict.fromkeys(rival.guess.effect.name for rival in one.rivals)),
+                channel=guess.effect.channel,
+                surface=surface,
+                segments=(_segment(guess, float(sight.case.t[0]), float(sight.case.t[-1])),),
+                held=proof.kept[i] / max(one.found.gain, 1e-9),
+            )
+        )
+    return tuple(out)
+
+
+def _segment(guess: Guess, first: float, last: float) -> tuple[float, float]:
+    if guess.when.kind is Onset.ALWAYS:
+        return first, last
+    if guess.when.kind is Onset.BUMP:
+        return guess.when.t0, guess.when.t0 + guess.when.T
+    return max(guess.when.t0, first), last
+
+
+def _gusts(sight: Sight, alone: bool) -> Finding | None:
+    """Name turbulence where what is left scatters as gusts do."""
+    gain, louder = turbulent(sight)
+    if gain < _GUSTY or not alone:
+        return None
+    effect = catalogue()["turbulence"]
+    made = sight.case.terms(sight.granted)
+    beta = np.radians(sight.case.residuals(sight.granted)[sight.ok][:, CHANNELS.index("side")])
+    intensity = float(np.sqrt(1.0 - 1.0 / louder) * beta.std() * np.median(made.flow.Va))
+    guess = Guess(effect, "", (intensity,), ALWAYS)
+    whole = (float(sight.case.t[0]), float(sight.case.t[-1]))
+    told = effect.told(effect, np.array([intensity]), sight.base.card.body)
+    return Finding(guess, gain, told, {name: 0.2 * x for name, x in told.items()}, (), "air", "", (whole,), 1.0)
+
+
+def _outcome(
+    base: Baseline, findings: tuple[Finding, ...], proof: Proof, before: np.ndarray, after: np.ndarray
+) -> Outcome:
+    gusty = any(one.guess.effect.variance for one in findings)
+    proven = gusty or (proof.gain >= HELD and all(one.held >= _KEPT / 2 for one in findings))
+    excess = [np.maximum(x[_TELLING] - 1.0, 0.0).sum() for x in (before, after)]
+    explained = 1.0 - excess[1] / max(excess[0], 1e-9)
+    if findings and proven:
+        lost = after[_TELLING].max() > _LEFT and explained < _EXPLAINED and not gusty
+        return Outcome.UNKNOWN if lost else Outcome.NAMED
+    if before[_TELLING].max() > _STRANGE:
+        return Outcome.UNKNOWN
+    return Outcome.SUSPECTED if findings else Outcome.NONE
+
+
+def _series(case: Case, before: np.ndarray, after: np.ndarray, force: foretell.Forces) -> Series:
+    place = np.column_stack([case.flight.place[::5], case.flight.readings["h"][::5]])
+    return Series(
+        t=case.t,
+        ok=case.ok,
+        place=place,
+        before=before,
+        after=after,
+        measured=force.measured,
+        base=force.base,
+        model=force.model,
+        held=foretell.blocks(case.t, odd=True),
+    )
