@@ -61,6 +61,11 @@ class Nuisance:
         return Guess(self.effect, self.of, tuple(par), ALWAYS)
 
     @property
+    def scatter(self) -> bool:
+        """Tell whether no effect stands for it, so that it can be handed to none."""
+        return self.of == "side"
+
+    @property
     def weather(self) -> bool:
         """Tell whether this is weather, of which any amount may be nominal."""
         return self.effect.name in ("wind_steady", "wind_shear")

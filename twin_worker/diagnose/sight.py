@@ -82,7 +82,7 @@ class Sight:
         """Find the nuisances, and hand those that leave their spread to the hypotheses."""
         more = np.ones(len(self.base.others))
         self.precision = np.array([*(1.0 / self._spread(n) ** 2 for n in self.nuisances), *more])
-        free = np.array([*(self.weather and n.weather for n in self.nuisances), *(more < 0)])
+        free = np.array([*(n.scatter or (self.weather and n.weather) for n in self.nuisances), *(more < 0)])
         flat = self.Jn.reshape(-1, self.Jn.shape[2])
         G, self.bn = flat.T @ flat, -flat.T @ self.e.ravel()
         for _ in range(6):
