@@ -1,4 +1,4 @@
-"""Name what explains a flight: up to three effects, re-chosen beside each other, each with what it cannot be told from."""
+"""Name what explains a flight: up to three effects, chosen beside each other, each with what it is not told from."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -21,10 +21,12 @@ from twin_worker.diagnose.unexplained import free_form, stretches
 from twin_worker.diagnose.words import sentence
 
 HELD = 0.03  # share of the residual that must go on held-out data for a name
-_KEPT = 0.25  # of an effect's gain that must show on held-out data too
+_TOLD = 0.10  # or of the error of forces told
+_KEPT = 0.15  # of an effect's gain that must show on held-out data too
 _STRANGE = 3.0  # a channel's residual over its usual that is not let pass unexplained
 _LEFT = 2.6  # and the same beside named effects
 _EXPLAINED = 0.6  # share of the excess that names must explain
+_OTHER = 1.7  # another aircraft flies faster or slower by this factor
 _GUSTY = 450.0  # gain of turbulence
 _TELLING = [CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed", "baro")]
 
@@ -37,13 +39,16 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     Args:
         flight: as read; base: as calibrated
         say: takes words of progress
+    Raises:
+        ValueError: when the flight cannot be of this aircraft; the sentence says why.
     """
     begun = time.perf_counter()
+    _fits(flight, base)
     case = Case(flight, base)
     weather = own_weather(case)
     sight = Sight(case, weather)
     before, white_before = sight.left() / base.usual, _profiled(sight)
-    gusts, louder = turbulent(sight)
+    gusts, _ = turbulent(sight)
     say("naming")
     named = decide(sight, weather, say)
     if gusts > _GUSTY and gusts > sum(one.found.gain for one in named):
@@ -57,10 +62,12 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     findings = _findings(sight, weather, named, proof)
     if (gust := _gusts(sight, not named)) is not None:
         findings = (*findings, gust)
-    outcome = _outcome(base, findings, proof, before, after)
     force = foretell.forces(case, weather, proof.fitted)
+    errors = [foretell.rms(case, force.measured - x) for x in (force.base, force.model)]
+    outcome = _outcome(findings, proof, 1.0 - errors[1] / errors[0], before, after)
     series = _series(case, white_before, white_after, force)
-    where, terms = ("", ()), {}
+    where: tuple[str, tuple[tuple[float, float], ...]] = ("", ())
+    terms: dict[str, float] = {}
     if outcome is Outcome.UNKNOWN:
         channel = _TELLING[int(np.argmax(after[_TELLING]))]
         where = (CHANNELS[channel], stretches(case.t, white_after[:, channel], sight.ok))
@@ -74,8 +81,8 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
         ratio_after=dict(zip(CHANNELS, after.tolist(), strict=True)),
         fit_before=proof.before,
         fit_after=proof.after,
-        force_before=foretell.rms(case, force.measured - force.base),
-        force_after=foretell.rms(case, force.measured - force.model),
+        force_before=errors[0],
+        force_after=errors[1],
         where=where,
         terms=terms,
         tried=ranking,
@@ -84,6 +91,21 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
         seconds=time.perf_counter() - begun,
     )
     return sentence(report)
+
+
+def _fits(flight: Flight, base: Baseline) -> None:
+    """Refuse a flight this simulation cannot be of."""
+    if base.vane and not flight.vane:
+        raise ValueError(
+            f"{flight.name}: found no accelerometer at 18 Hz or more, expected one as on the nominal flights; "
+            "calibrate on flights recorded like this one"
+        )
+    speed = float(np.median(np.hypot(flight.readings["v_n"], flight.readings["v_e"])[flight.ok]))
+    if not 1 / _OTHER < speed / base.speed < _OTHER:
+        raise ValueError(
+            f"{flight.name}: found {speed:.0f} m/s, expected about {base.speed:.0f} m/s as on the nominal flights; "
+            "give the model of this aircraft"
+        )
 
 
 def uncovered(base: Baseline) -> tuple[str, ...]:
@@ -154,10 +176,12 @@ def _gusts(sight: Sight, alone: bool) -> Finding | None:
 
 
 def _outcome(
-    base: Baseline, findings: tuple[Finding, ...], proof: Proof, before: np.ndarray, after: np.ndarray
+    findings: tuple[Finding, ...], proof: Proof, told: float, before: np.ndarray, after: np.ndarray
 ) -> Outcome:
+    """Decide; `told` is the share of the error of forces held out that went."""
     gusty = any(one.guess.effect.variance for one in findings)
-    proven = gusty or (proof.gain >= HELD and all(one.held >= _KEPT / 2 for one in findings))
+    gained = proof.gain >= HELD or told >= _TOLD
+    proven = gusty or (gained and all(one.held >= _KEPT and not _at_its_end(one) for one in findings))
     excess = [np.maximum(x[_TELLING] - 1.0, 0.0).sum() for x in (before, after)]
     explained = 1.0 - excess[1] / max(excess[0], 1e-9)
     if findings and proven:
@@ -166,6 +190,14 @@ def _outcome(
     if before[_TELLING].max() > _STRANGE:
         return Outcome.UNKNOWN
     return Outcome.SUSPECTED if findings else Outcome.NONE
+
+
+def _at_its_end(one: Finding) -> bool:
+    """Tell whether a parameter that counts stopped at what is physically possible: then it is no explanation."""
+    return any(
+        x and x in (p.low, p.high) and not p.aside
+        for p, x in zip(one.guess.effect.parameters, one.guess.par, strict=True)
+    )
 
 
 def _series(case: Case, before: np.ndarray, after: np.ndarray, force: foretell.Forces) -> Series:

@@ -82,7 +82,7 @@ def _side(cases: list[Case], made: list[Terms], vane: bool) -> np.ndarray:
 
 
 class _Rows:
-    """An equation's terms, dimensional, (n, k), and its measured side, (n,), over all flights; and which follow trusted ones."""
+    """An equation's terms, dimensional, (n, k), and measured side, (n,), over all flights; which rows to trust."""
 
     def __init__(
         self, cases: list[Case], made: list[Terms], name: str, more: Callable[[Terms], np.ndarray] | None = None

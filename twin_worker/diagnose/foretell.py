@@ -48,7 +48,8 @@ def forces(case: Case, weather: tuple[Guess, ...], fitted: tuple[Guess, ...]) ->
     measured = before.aside["f"].T
     ways = [w for w in product(LIFT, SIDE, PRESSURE) if w[2] == "velocity" or "Va" in case.flight.readings]
     if not fitted:
-        return Forces(measured, *[tell(case, before, ways[0])] * 2, ways[0])
+        told = tell(case, before, ways[0])
+        return Forces(measured, told, told, ways[0])
     even = case.ok & blocks(case.t, odd=False)
 
     def gained(way: tuple[str, str, str]) -> float:

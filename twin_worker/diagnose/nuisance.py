@@ -100,8 +100,7 @@ def nuisances(vane: bool) -> tuple[Nuisance, ...]:
         "rho": 0.003,
         "side": 0.05,
     }
-    for of in _OFFSETS:
-        out.append(Nuisance(of, DENSITY if of == "rho" else SCATTER, of, 0, floors[of], floors[of]))
+    out += [Nuisance(of, DENSITY if of == "rho" else SCATTER, of, 0, floors[of], floors[of]) for of in _OFFSETS]
     if not vane:
         out += [Nuisance(of, SCATTER, of, 0, _SHARE, _SHARE) for of in _SHARES]
     return tuple(out)

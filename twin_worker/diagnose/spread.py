@@ -1,6 +1,7 @@
 """Honest standard deviations: what the residuals leave open, and how far parts of the flight disagree."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -37,7 +38,7 @@ def told_sigma(guess: Guess, covariance: np.ndarray, body: object) -> dict[str, 
     effect, par = guess.effect, np.array(guess.par)
     here = effect.told(effect, par, body)  # type: ignore[arg-type]
     h = steps(guess) * 1e-2
-    J = {}
+    J: dict[str, np.ndarray] = {}
     for k in range(len(par)):
         moved = effect.told(effect, par + h[k] * np.eye(len(par))[k], body)  # type: ignore[arg-type]
         for name, x in moved.items():
@@ -78,7 +79,7 @@ def _jackknife(sight: Sight, granted: tuple[Guess, ...], guess: Guess) -> np.nda
         return np.zeros((len(guess.par),) * 2)
     edges = np.quantile(at_work, np.linspace(0, 1, _PARTS + 1))
     fits = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges):
         part = Sight(sight.case, granted, (t < low) | (t >= high))
         fits.append(refine(part, guess, rounds=2, move=False).guess.par)
     away = np.array(fits) - np.mean(fits, axis=0)

@@ -1,0 +1,48 @@
+"""Find where a flight and its simulation part ways, what physics was left out, and prove it on data held out."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from fleet.children import run_until
+from fleet.cli import stop_on_signal
+
+EXAMPLES = """
+  fleet diagnose flight.tlog --model skywalker.json
+  fleet diagnose friday/*.tlog.xz --model skywalker.json --json friday.json --report friday
+  fleet diagnose real.tlog --against simulated.tlog --airframe skywalker     your own simulator is what gets corrected
+"""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options; `python -m twin_worker.diagnose` takes the same."""
+    parser.add_argument("file", nargs="+", type=Path, metavar="FLIGHT", help="recordings of any kind, also compressed")
+    parser.add_argument("--model", type=Path, metavar="MODEL", help="what `fleet calibrate` wrote")
+    parser.add_argument(
+        "--against", type=Path, nargs="+", metavar="SIMULATED", help="or recordings of a simulator flying such missions"
+    )
+    parser.add_argument("--airframe", type=Path, metavar="CARD", help="with --against: the aircraft, as for calibrate")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write verdicts to OUT, predictions beside it")
+    parser.add_argument(
+        "--report", type=Path, metavar="DIR", help="write figures, a page and corrected models into DIR"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start the diagnosis; its exit code is ours.
+
+    Raises:
+        ValueError: when it is not said what to compare with.
+    """
+    if bool(args.model) == bool(args.against):
+        raise ValueError("expected either --model or --against; name one thing to compare the flights with")
+    stop = stop_on_signal()
+    options = [
+        f"--{name}={getattr(args, name)}" for name in ("model", "airframe", "json", "report") if getattr(args, name)
+    ]
+    simulated = ["--against", *map(str, args.against)] if args.against else []
+    code = run_until(stop, "twin_worker.diagnose", *options, *simulated, "--", *map(str, args.file))
+    if stop.is_set():
+        print("diagnose: stopped; what was not finished is not written", file=sys.stderr)
+        return 0
+    return code
