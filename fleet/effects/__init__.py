@@ -172,6 +172,7 @@ class Effect:
         examples: three magnitudes, small to large
         confused: effect -> what tells them apart
         variance: it shows in the scatter of residuals, not in their mean
+        takes_lag: its first parameter adds to the healthy servo's lag, and it stands for both
     """
 
     name: str
@@ -188,6 +189,7 @@ class Effect:
     starts: tuple[tuple[float, ...], ...] = ()
     confused: Mapping[str, str] = field(default_factory=dict)
     variance: bool = False
+    takes_lag: bool = False
 
     @property
     def size(self) -> int:

@@ -34,6 +34,7 @@ EFFECT = Effect(
     parameters=(Parameter("tau_s", "s", "time constant added", step=0.02, low=0.0, high=2.0),),
     act=act,
     told=told,
+    takes_lag=True,
     of=(*SURFACES, ALL_SURFACES),
     starts=((0.06,), (0.12,), (0.2,), (0.3,), (0.45,), (0.7,)),
     examples=((0.15,), (0.25,), (0.5,)),

@@ -69,11 +69,13 @@ class Case:
         """Give what one input does behind servo, lag and delay: angle [rad] or throttle, on the grid."""
         timing = self.base.timing
         u = np.ascontiguousarray(self.flight.commands[:, column], float)
+        tau = timing.engine if column == 3 else timing.servo
         for guess in acting:
             u, memory = u.copy(), np.full(MEMORY, u[0])
             par = np.asarray(guess.par)[:, None] * guess.when.gate(self.flight.t)
+            if guess.effect.takes_lag:
+                par[0], tau = par[0] + tau, 0.0
             guess.effect.act(u, memory, DT, np.ascontiguousarray(par))
-        tau = timing.engine if column == 3 else timing.servo
         if tau > 1e-3:  # exact between commands joined by straight lines
             a = exp(-DT / tau)
             mean = (1 - a) * tau / DT

@@ -66,12 +66,12 @@ class Simulation:
         commands, speed = np.empty((n, 4, self.runs)), np.empty((n, self.runs))
         memories: dict[tuple[int, int], np.ndarray] = {}
         acting: np.ndarray | None = None
-        used = np.zeros(self.runs)
+        used, share = np.zeros(self.runs), self._share()
         for k in range(n):
             t = self.begins + k * DT
             states[k], commands[k] = x, pilot(k, x)
             moved = self._moved(commands[k], t, memories)
-            acting = moved if acting is None else acting + self._share() * (moved - acting)
+            acting = moved if acting is None else acting + share * (moved - acting)
             used += commands[k, 3] * DT
             delta = self._angles(acting)
             k1, force[k], speed[k] = self.rates(x, delta, t, used)
@@ -86,7 +86,12 @@ class Simulation:
     def _share(self) -> np.ndarray:
         timing = self.base.timing
         tau = np.array([timing.servo + timing.delay] * 3 + [timing.engine])
-        return (1.0 - np.exp(-DT / np.maximum(tau, 1e-3)))[:, None]
+        share = np.repeat((1.0 - np.exp(-DT / np.maximum(tau, 1e-3)))[:, None], self.runs, axis=1)
+        for run, guess in self._servos:
+            for column, name in enumerate(SURFACES):
+                if guess.effect.takes_lag and guess.of in (name, ALL_SURFACES):
+                    share[column, run] = 1.0
+        return share
 
     def _moved(self, commands: np.ndarray, t: np.ndarray, memories: dict[tuple[int, int], np.ndarray]) -> np.ndarray:
         """Have faulty servos do to the commands what they do."""
@@ -98,6 +103,8 @@ class Simulation:
                 u = out[column, run : run + 1].copy()
                 memory = memories.setdefault((run, column, id(guess)), np.full(MEMORY, u[0]))  # type: ignore[arg-type]
                 par = np.asarray(guess.par)[:, None] * guess.when.gate(t[run : run + 1])
+                if guess.effect.takes_lag:
+                    par[0] += self.base.timing.servo + self.base.timing.delay
                 guess.effect.act(u, memory, DT, par)
                 out[column, run] = u[0]
         return out
