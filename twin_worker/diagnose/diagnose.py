@@ -26,7 +26,9 @@ _KEPT = 0.15  # of an effect's gain that must show on held-out data too
 _STRANGE = 3.0  # a channel's residual over its usual that is not let pass unexplained
 _LEFT = 2.6  # and the same beside named effects
 _EXPLAINED = 0.6  # share of the excess that names must explain
+_DOUBT = 2.0  # standard deviations below which a number is none
 _OTHER = 1.7  # another aircraft flies faster or slower by this factor
+_GUESSED = 0.2  # doubt of a turbulence's intensity, as a share of it
 _GUSTY = 450.0  # gain of turbulence
 _TELLING = [CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed", "baro")]
 
@@ -60,6 +62,8 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     say("proving")
     proof = prove.held_out(case, weather, guesses, before) if named else Proof(np.nan, np.nan, (), ())
     findings = _findings(sight, weather, named, proof)
+    if not any(map(_significant, findings)):
+        findings = ()
     if (gust := _gusts(sight, not named)) is not None:
         findings = (*findings, gust)
     force = foretell.forces(case, weather, proof.fitted)
@@ -142,6 +146,7 @@ def _findings(sight: Sight, weather: tuple[Guess, ...], named: list[Named], proo
                 gain=one.found.gain,
                 told=guess.effect.told(guess.effect, np.array(guess.par), body),
                 sigma=told_sigma(guess, covariance, body),
+                doubt=tuple(np.sqrt(np.diag(covariance)).tolist()),
                 rivals=tuple(dict.fromkeys(rival.guess.effect.name for rival in one.rivals)),
                 channel=guess.effect.channel,
                 surface=surface,
@@ -172,7 +177,8 @@ def _gusts(sight: Sight, alone: bool) -> Finding | None:
     guess = Guess(effect, "", (intensity,), ALWAYS)
     whole = (float(sight.case.t[0]), float(sight.case.t[-1]))
     told = effect.told(effect, np.array([intensity]), sight.base.card.body)
-    return Finding(guess, gain, told, {name: 0.2 * x for name, x in told.items()}, (), "air", "", (whole,), 1.0)
+    sigma = {name: _GUESSED * x for name, x in told.items()}
+    return Finding(guess, gain, told, sigma, (_GUESSED * intensity,), (), "air", "", (whole,), 1.0)
 
 
 def _outcome(
@@ -181,7 +187,8 @@ def _outcome(
     """Decide; `told` is the share of the error of forces held out that went."""
     gusty = any(one.guess.effect.variance for one in findings)
     gained = proof.gain >= HELD or told >= _TOLD
-    proven = gusty or (gained and all(one.held >= _KEPT and not _at_its_end(one) for one in findings))
+    sound = all(one.held >= _KEPT and _significant(one) and not _at_its_end(one) for one in findings)
+    proven = gusty or (gained and sound)
     excess = [np.maximum(x[_TELLING] - 1.0, 0.0).sum() for x in (before, after)]
     explained = 1.0 - excess[1] / max(excess[0], 1e-9)
     if findings and proven:
@@ -190,6 +197,12 @@ def _outcome(
     if before[_TELLING].max() > _STRANGE:
         return Outcome.UNKNOWN
     return Outcome.SUSPECTED if findings else Outcome.NONE
+
+
+def _significant(one: Finding) -> bool:
+    """Tell whether any number that counts is larger than its doubt."""
+    counted = zip(one.guess.effect.parameters, one.guess.par, one.doubt, strict=True)
+    return any(abs(x) > _DOUBT * doubt and not p.aside for p, x, doubt in counted)
 
 
 def _at_its_end(one: Finding) -> bool:

@@ -25,6 +25,7 @@ class Finding:
         guess: as fitted
         gain: drop of the whitened sum of squares
         told, sigma: its numbers in the units people want, and their standard deviations
+        doubt: standard deviations of the effect's own parameters
         rivals: names of effects it cannot be told from
         channel, surface: where it lives; surface may be empty
         segments: when, seconds since the flight's zero
@@ -35,6 +36,7 @@ class Finding:
     gain: float
     told: dict[str, float]
     sigma: dict[str, float]
+    doubt: tuple[float, ...]
     rivals: tuple[str, ...]
     channel: str
     surface: str
