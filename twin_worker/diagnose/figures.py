@@ -1,0 +1,143 @@
+"""Pictures of a diagnosis: where on the path, residuals, measured against simulated, what else was thought of."""
+
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from fleet.page.ink import INK, MUTED
+from fleet.sheet import plain
+from twin_worker.diagnose.marks import LEGEND, SAID, empty, marks, span, times
+from twin_worker.diagnose.report import Outcome, Report, Tried
+from twin_worker.diagnose.traces import residuals, simulated
+from twin_worker.paper_figures import house
+
+KINDS = ("path", "residuals", "simulated", "candidates")
+_LETTERS = 50  # of a flight's name in a file's name
+_TITLE = 60  # of a flight's name in a title
+_BARS = 12
+_DPI = 110  # a page is about as wide as the figures
+
+
+def draw(report: Report, folder: Path, stem: str = "") -> list[Path]:
+    """Draw the pictures of one flight into a folder; give the files, in the order of `KINDS`.
+
+    Args:
+        report: of the flight
+        folder: made where it is missing
+        stem: what the files' names begin with; otherwise made from the flight's name
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    stem = stem or stems([report.flight])[0]
+    name = plain(report.flight)
+    shown = replace(report, flight=name if len(name) <= _TITLE else name[: _TITLE - 2] + " …")
+    made = [folder / f"{stem}-{kind}.png" for kind in KINDS]
+    with matplotlib.rc_context({"text.parse_math": False}), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a letter no font has is a box, not an error
+        for path, picture in zip(made, (_path, residuals, simulated, _candidates), strict=True):
+            picture(shown).savefig(path, dpi=_DPI)
+    return made
+
+
+def stems(flights: Sequence[str]) -> list[str]:
+    """Give every flight a name for its files that cannot leave the folder, no two alike."""
+    out: list[str] = []
+    for flight in flights:
+        safe = re.sub(r"[^\w.-]+", "_", flight).lstrip(".-")[:_LETTERS] or "flight"
+        found, number = safe, 1
+        while found in out:
+            number += 1
+            found = f"{safe}-{number}"
+        out.append(found)
+    return out
+
+
+def _path(report: Report) -> Figure:
+    """Draw the flight from above and its height over time, what was located in colour."""
+    series = report.series
+    figure = Figure(figsize=(11, 5.4), layout="constrained")
+    above, height = figure.subplots(1, 2, width_ratios=(1.15, 1))
+    north, east, up = series.place.T
+    known = np.isfinite(series.place).all(axis=1)
+    for ax, x, y in ((above, east, north), (height, series.t, up)):
+        ax.plot(x, y, color=MUTED, lw=1.0, label="flown" if ax is above else None)
+        _located(ax, report, x, y)
+        if known.any():
+            first = int(np.argmax(known))
+            label = "start" if ax is above else None
+            ax.plot(x[first], y[first], "o", color=INK, mfc="white", ms=7, zorder=6, label=label)
+        else:
+            empty(ax, "no position")
+    above.set_aspect("equal", adjustable="datalim")
+    above.set(xlabel="east [m]", ylabel="north [m]")
+    height.set(xlabel="time [s]", ylabel="height [m]", xlim=span(series))
+    house(above, "from above")
+    house(height, "height over time")
+    figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3, **LEGEND)
+    figure.suptitle(f"{report.flight}: {SAID[report.outcome]}", fontsize=10, color=INK)
+    return figure
+
+
+def _located(ax: Any, report: Report, x: np.ndarray, y: np.ndarray) -> None:
+    """Colour what was located; several at one time lie on each other, the first widest."""
+    found = marks(report)
+    for k, mark in enumerate(found):
+        rows = mark.rows(report.series.t)
+        width = 2.2 + 2.2 * (len(found) - 1 - k)
+        label = f"{mark.name}: {times(mark.segments)}"
+        ax.plot(np.where(rows, x, np.nan), np.where(rows, y, np.nan), color=mark.colour, lw=width, label=label)
+
+
+def _candidates(report: Report) -> Figure:
+    """Draw what every candidate gains: the chosen in colour, what cannot be told from them hatched."""
+    tried = sorted(report.tried, key=lambda one: -one.gain)[:_BARS]
+    figure = Figure(figsize=(9, 0.3 * max(len(tried), 4) + 1.5), layout="constrained")
+    ax = figure.subplots()
+    chosen = {one.guess.label: mark.colour for one, mark in zip(report.findings, marks(report), strict=False)}
+    rivals = {name for one in report.findings for name in one.rivals}
+    seen: set[str] = set()
+    for place, one in enumerate(tried):
+        looks: dict[str, Any] = {"color": MUTED, "alpha": 0.45}
+        if one.label in chosen and one.label not in seen:
+            looks = {"color": chosen[one.label]}
+        elif one.label.split(":")[0] in rivals:
+            looks = _RIVAL
+        seen.add(one.label)
+        ax.barh(place, max(one.gain, 0.0), height=0.68, **looks)
+        ax.annotate(f"{one.gain:,.0f}", (max(one.gain, 0.0), place), (4, 0), textcoords="offset points", **_SMALL)
+    if not tried:
+        empty(ax, "no candidate gained anything worth ranking")
+    ax.set_yticks(range(len(tried)), [_named(one) for one in tried])
+    ax.invert_yaxis()
+    ax.margins(x=0.1)
+    ax.set_axisbelow(True)
+    ax.set_xlabel("gain: drop of the whitened sum of squares", fontsize=9, color=INK)
+    house(ax, f"{report.flight}: what was thought of, the best {len(tried)} of {len(report.tried)}")
+    ax.tick_params(axis="y", labelsize=8, labelcolor=INK, length=0)
+    ax.grid(visible=False, axis="y")
+    figure.legend(handles=_key(report, chosen), loc="outside lower center", ncols=4, **LEGEND)
+    return figure
+
+
+_RIVAL: Any = {"facecolor": "white", "edgecolor": INK, "hatch": "////", "lw": 0.8}
+_SMALL: Any = {"fontsize": 8, "color": INK, "va": "center"}
+
+
+def _named(one: Tried) -> str:
+    return f"{one.label}  {one.since}".strip()
+
+
+def _key(report: Report, chosen: dict[str, str]) -> list[Patch]:
+    """Explain the bars."""
+    word = "chosen, proven" if report.outcome is Outcome.NAMED else "chosen, not proven"
+    key = [Patch(color=colour, label=f"{word}: {label}") for label, colour in chosen.items()]
+    if any(one.rivals for one in report.findings):
+        key.append(Patch(**_RIVAL, label="cannot be told from it"))
+    return [*key, Patch(color=MUTED, alpha=0.45, label="other candidates")]

@@ -1,0 +1,199 @@
+"""One self-contained page for people: what was found in every flight, how it shows, what else it may be."""
+
+import base64
+from collections.abc import Iterator, Sequence
+from html import escape
+from math import floor, isfinite, log10
+from pathlib import Path
+
+from fleet.effects import Effect
+from fleet.page.ink import BAD, GOOD, GRID, INK, LINES, MUTED, ROUTE
+from fleet.sheet import plain
+from twin_worker.diagnose.figures import draw, stems
+from twin_worker.diagnose.marks import MEANING, SAID, times
+from twin_worker.diagnose.report import Finding, Outcome, Report
+
+_UNITS = {  # the last letters of a number's name; the first that fits
+    "mps_per_100m": "m/s per 100 m",
+    "_per_100s": "per 100 s",
+    "_per_rad": "1/rad",
+    "_per_s": "1/s",
+    "_mps2": "m/s²",
+    "_mps": "m/s",
+    "_dps": "°/s",
+    "_deg": "°",
+    "_kg": "kg",
+    "_m": "m",
+    "_s": "s",
+}
+_CAPTIONS = (
+    "Where: the path from above and over time, what was located in colour",
+    "How it shows: residuals before and after",
+    "Proof: measured against simulated; shaded blocks were held out of the fit",
+    "What else was thought of",
+)
+_GUARD = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # nothing is fetched, nothing runs
+_COLOURS = {"ink": INK, "muted": MUTED, "line": GRID, "good": GOOD, "bad": BAD, "doubt": LINES[3], "odd": ROUTE}
+
+
+def write(reports: Sequence[Report], folder: Path) -> Path:
+    """Write `index.html` with its figures inside, and the figures beside it; give the page's path.
+
+    Args:
+        reports: one for each flight, in the order they shall appear
+        folder: made where it is missing
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    names = stems([report.flight for report in reports])
+    sections = [
+        _section(report, k, draw(report, folder, stem))
+        for k, (report, stem) in enumerate(zip(reports, names, strict=True), 1)
+    ]
+    path = folder / "index.html"
+    path.write_text(_page(reports, sections), encoding="utf-8")
+    return path
+
+
+def _page(reports: Sequence[Report], sections: Sequence[str]) -> str:
+    colours = "".join(f"--{name}:{colour};" for name, colour in _COLOURS.items())
+    style = f":root{{{colours}}}\n" + Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+    title = f"Diagnosis of {_safe(reports[0].flight) if len(reports) == 1 else f'{len(reports)} flights'}"
+    head = (
+        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_GUARD}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    )
+    overview = _overview(reports) if len(reports) != 1 else ""
+    body = "\n".join((overview, *sections))
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head>{head}<title>{title}</title>\n<style>{style}</style></head>\n'
+        f"<body><main>\n{body}\n</main></body></html>\n"
+    )
+
+
+def _overview(reports: Sequence[Report]) -> str:
+    """Tabulate every flight with its sentence."""
+    rows = "".join(
+        f'<tr><td>{_chip(one.outcome)}</td><td><a href="#flight-{k}">{_safe(one.flight)}</a></td>'
+        f'<td>{_safe(one.sentence)}</td><td class="num">{_change(one.fit_before, one.fit_after)}</td></tr>'
+        for k, one in enumerate(reports, 1)
+    )
+    head = "<tr><th>outcome</th><th>flight</th><th>in a sentence</th><th class='num'>held-out residual</th></tr>"
+    return f'<h1>Diagnosis of {len(reports)} flights</h1>\n<table class="all">{head}{rows}</table>'
+
+
+def _section(report: Report, number: int, figures: Sequence[Path]) -> str:
+    parts = (
+        f'<h2 id="flight-{number}">{_chip(report.outcome)} {_safe(report.flight)}</h2>',
+        f'<p class="say">{_safe(report.sentence)}</p>',
+        _cards(report),
+        *(_finding(one) for one in report.findings),
+        _unknown(report),
+        _lacks(report),
+        *_figures(report, figures),
+    )
+    return "<section>" + "\n".join(filter(None, parts)) + "</section>"
+
+
+def _cards(report: Report) -> str:
+    """Say what the proof is: errors on data held out, before and after."""
+    told = {
+        "residual on held-out blocks, whitened rms": _change(report.fit_before, report.fit_after),
+        "simulated specific force on held-out blocks, rms error [m/s²]": _change(
+            report.force_before, report.force_after
+        ),
+        "computed in": f"{report.seconds:.1f} s",
+    }
+    cards = "".join(f'<div class="card"><b>{value}</b>{words}</div>' for words, value in told.items() if value)
+    return f'<div class="cards">{cards}</div>'
+
+
+def _finding(one: Finding) -> str:
+    """Describe one effect: numbers, where and when, what it cannot be told from."""
+    effect = one.guess.effect
+    where = ", ".join(filter(None, (one.channel, one.surface)))
+    rows = "".join(
+        f'<tr><td>{_safe(name)}</td><td class="num">{amount(value, one.sigma.get(name, float("nan")))}</td>'
+        f"<td>{_safe(unit(name, effect))}</td></tr>"
+        for name, value in one.told.items()
+    )
+    rivals = ", ".join(_rival(name, effect) for name in one.rivals) or "nothing else in the catalogue"
+    held = f"takes {100 * one.held:.0f} % of the held-out residual, " if one.held else ""
+    return (
+        f"<h3>{_safe(one.guess.label)}</h3><p><code>{_safe(effect.equation)}</code></p>"
+        f"<p>Where: {_safe(where)}. When: {times(one.segments)}. "
+        f'<span class="soft">{held}gain {one.gain:,.0f}</span></p>'
+        f'<table><tr><th>number</th><th class="num">value ± standard deviation</th><th>unit</th></tr>{rows}</table>'
+        f"<p>Cannot be told from: {rivals}.</p>"
+    )
+
+
+def _rival(name: str, effect: Effect) -> str:
+    """Name a rival, and what would tell it apart where the effect knows."""
+    apart = effect.confused.get(name)
+    return f"<b>{_safe(name)}</b>" + (f' <span class="soft">({_safe(apart)})</span>' if apart else "")
+
+
+def _unknown(report: Report) -> str:
+    """Say where something unknown lives, and the term that describes it."""
+    if report.outcome is not Outcome.UNKNOWN:
+        return ""
+    channel, segments = report.where
+    where = _safe(MEANING.get(channel, channel) or "no one channel")
+    said = f"<h3>Unknown</h3><p>Where: {where}. When: {times(segments)}.</p>"
+    if not report.terms:
+        return said
+    rows = "".join(
+        f'<tr><td>{_safe(term)}</td><td class="num">{coefficient:.3g}</td></tr>'
+        for term, coefficient in report.terms.items()
+    )
+    head = '<tr><th>term</th><th class="num">coefficient</th></tr>'
+    words = "A free-form term that fits it. It is no physics: it describes, it does not explain."
+    return f"{said}<p>{words}</p><table>{head}{rows}</table>"
+
+
+def _lacks(report: Report) -> str:
+    items = "".join(f"<li>{_safe(words)}</li>" for words in report.lacks)
+    return f"<h3>What was lacking</h3><ul>{items}</ul>" if items else ""
+
+
+def _figures(report: Report, figures: Sequence[Path]) -> Iterator[str]:
+    for path, caption in zip(figures, _CAPTIONS, strict=True):
+        data = base64.b64encode(path.read_bytes()).decode()
+        yield (
+            f"<figure><figcaption>{caption}</figcaption>"
+            f'<img alt="{_safe(report.flight)}: {caption}" src="data:image/png;base64,{data}"></figure>'
+        )
+
+
+def amount(value: float, sigma: float) -> str:
+    """Write a value and its standard deviation, both to the second digit of the latter."""
+    if not isfinite(value):
+        return "not known"
+    if not (isfinite(sigma) and sigma > 0.0):
+        return f"{value:.3g} ± not known"
+    digits = min(max(1 - floor(log10(sigma)), 0), 9)
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
+
+
+def unit(name: str, effect: Effect) -> str:
+    """Give the unit of a number: its name's suffix, or what the effect says of a parameter of that name."""
+    suffix = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
+    own = next((p.unit for p in effect.parameters if p.name == name), "")
+    return suffix or own.removeprefix("-") or "–"
+
+
+def _change(before: float, after: float) -> str:
+    """Write before → after and the share gone; nothing where nothing is known."""
+    if not (isfinite(before) and isfinite(after)):
+        return f"{before:.2f}" if isfinite(before) else ""
+    share = f" ({100 * (after / before - 1):+.0f} %)" if before > 0.0 else ""
+    return f"{before:.2f} → {after:.2f}{share}"
+
+
+def _chip(outcome: Outcome) -> str:
+    return f'<span class="chip {outcome.value}">{SAID[outcome]}</span>'
+
+
+def _safe(text: str) -> str:
+    """Escape what came with the data: a flight is named after its file."""
+    return escape(plain(text))
