@@ -131,12 +131,14 @@ def test_what_is_not_there_is_left_blank(tmp_path: Path) -> None:
     assert "force_x" not in names and "1 without data" in title
 
 
-def test_only_channels_that_differ_are_drawn_and_the_others_counted() -> None:
+def test_only_channels_that_differ_are_drawn_and_the_others_counted(tmp_path: Path) -> None:
     report = made()
     ratios = dict.fromkeys(CHANNELS, 1.0)
     names, title = chosen(replace(report, ratio_before=ratios | {"pitch": 9.0, "lift": 12.0}))
     assert names == ["lift", "pitch"] and title == "12 of 14 channels at their usual"
-    names, title = chosen(replace(report, ratio_before=dict.fromkeys(CHANNELS, 2.0)))
+    wide = replace(report, ratio_before=dict.fromkeys(CHANNELS, 2.0))
+    assert all(path.stat().st_size < 300_000 for path in draw(wide, tmp_path))
+    names, title = chosen(wide)
     assert len(names) == 8 and "0 of 14" in title and "worst 8 of the other 14" in title
     names, title = chosen(replace(report, ratio_before=ratios))
     assert len(names) == 4 and "14 of 14" in title

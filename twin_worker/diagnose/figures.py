@@ -1,5 +1,6 @@
 """Pictures of a diagnosis: where on the path, residuals, measured against simulated, what else was thought of."""
 
+import io
 import re
 import warnings
 from collections.abc import Sequence
@@ -11,19 +12,23 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from PIL import Image
 
 from fleet.page.ink import INK, MUTED
 from fleet.sheet import plain
 from twin_worker.diagnose.marks import LEGEND, SAID, empty, marks, span, times
-from twin_worker.diagnose.report import Outcome, Report, Tried
+from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.diagnose.traces import residuals, simulated
 from twin_worker.paper_figures import house
 
 KINDS = ("path", "residuals", "simulated", "candidates")
 _LETTERS = 50  # of a flight's name in a file's name
-_TITLE = 60  # of a flight's name in a title
+_TITLE = 40  # of a flight's name in a title
 _BARS = 12
+_RIVAL: Any = {"facecolor": "white", "edgecolor": INK, "hatch": "////", "lw": 0.8}
+_SMALL: Any = {"fontsize": 8, "color": INK, "va": "center"}
 _DPI = 110  # a page is about as wide as the figures
+_INKS = 96  # a picture of so many colours is a third as large, and a page holds four for every flight
 
 
 def draw(report: Report, folder: Path, stem: str = "") -> list[Path]:
@@ -42,8 +47,16 @@ def draw(report: Report, folder: Path, stem: str = "") -> list[Path]:
     with matplotlib.rc_context({"text.parse_math": False}), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a letter no font has is a box, not an error
         for path, picture in zip(made, (_path, residuals, simulated, _candidates), strict=True):
-            picture(shown).savefig(path, dpi=_DPI)
+            _save(picture(shown), path)
     return made
+
+
+def _save(figure: Figure, path: Path) -> None:
+    """Save a picture small."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=_DPI)
+    with Image.open(drawn) as picture:
+        picture.convert("RGB").quantize(_INKS, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def stems(flights: Sequence[str]) -> list[str]:
@@ -72,12 +85,14 @@ def _path(report: Report) -> Figure:
         if known.any():
             first = int(np.argmax(known))
             label = "start" if ax is above else None
-            ax.plot(x[first], y[first], "o", color=INK, mfc="white", ms=7, zorder=6, label=label)
+            ax.plot(x[first], y[first], "o", color=INK, mfc="white", ms=7, zorder=6, clip_on=False, label=label)
         else:
             empty(ax, "no position")
     above.set_aspect("equal", adjustable="datalim")
-    above.set(xlabel="east [m]", ylabel="north [m]")
-    height.set(xlabel="time [s]", ylabel="height [m]", xlim=span(series))
+    height.set_xlim(*span(series))
+    for ax, words in ((above, ("east [m]", "north [m]")), (height, ("time [s]", "height [m]"))):
+        ax.set_xlabel(words[0], fontsize=9, color=INK)
+        ax.set_ylabel(words[1], fontsize=9, color=INK)
     house(above, "from above")
     house(height, "height over time")
     figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=3, **LEGEND)
@@ -86,11 +101,12 @@ def _path(report: Report) -> Figure:
 
 
 def _located(ax: Any, report: Report, x: np.ndarray, y: np.ndarray) -> None:
-    """Colour what was located; several at one time lie on each other, the first widest."""
-    found = marks(report)
+    """Colour what was located; several at one time lie on each other, the longest beneath and widest."""
+    t = report.series.t
+    found = sorted(marks(report), key=lambda mark: -int(mark.rows(t).sum()))
     for k, mark in enumerate(found):
-        rows = mark.rows(report.series.t)
-        width = 2.2 + 2.2 * (len(found) - 1 - k)
+        rows = mark.rows(t)
+        width = 2.4 + 2.4 * (len(found) - 1 - k)
         label = f"{mark.name}: {times(mark.segments)}"
         ax.plot(np.where(rows, x, np.nan), np.where(rows, y, np.nan), color=mark.colour, lw=width, label=label)
 
@@ -98,7 +114,7 @@ def _located(ax: Any, report: Report, x: np.ndarray, y: np.ndarray) -> None:
 def _candidates(report: Report) -> Figure:
     """Draw what every candidate gains: the chosen in colour, what cannot be told from them hatched."""
     tried = sorted(report.tried, key=lambda one: -one.gain)[:_BARS]
-    figure = Figure(figsize=(9, 0.3 * max(len(tried), 4) + 1.5), layout="constrained")
+    figure = Figure(figsize=(11, 0.3 * max(len(tried), 4) + 1.5), layout="constrained")
     ax = figure.subplots()
     chosen = {one.guess.label: mark.colour for one, mark in zip(report.findings, marks(report), strict=False)}
     rivals = {name for one in report.findings for name in one.rivals}
@@ -112,26 +128,20 @@ def _candidates(report: Report) -> Figure:
         seen.add(one.label)
         ax.barh(place, max(one.gain, 0.0), height=0.68, **looks)
         ax.annotate(f"{one.gain:,.0f}", (max(one.gain, 0.0), place), (4, 0), textcoords="offset points", **_SMALL)
-    if not tried:
-        empty(ax, "no candidate gained anything worth ranking")
-    ax.set_yticks(range(len(tried)), [_named(one) for one in tried])
+    ax.set_yticks(range(len(tried)), [f"{one.label}  {one.since}".strip() for one in tried])
     ax.invert_yaxis()
     ax.margins(x=0.1)
     ax.set_axisbelow(True)
     ax.set_xlabel("gain: drop of the whitened sum of squares", fontsize=9, color=INK)
-    house(ax, f"{report.flight}: what was thought of, the best {len(tried)} of {len(report.tried)}")
+    house(ax, f"{report.flight}: candidates, the best {len(tried)} of {len(report.tried)}")
     ax.tick_params(axis="y", labelsize=8, labelcolor=INK, length=0)
     ax.grid(visible=False, axis="y")
-    figure.legend(handles=_key(report, chosen), loc="outside lower center", ncols=4, **LEGEND)
+    if tried:
+        figure.legend(handles=_key(report, chosen), loc="outside lower center", ncols=4, **LEGEND)
+    else:
+        empty(ax, "no candidate gained anything worth ranking")
+        ax.set(xticks=[], xlabel="")
     return figure
-
-
-_RIVAL: Any = {"facecolor": "white", "edgecolor": INK, "hatch": "////", "lw": 0.8}
-_SMALL: Any = {"fontsize": 8, "color": INK, "va": "center"}
-
-
-def _named(one: Tried) -> str:
-    return f"{one.label}  {one.since}".strip()
 
 
 def _key(report: Report, chosen: dict[str, str]) -> list[Patch]:

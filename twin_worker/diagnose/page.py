@@ -27,10 +27,10 @@ _UNITS = {  # the last letters of a number's name; the first that fits
     "_s": "s",
 }
 _CAPTIONS = (
-    "Where: the path from above and over time, what was located in colour",
+    "Where: the path from above and the height over time, what was located in colour",
     "How it shows: residuals before and after",
     "Proof: measured against simulated; shaded blocks were held out of the fit",
-    "What else was thought of",
+    "Candidates: what each would gain, and what cannot be told from the chosen",
 )
 _GUARD = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # nothing is fetched, nothing runs
 _COLOURS = {"ink": INK, "muted": MUTED, "line": GRID, "good": GOOD, "bad": BAD, "doubt": LINES[3], "odd": ROUTE}
@@ -116,14 +116,15 @@ def _finding(one: Finding) -> str:
         f"<td>{_safe(unit(name, effect))}</td></tr>"
         for name, value in one.told.items()
     )
-    rivals = ", ".join(_rival(name, effect) for name in one.rivals) or "nothing else in the catalogue"
-    held = f"takes {100 * one.held:.0f} % of the held-out residual, " if one.held else ""
+    rivals = ", ".join(_rival(name, effect) for name in one.rivals)
+    apart = f"Cannot be told from: {rivals}." if rivals else "Told apart from every other effect."
+    held = f"Takes {100 * one.held:.0f} % of the held-out residual, gain" if one.held else "Gain"
     return (
         f"<h3>{_safe(one.guess.label)}</h3><p><code>{_safe(effect.equation)}</code></p>"
         f"<p>Where: {_safe(where)}. When: {times(one.segments)}. "
-        f'<span class="soft">{held}gain {one.gain:,.0f}</span></p>'
+        f'<span class="soft">{held} {one.gain:,.0f}.</span></p>'
         f'<table><tr><th>number</th><th class="num">value ± standard deviation</th><th>unit</th></tr>{rows}</table>'
-        f"<p>Cannot be told from: {rivals}.</p>"
+        f"<p>{apart}</p>"
     )
 
 
@@ -186,7 +187,7 @@ def _change(before: float, after: float) -> str:
     """Write before → after and the share gone; nothing where nothing is known."""
     if not (isfinite(before) and isfinite(after)):
         return f"{before:.2f}" if isfinite(before) else ""
-    share = f" ({100 * (after / before - 1):+.0f} %)" if before > 0.0 else ""
+    share = f" ({100 * (after / before - 1):+.0f} %)".replace("-", "−") if before > 0.0 else ""
     return f"{before:.2f} → {after:.2f}{share}"
 
 

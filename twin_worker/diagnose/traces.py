@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from fleet.page.ink import GRID, INK, spread
 from twin_worker.diagnose.baseline import CHANNELS
 from twin_worker.diagnose.marks import AFTER, BEFORE, LEGEND, MEANING, empty, marks, runs, span
-from twin_worker.diagnose.report import Report, Series
+from twin_worker.diagnose.report import Report
 from twin_worker.paper_figures import house
 
 SHOWS = 1.15  # mean square of a channel over its usual, from which it differs; as in the proof [-]
@@ -29,12 +29,12 @@ def residuals(report: Report) -> Figure:
     for ax in panels[len(names) :]:
         ax.set_visible(False)
     for ax in panels[max(len(names) - 2, 0) : len(names)]:
-        ax.tick_params(labelbottom=True)  # the last column may end a row earlier
+        ax.tick_params(labelbottom=True)  # a column may end a row earlier
+        ax.set_xlabel("time [s]", fontsize=9, color=INK)
     if names:
         panels[0].set_xlim(*span(report.series))
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, **LEGEND)
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, **LEGEND)
     figure.supylabel("standard deviations of nominal flights", fontsize=9, color=INK)
-    figure.supxlabel("time [s]", fontsize=9, color=INK)
     figure.suptitle(f"{report.flight}: {title}", fontsize=10, color=INK)
     return figure
 
@@ -65,20 +65,19 @@ def _trusted(report: Report, name: str) -> tuple[np.ndarray, np.ndarray]:
 def _residual(ax: Any, report: Report, name: str) -> None:
     t = report.series.t
     before, after = _trusted(report, name)
-    ax.axhspan(-_NOMINAL, _NOMINAL, color=GRID, alpha=0.6, lw=0, label=f"±{_NOMINAL:.0f}")
+    ax.axhspan(-_NOMINAL, _NOMINAL, color=GRID, alpha=0.6, lw=0, label="usual")
     said = f"{MEANING[name]}: {report.ratio_before[name]:.1f}"
     ax.plot(t, before, color=BEFORE, lw=0.9, label="without the effects" if report.findings else "residual")
     if report.findings:
         ax.plot(t, after, color=AFTER, lw=0.9, label="with them")
         said += f" → {report.ratio_after.get(name, np.nan):.1f}"
     for mark in marks(report):
-        for onset in mark.begins(span(report.series)):
-            ax.axvline(onset, color=mark.colour, lw=1.6, ls="--")
-        ax.plot([], [], color=mark.colour, lw=1.6, ls="--", label=f"begins: {mark.name}")
+        for k, onset in enumerate(mark.begins(span(report.series))):
+            ax.axvline(onset, color=mark.colour, lw=1.6, ls="--", label=None if k else f"{mark.name} begins")
     # a few peaks may leave the picture, what lasts may not
     most = np.nanpercentile(np.abs(np.concatenate([before, after if report.findings else before])), 99.7)
     ax.set_ylim(-max(1.15 * most, 2.0 * _NOMINAL), max(1.15 * most, 2.0 * _NOMINAL))
-    house(ax, f"{said} times the usual mean square")
+    house(ax, f"{said} × the usual mean square")
 
 
 def simulated(report: Report) -> Figure:
@@ -87,15 +86,17 @@ def simulated(report: Report) -> Figure:
     figure = Figure(figsize=(11, 6.8), layout="constrained")
     panels = figure.subplots(3, 2, sharex="col", sharey="row", width_ratios=(2.6, 1), squeeze=False)
     near = _usual(report)
+    closer = "one held-out block" + (", that of median gain" if report.findings else "") if near else "nothing held out"
     for i, pair in enumerate(panels):
-        for ax in pair:
-            _force(ax, report, i)
+        for ax, width in zip(pair, (0.8, 1.6), strict=True):
+            _force(ax, report, i, width)
         house(pair[0], f"{_FORCES[i]} [m/s²]")
-        house(pair[1], "" if i else "one held-out block, the one of median gain" if near else "no data held out")
+        house(pair[1], "" if i else closer)
+    for ax in panels[-1]:
+        ax.set_xlabel("time [s]", fontsize=9, color=INK)
     panels[0, 0].set_xlim(*span(series))
     panels[0, 1].set_xlim(*(near or span(series)))
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, **LEGEND)
-    figure.supxlabel("time [s]", fontsize=9, color=INK)
     figure.suptitle(f"{report.flight}: specific force, {_rms(report)}", fontsize=10, color=INK)
     return figure
 
@@ -110,33 +111,30 @@ def _rms(report: Report) -> str:
     return f"{said} m/s²"
 
 
-def _force(ax: Any, report: Report, i: int) -> None:
+def _force(ax: Any, report: Report, i: int, width: float) -> None:
     series = report.series
-    measured, base, model = (np.where(series.ok, x[:, i], np.nan) for x in _forces(series))
+    forces = (series.measured, series.base, series.model)
+    measured, base, model = (np.where(series.ok, x[:, i], np.nan) for x in forces)
     for k, (start, stop) in enumerate(runs(series.t, series.held)):
         ax.axvspan(start, stop, color=GRID, alpha=0.6, lw=0, label="held out of the fit" if k == 0 else None)
     if not np.isfinite(measured).any():
         empty(ax, "not measured")
-    ax.plot(series.t, measured, color=INK, lw=1.6, label="measured")
-    ax.plot(
-        series.t, base, color=BEFORE, lw=1.0, label="simulated without the effects" if report.findings else "simulated"
-    )
+    ax.plot(series.t, measured, color=INK, lw=width, label="measured")
+    without = "simulated without the effects" if report.findings else "simulated"
+    ax.plot(series.t, base, color=BEFORE, lw=1.0, label=without)
     if report.findings:
         ax.plot(series.t, model, color=AFTER, lw=1.0, label="with them")
     drawn = np.concatenate([measured, base])
     drawn = drawn[np.isfinite(drawn)]
     if len(drawn):
-        ax.set_ylim(*spread(np.percentile(drawn, (0.1, 99.9))))
-
-
-def _forces(series: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return series.measured, series.base, series.model
+        ax.set_ylim(*spread(np.percentile(drawn, (0.1, 99.9)), least=0.2))
 
 
 def _usual(report: Report) -> tuple[float, float] | None:
     """Pick the held-out block of median gain among those where something was located: neither best nor worst."""
     series, found = report.series, marks(report)
     located = np.any([mark.rows(series.t) for mark in found], axis=0) if found else series.ok
+    located = located if located.any() else series.ok
     gains: dict[tuple[float, float], float] = {}
     for start, stop in runs(series.t, series.held):
         rows = series.ok & located & (series.t >= start) & (series.t <= stop)
