@@ -133,7 +133,8 @@ def _candidates(report: Report) -> Figure:
     ax.margins(x=0.1)
     ax.set_axisbelow(True)
     ax.set_xlabel("gain: drop of the whitened sum of squares", fontsize=9, color=INK)
-    house(ax, f"{report.flight}: candidates, the best {len(tried)} of {len(report.tried)}")
+    how_many = f", the best {len(tried)} of {len(report.tried)}" if tried else ""
+    house(ax, f"{report.flight}: candidates{how_many}")
     ax.tick_params(axis="y", labelsize=8, labelcolor=INK, length=0)
     ax.grid(visible=False, axis="y")
     if tried:

@@ -73,7 +73,7 @@ def _residual(ax: Any, report: Report, name: str) -> None:
         said += f" → {report.ratio_after.get(name, np.nan):.1f}"
     for mark in marks(report):
         for k, onset in enumerate(mark.begins(span(report.series))):
-            ax.axvline(onset, color=mark.colour, lw=1.6, ls="--", label=None if k else f"{mark.name} begins")
+            ax.axvline(onset, color=mark.colour, lw=1.6, ls="--", label=None if k else f"begins: {mark.name}")
     # a few peaks may leave the picture, what lasts may not
     most = np.nanpercentile(np.abs(np.concatenate([before, after if report.findings else before])), 99.7)
     ax.set_ylim(-max(1.15 * most, 2.0 * _NOMINAL), max(1.15 * most, 2.0 * _NOMINAL))
