@@ -77,7 +77,7 @@ def test_json_holds_all_of_it(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["effects", "--json"]) == 0
     described = json.loads(capsys.readouterr().out)
     assert set(described) == set(ALL) and all(one["summary"].endswith(".") for one in described.values())
-    assert described["icing"]["told"] == ["lift_loss", "dCD"] and described["stall"]["of"][0] == "8 deg"
+    assert described["icing"]["told"] == ["lift_loss", "dCD", "dCm"] and described["stall"]["of"][0] == "8 deg"
     assert described["gyro_bias"]["parameters"][0]["unit"] == "rad/s" and described["turbulence"]["variance"]
 
 

@@ -117,14 +117,14 @@ def test_a_stall_begins_at_its_break(of: str, over: float) -> None:
 
 def test_the_ground_is_felt_within_a_span_and_takes_no_more_than_induced_drag() -> None:
     act = ALL["ground_effect"].act
-    low, half, high = (act(flow(height, C_L=0.8), 0.2, 1.0) for height in (0.0, 5.5, 22.0))
+    low, half, high = (act(flow(height, C_L=0.8), 0.2, 1.0, 0.0) for height in (0.0, 5.5, 22.0))
     assert low["lift"] > 3.0 * half["lift"] > 30.0 * high["lift"] > 0.0
     assert 0.0 < -low["C_D"] < 0.8**2 / (np.pi * 0.8 * 11.0**2 / 16.0)
-    assert act(flow(-5.0, C_L=0.8), 0.2, 1.0) == low  # a field that lies lower than the start
+    assert act(flow(-5.0, C_L=0.8), 0.2, 1.0, 0.0) == low  # a field that lies lower than the start
 
 
 def test_ice_a_flap_weak_thrust_and_weight_have_their_signs() -> None:
-    assert ALL["icing"].act(flow(), 0.1, 0.02) == {"lift": -0.1, "C_D": 0.02}
+    assert ALL["icing"].act(flow(), 0.1, 0.02, 0.01) == {"lift": -0.1, "C_D": 0.02, "C_m": 0.01}
     assert ALL["flap_deployed"].act(flow(), 0.2, 0.02, -0.03) == {"C_L": 0.2, "C_D": 0.02, "C_m": -0.03}
     assert ALL["thrust_loss"].act(flow(), 0.3) == {"thrust": -0.3}
     assert ALL["air_density"].act(flow(), -0.1) == {"rho": -0.1}
