@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Flow, Stage
+from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Flow, Onset, Stage
 from fleet.frames import G
 from twin_worker.diagnose import equations as eq
 from twin_worker.diagnose.baseline import Baseline
@@ -28,12 +28,13 @@ Pilot = Callable[[int, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Runs:
-    """What was flown: states (n, 10, runs), specific force FRD (n, 3, runs), commands (n, 4, runs), Va (n, runs)."""
+    """What was flown: states (n, 10, runs), specific force FRD (n, 3, runs), commands (n, 4, runs), Va, rho (n, runs)."""
 
     states: np.ndarray
     force: np.ndarray
     commands: np.ndarray
     Va: np.ndarray
+    rho: np.ndarray
 
 
 class Simulation:
@@ -53,9 +54,10 @@ class Simulation:
         self.runs = len(guesses)
         self._groups = _grouped(guesses)
         self._servos = [(run, g) for run, all_ in enumerate(guesses) for g in all_ if g.effect.stage is Stage.DELTA]
+        self._no_wind = np.zeros((3, self.runs))
 
     def fly(self, start: np.ndarray, pilot: Pilot, n: int) -> Runs:
-        """Fly n steps of `DT`.
+        """Fly n steps of `DT`; commands are held over a step, servos and engine follow them.
 
         Args:
             start: states in the order of `STATE`, (10, runs)
@@ -63,30 +65,40 @@ class Simulation:
         """
         x = np.array(start, float)
         states, force = np.empty((n, len(STATE), self.runs)), np.empty((n, 3, self.runs))
-        commands, speed = np.empty((n, 4, self.runs)), np.empty((n, self.runs))
+        commands, speed, rho = np.empty((n, 4, self.runs)), np.empty((n, self.runs)), np.empty((n, self.runs))
         memories: dict[tuple[int, int], np.ndarray] = {}
         acting: np.ndarray | None = None
-        used, share = np.zeros(self.runs), self._share()
+        used = np.zeros(self.runs)
+        half, whole = self._share(0.5 * DT), self._share(DT)
         for k in range(n):
             t = self.begins + k * DT
             states[k], commands[k] = x, pilot(k, x)
             moved = self._moved(commands[k], t, memories)
-            acting = moved if acting is None else acting + share * (moved - acting)
+            acting = moved if acting is None else acting
             used += commands[k, 3] * DT
-            delta = self._angles(acting)
-            k1, force[k], speed[k] = self.rates(x, delta, t, used)
-            k2 = self.rates(x + 0.5 * DT * k1, delta, t, used)[0]
-            k3 = self.rates(x + 0.5 * DT * k2, delta, t, used)[0]
-            k4 = self.rates(x + DT * k3, delta, t, used)[0]
+            self._gate(t)
+            first, middle = self._angles(acting), self._angles(acting + half * (moved - acting))
+            acting = acting + whole * (moved - acting)
+            k1, force[k], speed[k], rho[k] = self.rates(x, first, t, used)
+            k2 = self.rates(x + 0.5 * DT * k1, middle, t + 0.5 * DT, used)[0]
+            k3 = self.rates(x + 0.5 * DT * k2, middle, t + 0.5 * DT, used)[0]
+            k4 = self.rates(x + DT * k3, self._angles(acting), t + DT, used)[0]
             x = x + DT / 6.0 * (k1 + 2 * k2 + 2 * k3 + k4)
             lost = ~(np.abs(x[3:6]).max(axis=0) < _WILDEST)
             x[:, lost] = np.where(np.isfinite(states[k][:, lost]), states[k][:, lost], 0.0)
-        return Runs(states, force, commands, speed)
+        return Runs(states, force, commands, speed, rho)
 
-    def _share(self) -> np.ndarray:
+    def airspeed(self, x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Give true airspeed, (runs,) [m/s], in states (10, runs) at times (runs,) [s]: what a pilot may go by."""
+        flow = Flow(t, x[9], x[9] - self.ground, self.base.card.body)
+        self._gate(t)
+        return np.sqrt(((x[:3] - self._wind(self._increments(flow, (Stage.AIR,)))) ** 2).sum(axis=0))  # type: ignore[no-any-return]
+
+    def _share(self, dt: float) -> np.ndarray:
+        """Give how far servos and engine come to what is commanded within dt, (4, runs)."""
         timing = self.base.timing
         tau = np.array([timing.servo + timing.delay] * 3 + [timing.engine])
-        share = np.repeat((1.0 - np.exp(-DT / np.maximum(tau, 1e-3)))[:, None], self.runs, axis=1)
+        share = np.repeat((1.0 - np.exp(-dt / np.maximum(tau, 1e-3)))[:, None], self.runs, axis=1)
         for run, guess in self._servos:
             for column, name in enumerate(SURFACES):
                 if guess.effect.takes_lag and guess.of in (name, ALL_SURFACES):
@@ -109,26 +121,34 @@ class Simulation:
                 out[column, run] = u[0]
         return out
 
+    def _gate(self, t: np.ndarray) -> None:
+        """Set the parameters of every effect in the air for one step, by its course."""
+        for group in self._groups:
+            group.gate(t)
+
     def _increments(self, flow: Flow, stages: tuple[Stage, ...]) -> dict[str, np.ndarray]:
         total: dict[str, np.ndarray] = {}
-        for guesses, rows in self._groups:
-            first = guesses[0]
-            if first.effect.stage not in stages:
+        for group in self._groups:
+            if group.effect.stage not in stages:
                 continue
-            gates = np.array([g.when.gate(flow.t[row : row + 1])[0] for g, row in zip(guesses, rows, strict=True)])
-            par = np.array([g.par for g in guesses]).T * gates
-            more = first.effect.act(_part(flow, rows), *par, **({"of": first.of} if first.of else {}))
-            for name, x in more.items():
-                total.setdefault(name, np.zeros(self.runs))[rows] += x
+            for name, x in group.act(flow).items():
+                if name not in total:
+                    total[name] = np.zeros(self.runs)
+                total[name][group.rows] += x
         return total
+
+    def _wind(self, air: dict[str, np.ndarray]) -> np.ndarray:
+        if not air:
+            return self._no_wind
+        return np.stack([air.get(name, self._no_wind[0]) for name in ("w_n", "w_e", "w_d")])
 
     def _angles(self, u: np.ndarray) -> np.ndarray:
         return np.stack([*(self.base.card.angles(i)(u[i]) for i in range(3)), u[3]])
 
     def rates(
         self, x: np.ndarray, delta: np.ndarray, t: np.ndarray, used: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Give d state / dt (10, runs), specific force FRD (3, runs) [m/s2] and airspeed (runs,) [m/s].
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Give d state / dt (10, runs), specific force FRD (3, runs) [m/s2], airspeed [m/s], density [kg/m3], (runs,).
 
         Args:
             x: states, (10, runs)
@@ -142,7 +162,7 @@ class Simulation:
         flow = Flow(t, h, h - self.ground, body, p=p, q=q, r=r, delta_t=d_t, used=used)
         air = self._increments(flow, (Stage.AIR,))
         R = rotation(phi, theta, psi)
-        moving = v - np.stack([air.get(name, np.zeros(self.runs)) for name in ("w_n", "w_e", "w_d")])
+        moving = v - self._wind(air)
         ua, va, wa = np.einsum("ijn,in->jn", R, moving)
         flow.Va = np.maximum(np.sqrt(ua * ua + va * va + wa * wa), _SLOWEST)
         flow.alpha, flow.beta = np.arctan2(wa, ua), np.arcsin(np.clip(va / flow.Va, -1, 1))
@@ -172,7 +192,7 @@ class Simulation:
         x_cg, y_cg = add.get("x_cg", zero), add.get("y_cg", zero)
         M, N, L = M + x_cg * force[2], N - x_cg * force[1] + y_cg * force[0], L - y_cg * force[2]
         f = force / (body.mass * (1.0 + add.get("mass", zero)))
-        return np.concatenate([self._moving(R, f), self._turning(x, (L, M, N)), -v[2:3]]), f, flow.Va
+        return np.concatenate([self._moving(R, f), self._turning(x, (L, M, N)), -v[2:3]]), f, flow.Va, flow.rho
 
     @staticmethod
     def _moving(R: np.ndarray, f: np.ndarray) -> np.ndarray:
@@ -207,15 +227,34 @@ def lift_of(A: np.ndarray, rest: np.ndarray) -> np.ndarray:
     return c_z
 
 
-def _grouped(guesses: Sequence[Sequence[Guess]]) -> list[tuple[list[Guess], np.ndarray]]:
+class _Group:
+    """Guesses of one effect on one thing, and the runs they are at work in."""
+
+    def __init__(self, guesses: list[Guess], runs: list[int]) -> None:
+        self.effect, self._whens = guesses[0].effect, [guess.when for guess in guesses]
+        self._runs, self._of = np.array(runs), {"of": guesses[0].of} if guesses[0].of else {}
+        side_by_side = np.array_equal(self._runs, np.arange(runs[0], runs[0] + len(runs)))
+        self.rows = slice(runs[0], runs[0] + len(runs)) if side_by_side else self._runs  # a view where it can be one
+        self._full = self._par = np.array([guess.par for guess in guesses]).T
+        self._comes = any(when.kind is not Onset.ALWAYS for when in self._whens)
+
+    def gate(self, t: np.ndarray) -> None:
+        """Set the parameters at times t, (runs,) of all runs."""
+        if self._comes:
+            gates = [when.gate(t[run : run + 1])[0] for when, run in zip(self._whens, self._runs, strict=True)]
+            self._par = self._full * np.array(gates)
+
+    def act(self, flow: Flow) -> dict[str, np.ndarray]:
+        """Give the increments of the runs it is at work in."""
+        part = Flow(**{name: x[self.rows] if isinstance(x, np.ndarray) else x for name, x in flow.__dict__.items()})
+        return self.effect.act(part, *self._par, **self._of)  # type: ignore[no-any-return]
+
+
+def _grouped(guesses: Sequence[Sequence[Guess]]) -> list[_Group]:
     """Collect guesses of one effect on one thing over the runs."""
     groups: dict[str, list[tuple[Guess, int]]] = {}
     for run, all_ in enumerate(guesses):
         for guess in all_:
             if guess.effect.stage in (Stage.AIR, Stage.WRENCH, Stage.MASS):
                 groups.setdefault(f"{guess.effect.stage}:{guess.label}", []).append((guess, run))
-    return [([g for g, _ in group], np.array([run for _, run in group])) for group in groups.values()]
-
-
-def _part(flow: Flow, rows: np.ndarray) -> Flow:
-    return Flow(**{name: x[rows] if isinstance(x, np.ndarray) else x for name, x in flow.__dict__.items()})
+    return [_Group([g for g, _ in group], [run for _, run in group]) for group in groups.values()]
