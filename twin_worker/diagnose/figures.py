@@ -1,7 +1,6 @@
 """Pictures of a diagnosis: where on the path, residuals, measured against simulated, what else was thought of."""
 
 import io
-import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,12 +18,14 @@ from fleet.sheet import plain
 from twin_worker.diagnose.marks import LEGEND, SAID, empty, marks, span, times
 from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.diagnose.traces import residuals, simulated
+from twin_worker.diagnose.written import safe
 from twin_worker.paper_figures import house
 
 KINDS = ("path", "residuals", "simulated", "candidates")
-_LETTERS = 50  # of a flight's name in a file's name
+_LETTERS = 50  # of a flight's name in a file's name, which holds 255 bytes
 _TITLE = 40  # of a flight's name in a title
 _BARS = 12
+_FEWEST = 4  # bars there is room for, lest one alone fill the picture
 _RIVAL: Any = {"facecolor": "white", "edgecolor": INK, "hatch": "////", "lw": 0.8}
 _SMALL: Any = {"fontsize": 8, "color": INK, "va": "center"}
 _DPI = 110  # a page is about as wide as the figures
@@ -63,11 +64,10 @@ def stems(flights: Sequence[str]) -> list[str]:
     """Give every flight a name for its files that cannot leave the folder, no two alike."""
     out: list[str] = []
     for flight in flights:
-        safe = re.sub(r"[^\w.-]+", "_", flight).lstrip(".-")[:_LETTERS] or "flight"
-        found, number = safe, 1
+        found, number = safe(flight)[:_LETTERS], 1
         while found in out:
             number += 1
-            found = f"{safe}-{number}"
+            found = f"{safe(flight)[:_LETTERS]}-{number}"
         out.append(found)
     return out
 
@@ -114,7 +114,7 @@ def _located(ax: Any, report: Report, x: np.ndarray, y: np.ndarray) -> None:
 def _candidates(report: Report) -> Figure:
     """Draw what every candidate gains: the chosen in colour, what cannot be told from them hatched."""
     tried = sorted(report.tried, key=lambda one: -one.gain)[:_BARS]
-    figure = Figure(figsize=(11, 0.3 * max(len(tried), 4) + 1.5), layout="constrained")
+    figure = Figure(figsize=(11, 0.3 * max(len(tried), _FEWEST) + 1.5), layout="constrained")
     ax = figure.subplots()
     chosen = {one.guess.label: mark.colour for one, mark in zip(report.findings, marks(report), strict=False)}
     rivals = {name for one in report.findings for name in one.rivals}
@@ -129,8 +129,8 @@ def _candidates(report: Report) -> Figure:
         ax.barh(place, max(one.gain, 0.0), height=0.68, **looks)
         ax.annotate(f"{one.gain:,.0f}", (max(one.gain, 0.0), place), (4, 0), textcoords="offset points", **_SMALL)
     ax.set_yticks(range(len(tried)), [f"{one.label}  {one.since}".strip() for one in tried])
-    ax.invert_yaxis()
     ax.margins(x=0.1)
+    ax.set_ylim(max(len(tried), _FEWEST) - 0.4, -0.6)
     ax.set_axisbelow(True)
     ax.set_xlabel("gain: drop of the whitened sum of squares", fontsize=9, color=INK)
     how_many = f", the best {len(tried)} of {len(report.tried)}" if tried else ""
@@ -151,4 +151,6 @@ def _key(report: Report, chosen: dict[str, str]) -> list[Patch]:
     key = [Patch(color=colour, label=f"{word}: {label}") for label, colour in chosen.items()]
     if any(one.rivals for one in report.findings):
         key.append(Patch(**_RIVAL, label="cannot be told from it"))
-    return [*key, Patch(color=MUTED, alpha=0.45, label="other candidates")]
+    if len(report.tried) > len(key):
+        key.append(Patch(color=MUTED, alpha=0.45, label="others"))
+    return key

@@ -22,7 +22,7 @@ def residuals(report: Report) -> Figure:
     """Draw each channel that differs from its usual, before and after, worst first."""
     names, title = chosen(report)
     rows = max((len(names) + 1) // 2, 1)
-    figure = Figure(figsize=(11, 1.8 * rows + 1.0), layout="constrained")
+    figure = Figure(figsize=(11, max(1.8 * rows + 1.0, 3.6)), layout="constrained")
     panels = list(figure.subplots(rows, 2, sharex=True, squeeze=False).flat)
     for ax, name in zip(panels, names, strict=False):
         _residual(ax, report, name)
@@ -124,7 +124,7 @@ def _force(ax: Any, report: Report, i: int, width: float) -> None:
     ax.plot(series.t, base, color=BEFORE, lw=1.0, label=without)
     if report.findings:
         ax.plot(series.t, model, color=AFTER, lw=1.0, label="with them")
-    drawn = np.concatenate([measured, base])
+    drawn = np.concatenate([measured, base, model] if report.findings else [measured, base])
     drawn = drawn[np.isfinite(drawn)]
     if len(drawn):
         ax.set_ylim(*spread(np.percentile(drawn, (0.1, 99.9)), least=0.2))
