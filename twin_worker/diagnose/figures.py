@@ -27,6 +27,7 @@ _TITLE = 40  # of a flight's name in a title
 _BARS = 12
 _FEWEST = 4  # bars there is room for, lest one alone fill the picture
 _RIVAL: Any = {"facecolor": "white", "edgecolor": INK, "hatch": "////", "lw": 0.8}
+_OTHER: Any = {"color": MUTED, "alpha": 0.45}
 _SMALL: Any = {"fontsize": 8, "color": INK, "va": "center"}
 _DPI = 110  # a page is about as wide as the figures
 _INKS = 96  # a picture of so many colours is a third as large, and a page holds four for every flight
@@ -118,14 +119,15 @@ def _candidates(report: Report) -> Figure:
     ax = figure.subplots()
     chosen = {one.guess.label: mark.colour for one, mark in zip(report.findings, marks(report), strict=False)}
     rivals = {name for one in report.findings for name in one.rivals}
-    seen: set[str] = set()
+    proven = "proven" if report.outcome is Outcome.NAMED else "not proven"
+    key: dict[str, Patch] = {}
     for place, one in enumerate(tried):
-        looks: dict[str, Any] = {"color": MUTED, "alpha": 0.45}
-        if one.label in chosen and one.label not in seen:
-            looks = {"color": chosen[one.label]}
+        words, looks = "others", _OTHER
+        if one.label in chosen:  # the best of its label; further ones come at other times
+            words, looks = f"chosen, {proven}: {one.label}", {"color": chosen.pop(one.label)}
         elif one.label.split(":")[0] in rivals:
-            looks = _RIVAL
-        seen.add(one.label)
+            words, looks = "cannot be told from it", _RIVAL
+        key[words] = Patch(**looks, label=words)
         ax.barh(place, max(one.gain, 0.0), height=0.68, **looks)
         ax.annotate(f"{one.gain:,.0f}", (max(one.gain, 0.0), place), (4, 0), textcoords="offset points", **_SMALL)
     ax.set_yticks(range(len(tried)), [f"{one.label}  {one.since}".strip() for one in tried])
@@ -138,19 +140,8 @@ def _candidates(report: Report) -> Figure:
     ax.tick_params(axis="y", labelsize=8, labelcolor=INK, length=0)
     ax.grid(visible=False, axis="y")
     if tried:
-        figure.legend(handles=_key(report, chosen), loc="outside lower center", ncols=4, **LEGEND)
+        figure.legend(handles=list(key.values()), loc="outside lower center", ncols=4, **LEGEND)
     else:
         empty(ax, "no candidate gained anything worth ranking")
         ax.set(xticks=[], xlabel="")
     return figure
-
-
-def _key(report: Report, chosen: dict[str, str]) -> list[Patch]:
-    """Explain the bars."""
-    word = "chosen, proven" if report.outcome is Outcome.NAMED else "chosen, not proven"
-    key = [Patch(color=colour, label=f"{word}: {label}") for label, colour in chosen.items()]
-    if any(one.rivals for one in report.findings):
-        key.append(Patch(**_RIVAL, label="cannot be told from it"))
-    if len(report.tried) > len(key):
-        key.append(Patch(color=MUTED, alpha=0.45, label="others"))
-    return key
