@@ -43,6 +43,8 @@ def made(flight: str = "s07-lag", outcome: Outcome = Outcome.NAMED, seed: int = 
         fit_after=1.07 if found else NAN,
         force_before=errors[0],
         force_after=errors[1] if found else NAN,
+        stray_before=6.1,
+        stray_after=2.2,
         where=("pitch", ((ONSET, 118.0), (130.0, LENGTH))) if outcome is Outcome.UNKNOWN else ("", ()),
         terms={"q·V": -0.42, "sin(0.9 t)": 1.3e-5} if outcome is Outcome.UNKNOWN else {},
         tried=() if outcome is Outcome.NONE else _tried(),

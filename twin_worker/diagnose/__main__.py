@@ -27,7 +27,7 @@ def _run(args: argparse.Namespace) -> int:
             for flight in flights:
                 say(f"{flight.name}: {flight.seconds:.0f} s of flight")
                 reports.append(diagnose(flight, base, say))
-                print(reports[-1].sentence, flush=True)
+                print(f"{flight.name}: {reports[-1].sentence}", flush=True)
         except (ValueError, OSError) as error:  # one bad recording loses no other
             refused += 1
             say(str(error))
@@ -40,12 +40,13 @@ def _run(args: argparse.Namespace) -> int:
 
 def _page(reports: list[Report], base: Baseline, folder: Path) -> None:
     """Write figures, page and the simulations corrected by what was named."""
+    from twin_worker.diagnose.figures import stems
     from twin_worker.diagnose.page import write
 
     folder.mkdir(exist_ok=True)
-    for report in reports:
+    for report, stem in zip(reports, stems([report.flight for report in reports]), strict=True):
         if report.outcome is Outcome.NAMED:
-            keep.save(folder / f"{written.safe(report.flight)}.model.json", base, report.findings)
+            keep.save(folder / f"{stem}.model.json", base, report.findings)
     say(f"wrote {write(reports, folder)}")
 
 

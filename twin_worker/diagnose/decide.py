@@ -37,8 +37,8 @@ class Named:
     rivals: tuple[Found, ...]
 
 
-def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: None) -> list[Named]:
-    """Find what explains the flight; `sight` ends with everything found taken for granted.
+def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: None) -> tuple[list[Named], list[Found]]:
+    """Find what explains the flight, and the first ranking; `sight` ends with everything found taken for granted.
 
     Args:
         sight: the flight with nothing but its weather granted
@@ -46,10 +46,12 @@ def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: Non
         say: takes words of progress
     """
     named: list[Named] = []
+    ranking: list[Found] = []
     first = Joint(sight, weather)
     while len(named) < MOST:
         say(f"effect {len(named) + 1}")
         found = best(sight, [one.found.guess for one in named])
+        ranking = ranking or found
         found = [one for one in found if one.gain > needed(sight, named, one)]
         if not found:
             break
@@ -61,7 +63,7 @@ def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: Non
         named = more
         sight.grant((*weather, *(one.found.guess for one in named)))
     sight.grant((*weather, *(one.found.guess for one in named)))
-    return named
+    return named, ranking
 
 
 class Joint:

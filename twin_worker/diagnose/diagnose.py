@@ -11,16 +11,17 @@ from twin_worker.diagnose.baseline import CHANNELS, Baseline
 from twin_worker.diagnose.calibrate import own_weather
 from twin_worker.diagnose.decide import Named, decide, turbulent
 from twin_worker.diagnose.flight import Flight
+from twin_worker.diagnose.freely import stray
 from twin_worker.diagnose.guess import ALWAYS, Guess
-from twin_worker.diagnose.prove import Proof
+from twin_worker.diagnose.prove import HELD, Proof
 from twin_worker.diagnose.report import Finding, Outcome, Report, Series, Tried
 from twin_worker.diagnose.residual import Case
+from twin_worker.diagnose.scan import Found
 from twin_worker.diagnose.sight import Sight
 from twin_worker.diagnose.spread import covariances, told_sigma
 from twin_worker.diagnose.unexplained import free_form, stretches
-from twin_worker.diagnose.words import sentence
+from twin_worker.diagnose.words import sentence, since
 
-HELD = 0.03  # share of the residual that must go on held-out data for a name
 _TOLD = 0.10  # or of the error of forces told
 _KEPT = 0.15  # of an effect's gain that must show on held-out data too
 _STRANGE = 3.0  # a channel's residual over its usual that is not let pass unexplained
@@ -52,13 +53,12 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     before, white_before = sight.left() / base.usual, _profiled(sight)
     gusts, _ = turbulent(sight)
     say("naming")
-    named = decide(sight, weather, say)
+    named, ranked = decide(sight, weather, say)
     if gusts > _GUSTY and gusts > sum(one.found.gain for one in named):
         named = []
         sight.grant(weather)
     guesses = tuple(one.found.guess for one in named)
     after, white_after = sight.left() / base.usual, _profiled(sight)
-    ranking = tuple(Tried(f.guess.label, f.guess.when.kind, f.gain) for one in named for f in (one.found, *one.rivals))
     say("proving")
     proof = prove.held_out(case, weather, guesses, before) if named else Proof(np.nan, np.nan, (), ())
     findings = _findings(sight, weather, named, proof)
@@ -87,9 +87,11 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
         fit_after=proof.after,
         force_before=errors[0],
         force_after=errors[1],
+        stray_before=float(np.degrees(stray(case, weather))),
+        stray_after=float(np.degrees(stray(case, (*weather, *proof.fitted)))),
         where=where,
         terms=terms,
-        tried=ranking,
+        tried=_ranking(ranked, named),
         lacks=(*flight.lacks, *uncovered(base)),
         series=series,
         seconds=time.perf_counter() - begun,
@@ -124,6 +126,16 @@ def uncovered(base: Baseline) -> tuple[str, ...]:
         for name in doublets
         if base.r2.get(name, 1.0) <= WELL
     )
+
+
+def _ranking(ranked: list[Found], named: list[Named]) -> tuple[Tried, ...]:
+    """List what was tried, each label once with its best course; the named and their rivals beside them."""
+    best: dict[str, Found] = {}
+    for one in (*ranked, *(found for n in named for found in (n.found, *n.rivals))):
+        if one.guess.label not in best or one.gain > best[one.guess.label].gain:
+            best[one.guess.label] = one
+    found = sorted(best.values(), key=lambda one: -one.gain)
+    return tuple(Tried(one.guess.label, since(one.guess.when), one.gain) for one in found)
 
 
 def _profiled(sight: Sight) -> np.ndarray:

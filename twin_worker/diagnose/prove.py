@@ -10,7 +10,8 @@ from twin_worker.diagnose.refine import refine
 from twin_worker.diagnose.residual import Case
 from twin_worker.diagnose.sight import Sight
 
-_SHOWS = 1.15  # a channel's residual over its usual, from which it takes part in the proof
+HELD = 0.03  # share of the residual that must go on held-out data for a name
+SHOWS = 1.15  # a channel's residual over its usual, from which it takes part in the proof
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def held_out(case: Case, weather: tuple[Guess, ...], guesses: tuple[Guess, ...],
             even.grant((*weather, *(g for k, g in enumerate(fitted) if k != i)))
             fitted[i] = refine(even, guess, rounds=3, move=False).guess
     odd = Sight(case, weather, blocks(case.t, odd=True))
-    use = shows > _SHOWS if (shows > _SHOWS).any() else np.ones_like(shows, bool)
+    use = shows > SHOWS if (shows > SHOWS).any() else np.ones_like(shows, bool)
     cost = odd.cost(fitted)
     kept = tuple(2.0 * (odd.cost([g for k, g in enumerate(fitted) if k != i]) - cost) for i in range(len(fitted)))
     before = _rms(odd, use)

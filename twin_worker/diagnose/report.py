@@ -85,6 +85,7 @@ class Report:
         ratio_before, ratio_after: each channel's mean square over its usual, by channel
         fit_before, fit_after: whitened rms on held-out blocks; nan where nothing was found
         force_before, force_after: rms error of simulated specific force on held-out blocks [m/s2]
+        stray_before, stray_after: rms attitude error of free flights of 5 s on held-out blocks [deg]
         where: for unknown: channel and segments
         terms: for unknown: a sparse free-form term, no physics: `term -> coefficient`
         tried: the ranking of candidates
@@ -103,6 +104,8 @@ class Report:
     fit_after: float
     force_before: float
     force_after: float
+    stray_before: float
+    stray_after: float
     where: tuple[str, tuple[tuple[float, float], ...]]
     terms: dict[str, float]
     tried: tuple[Tried, ...]

@@ -28,7 +28,7 @@ Pilot = Callable[[int, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Runs:
-    """What was flown: states (n, 10, runs), specific force FRD (n, 3, runs), commands (n, 4, runs), Va, rho (n, runs)."""
+    """What was flown: states (n, 10, runs), force FRD (n, 3, runs), commands (n, 4, runs); Va, rho (n, runs)."""
 
     states: np.ndarray
     force: np.ndarray
@@ -246,7 +246,7 @@ class _Group:
 
     def act(self, flow: Flow) -> dict[str, np.ndarray]:
         """Give the increments of the runs it is at work in."""
-        part = Flow(**{name: x[self.rows] if isinstance(x, np.ndarray) else x for name, x in flow.__dict__.items()})
+        part = Flow(**{name: x[self.rows] if isinstance(x, np.ndarray) else x for name, x in flow.__dict__.items()})  # type: ignore[arg-type]
         return self.effect.act(part, *self._par, **self._of)  # type: ignore[no-any-return]
 
 

@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 from fleet.page.ink import GRID, INK, spread
 from twin_worker.diagnose.baseline import CHANNELS
 from twin_worker.diagnose.marks import AFTER, BEFORE, LEGEND, MEANING, empty, marks, runs, span
+from twin_worker.diagnose.prove import SHOWS
 from twin_worker.diagnose.report import Report
 from twin_worker.paper_figures import house
 
-SHOWS = 1.15  # mean square of a channel over its usual, from which it differs; as in the proof [-]
 _MOST = 8  # channels drawn
 _FEW = 4  # drawn where none differs: that there is nothing must be seen
 _NOMINAL = 2.0  # shaded: where nominal flights mostly lie [standard deviations]

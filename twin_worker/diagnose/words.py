@@ -3,14 +3,14 @@
 from dataclasses import replace
 
 from fleet.effects import Onset
+from twin_worker.diagnose.guess import When
+from twin_worker.diagnose.prove import HELD
 from twin_worker.diagnose.report import Finding, Outcome, Report
-
-_UNITS = {"mps": "m/s", "deg": "deg", "s": "s", "kg": "kg", "m": "m", "dps": "deg/s", "mps2": "m/s2"}
 
 
 def sentence(report: Report) -> Report:
     """Give the report with its sentence written."""
-    return replace(report, sentence=f"{report.flight}: {_said(report)}")
+    return replace(report, sentence=_said(report))
 
 
 def _said(report: Report) -> str:
@@ -34,11 +34,11 @@ def _finding(one: Finding) -> str:
     )
     place = f" of the {one.surface}" if one.surface else ""
     rivals = f", not told apart from {' or '.join(one.rivals)}" if one.rivals else ""
-    return f"{one.guess.effect.name}{place} {_since(one)} ({numbers}{rivals})"
+    return f"{one.guess.effect.name}{place} {since(one.guess.when)} ({numbers}{rivals})"
 
 
-def _since(one: Finding) -> str:
-    when = one.guess.when
+def since(when: When) -> str:
+    """Say the course of an effect."""
     if when.kind is Onset.ALWAYS:
         return "throughout"
     if when.kind is Onset.STEP:
@@ -49,5 +49,20 @@ def _since(one: Finding) -> str:
 def _proof(report: Report) -> str:
     if not report.fit_before > 0:
         return "seen in the scatter of air data"
-    drop = 1.0 - report.fit_after / report.fit_before
-    return f"on held-out blocks the residual falls from {report.fit_before:.2f} to {report.fit_after:.2f} ({drop:.0%})"
+    drop, told = (1.0 - b / a for a, b in _evidence(report))
+    if drop >= HELD:
+        said = f"the residual falls from {report.fit_before:.2f} to {report.fit_after:.2f} ({drop:.0%})"
+    else:
+        said = (
+            f"specific force is told to {report.force_after:.2f} instead of {report.force_before:.2f} m/s2 ({told:.0%})"
+        )
+    return f"on held-out blocks {said}{_flown(report)}"
+
+
+def _evidence(report: Report) -> tuple[tuple[float, float], tuple[float, float]]:
+    return (report.fit_before, report.fit_after), (report.force_before, report.force_after)
+
+
+def _flown(report: Report) -> str:
+    before, after = report.stray_before, report.stray_after
+    return f", and free flights of 5 s stray {after:.1f} instead of {before:.1f} deg" if after < 0.9 * before else ""

@@ -39,6 +39,8 @@ def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
         "fit_after": _or_none(report.fit_after),
         "force_before": _or_none(report.force_before),
         "force_after": _or_none(report.force_after),
+        "stray_before_deg": _or_none(report.stray_before),
+        "stray_after_deg": _or_none(report.stray_after),
         "predictions": str(predictions) if predictions else None,
         "channels_before": _finite(report.ratio_before),
         "channels_after": _finite(report.ratio_after),
