@@ -38,17 +38,22 @@ def fit(flights: Sequence[Flight], card: Card, timing: Timing, vane: bool) -> tu
     speed = float(np.median(np.concatenate([np.hypot(f.readings["v_n"], f.readings["v_e"])[f.ok] for f in flights])))
     base = Baseline(card, {}, speed, timing=timing, vane=vane, flights=tuple(f.name for f in flights))
     winds = [np.zeros(4) for _ in flights]
+    cases = [Case(flight, base) for flight in flights]
     for _ in range(_ROUNDS):
-        cases = [Case(flight, base) for flight in flights]
         winds = [fit_wind(case, w) for case, w in zip(cases, winds, strict=True)]
         made = [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)]
         base = replace(base, airspeed=_airspeed(cases, made))
         base = replace(
             base, coef={"alpha": _solve(_Rows(cases, made, "alpha"), 0)[0], "beta": _side(cases, made, vane)}
         )
-        cases = [Case(flight, base) for flight in flights]
+        cases = _with(cases, base)
         base = _moments(cases, [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)], base)
+        cases = _with(cases, base)
     return base, winds
+
+
+def _with(cases: list[Case], base: Baseline) -> list[Case]:
+    return [Case(case.flight, base, like=case) for case in cases]
 
 
 def _moments(cases: list[Case], made: list[Terms], base: Baseline) -> Baseline:
@@ -184,19 +189,22 @@ def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
     Pitch tells of the servos: in roll, damping and lag look alike within the band. Axial force tells of the engine.
     """
     best = Timing()
+    base, winds = fit(flights, card, best, vane)
+    cases = [Case(flight, base) for flight in flights]
+
+    def left(timing: Timing) -> dict[str, float]:
+        """Give what the pitch and axial equations leave unexplained."""
+        timed = _with(cases, replace(base, timing=timing))
+        made = [case.terms(wind(w)) for case, w in zip(timed, winds, strict=True)]
+        axial = _axial(timed, made)
+        coef = {"T": _solve(axial, 0)[0][len(eq.X) :]}
+        return {"M": _surprise(_pitch(timed, made, coef)), "X": _surprise(axial)}
+
     for _ in range(2):
         for name, grid, equation in (("servo", _LAGS, "M"), ("delay", _DELAYS, "M"), ("engine", _ENGINES, "X")):
             trials = [replace(best, **{name: value}) for value in grid]
-            best = min(trials, key=lambda timing: _left(flights, card, timing, vane)[equation])
+            best = min(trials, key=lambda timing: left(timing)[equation])
     return best
-
-
-def _left(flights: Sequence[Flight], card: Card, timing: Timing, vane: bool) -> dict[str, float]:
-    """Give what the pitch and axial equations leave unexplained."""
-    base, winds = fit(flights, card, timing, vane)
-    cases = [Case(flight, base) for flight in flights]
-    made = [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)]
-    return {"M": _surprise(_pitch(cases, made, base.coef)), "X": _surprise(_axial(cases, made))}
 
 
 def _pitch(cases: list[Case], made: list[Terms], coef: dict[str, np.ndarray]) -> _Rows:

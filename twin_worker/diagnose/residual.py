@@ -45,8 +45,10 @@ class Case:
 
     def __init__(self, flight: Flight, base: Baseline, like: "Case | None" = None) -> None:
         self.flight, self.base = flight, base
-        if like is not None:  # the same flight and timing: what was filtered is filtered
-            self._smooth, self._delta = like._smooth, like._delta
+        if like is not None:  # the same flight: what was filtered is filtered
+            self._smooth = like._smooth
+            if like.base.timing == base.timing:
+                self._delta = like._delta
         self.t = thinned(flight.t)
         self.ok = whole(flight.ok)
         self.used = thinned(np.cumsum(flight.commands[:, 3]) * DT)

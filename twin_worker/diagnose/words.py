@@ -53,9 +53,8 @@ def _proof(report: Report) -> str:
     if drop >= HELD:
         said = f"the residual falls from {report.fit_before:.2f} to {report.fit_after:.2f} ({drop:.0%})"
     else:
-        said = (
-            f"specific force is told to {report.force_after:.2f} instead of {report.force_before:.2f} m/s2 ({told:.0%})"
-        )
+        before, after = report.force_before, report.force_after
+        said = f"the error of specific force falls from {before:.2f} to {after:.2f} m/s2 ({told:.0%})"
     return f"on held-out blocks {said}{_flown(report)}"
 
 
