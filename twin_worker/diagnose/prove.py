@@ -43,13 +43,13 @@ def held_out(case: Case, weather: tuple[Guess, ...], guesses: tuple[Guess, ...],
         guesses: as fitted on the whole flight
         shows: each channel's residual over its usual, (c,)
     """
-    even = Sight(case, weather, blocks(case.t, odd=False))
+    sight = Sight(case, weather)
+    even, odd = (sight.part(blocks(case.t, odd=side)) for side in (False, True))
     fitted = list(guesses)
     for _ in range(1 + (len(guesses) > 1)):
         for i, guess in enumerate(fitted):
             even.grant((*weather, *(g for k, g in enumerate(fitted) if k != i)))
             fitted[i] = refine(even, guess, rounds=3, move=False).guess
-    odd = Sight(case, weather, blocks(case.t, odd=True))
     use = shows > SHOWS if (shows > SHOWS).any() else np.ones_like(shows, bool)
     cost = odd.cost(fitted)
     kept = tuple(2.0 * (odd.cost([g for k, g in enumerate(fitted) if k != i]) - cost) for i in range(len(fitted)))

@@ -58,6 +58,17 @@ class Case:
         return self._filtered(self.flight.readings)
 
     @cached_property
+    def _turned(self) -> np.ndarray:
+        return rotation(*(self._smooth[name] for name in ("phi", "theta", "psi")))
+
+    @cached_property
+    def level(self) -> tuple[np.ndarray, np.ndarray]:
+        """Give a constant and height, (n, 2), and what finds their coefficients in trusted rows, (2, n_ok)."""
+        h = self._smooth["h"]
+        A = np.column_stack([np.ones_like(h), h - h.mean()])
+        return A, np.linalg.pinv(A[self.ok])
+
+    @cached_property
     def _delta(self) -> np.ndarray:
         return np.stack([smooth(self.surface(i, ())) for i in range(4)])
 
@@ -129,7 +140,7 @@ class Case:
         s, (d_a, d_e, d_r, d_t) = self.sensed(guesses), self.inputs(guesses)
         flow = Flow(self.t, s["h"], s["h"] - self.flight.ground, body, delta_t=d_t, used=self.used)
         air = self._increments(flow, guesses, (Stage.AIR,))
-        R = rotation(s["phi"], s["theta"], s["psi"])
+        R = self._turned if s["psi"] is self._smooth["psi"] else rotation(s["phi"], s["theta"], s["psi"])
         ground = np.stack(
             [s["v_n"] - air.get("w_n", 0.0), s["v_e"] - air.get("w_e", 0.0), s["v_d"] - air.get("w_d", 0.0)]
         )
@@ -226,7 +237,7 @@ def channels(case: Case, made: Terms) -> np.ndarray:
         out[:, 7:10] = (aside["derived"] - np.stack([aside["a_x"], aside["a_y"], aside["a_z"]])).T
     out[:, 10:13] = _turning(flow, aside)
     if "baro" in readings:
-        out[:, 13] = _detrended(aside["baro"] - aside["h"], aside["h"], case.ok)
+        out[:, 13] = _detrended(aside["baro"] - aside["h"], case)
     out[:, 7:13] = slow(out[:, 7:13])
     return out
 
@@ -255,10 +266,10 @@ def _turning(flow: Flow, aside: Series) -> np.ndarray:
     )
 
 
-def _detrended(x: np.ndarray, h: np.ndarray, ok: np.ndarray) -> np.ndarray:
+def _detrended(x: np.ndarray, case: Case) -> np.ndarray:
     """Take off a constant and a slope with height: sea level pressure and lapse rate are unknown, never evidence."""
-    A = np.column_stack([np.ones_like(h), h - h.mean()])
-    return x - A @ np.linalg.lstsq(A[ok], x[ok], rcond=None)[0]
+    A, find = case.level
+    return x - A @ (find @ x[case.ok])
 
 
 def rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:

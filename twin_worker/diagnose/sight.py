@@ -1,6 +1,7 @@
 """Whitened residuals of one flight, the nuisances profiled out: what every hypothesis is measured by."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -24,19 +25,27 @@ class Sight:
     Args:
         case: the flight
         granted: guesses at work in everything that follows
-        span: which residual rows count, (n,) bool; None: all that are trusted
     """
 
-    def __init__(self, case: Case, granted: tuple[Guess, ...] = (), span: np.ndarray | None = None) -> None:
+    def __init__(self, case: Case, granted: tuple[Guess, ...] = ()) -> None:
         self.case, self.base = case, case.base
         ok = case.ok.copy()
         ok[2:] &= case.ok[1:-1] & case.ok[:-2]
         ok[:2] = False
-        self.ok = ok if span is None else ok & span
+        self.ok = ok
         self.noise = self._scaled()
         self.weather = is_weather(self.base)
         self.nuisances: tuple[Nuisance, ...] = nuisances(self.base.vane)
         self.grant(granted)
+
+    def part(self, span: np.ndarray) -> "Sight":
+        """Give the same with only the rows of `span`, (n,) bool, counting."""
+        out = copy(self)
+        out.ok = self.ok & span
+        out.raw, out.e = self.raw * out.ok[:, None], self.e * out.ok[:, None]
+        out.Jn = self.Jn * out.ok[:, None, None]
+        out._profile()
+        return out
 
     def _scaled(self):  # type: ignore[no-untyped-def]
         """Scale the noise to this flight's own: quieter always, louder only where weather is nominal."""

@@ -73,6 +73,7 @@ def _sandwich(sight: Sight, guesses: Sequence[Guess]) -> np.ndarray:
 
 def _jackknife(sight: Sight, granted: tuple[Guess, ...], guess: Guess) -> np.ndarray:
     """Give the covariance that fits without each quarter of the time at work show, (k, k)."""
+    sight.grant(granted)
     t = sight.case.t
     at_work = t[(guess.when.gate(t) > 0) & sight.ok]
     if len(at_work) < 4 * _BLOCK:
@@ -80,7 +81,7 @@ def _jackknife(sight: Sight, granted: tuple[Guess, ...], guess: Guess) -> np.nda
     edges = np.quantile(at_work, np.linspace(0, 1, _PARTS + 1))
     fits = []
     for low, high in pairwise(edges):
-        part = Sight(sight.case, granted, (t < low) | (t >= high))
+        part = sight.part((t < low) | (t >= high))
         fits.append(refine(part, guess, rounds=2, move=False).guess.par)
     away = np.array(fits) - np.mean(fits, axis=0)
     return (_PARTS - 1) / _PARTS * away.T @ away

@@ -1,0 +1,68 @@
+"""A third-party autopilot on its own physics, plain telemetry: changes named, nominal flights left in peace."""
+
+from pathlib import Path
+
+import pytest
+
+from twin_worker.diagnose.baseline import Baseline
+from twin_worker.diagnose.calibrate import calibrate
+from twin_worker.diagnose.card import read
+from twin_worker.diagnose.diagnose import diagnose
+from twin_worker.diagnose.flight import Flight, read_flights
+from twin_worker.diagnose.report import Outcome
+
+pytestmark = pytest.mark.recordings
+CARD = read(Path("skywalker"))
+ZERO_S = 2.045  # boot time of each flight's first attitude [s]
+CHANGED = {  # flight -> truth: effect, number, value, boot time of the change [s] or None from the start
+    "s04_wind_step": ("wind_steady", "speed_mps", 9.0, 266.2),
+    "s05_engine_75": ("thrust_loss", "loss", 0.30, 246.08),
+    "s06_drag_up": ("drag_increase", "dCD", 0.06, None),
+    "s07_servo_slow": ("actuator_lag", "tau_s", 0.25, 236.14),
+    "s08_airspeed_ratio": ("airspeed_scale", "scale", (1.99 / 2.6) ** 0.5, 216.12),
+}
+
+
+@pytest.fixture(scope="module")
+def sitl(recordings: Path) -> Path:
+    return recordings / "sitl"
+
+
+@pytest.fixture(scope="module")
+def nominal(sitl: Path) -> list[Flight]:
+    return [f for path in sorted(sitl.glob("s0[123]*.tlog.xz")) for f in read_flights(path, CARD)]
+
+
+@pytest.fixture(scope="module")
+def base(nominal: list[Flight]) -> Baseline:
+    return calibrate(nominal, CARD)
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_a_change_in_flight_is_named_sized_and_dated(name: str, sitl: Path, base: Baseline) -> None:
+    effect, number, truth, boot = CHANGED[name]
+    flight = read_flights(sitl / f"{name}.tlog.xz", CARD)[0]
+    report = diagnose(flight, base)
+    assert report.outcome is Outcome.NAMED and len(report.findings) == 1, report.sentence
+    found = report.findings[0]
+    assert found.guess.effect.name == effect and len(found.rivals) <= 2, report.sentence
+    off = abs(found.told[number] - truth) / (1.0 - truth if effect == "airspeed_scale" else truth)
+    assert off <= 0.10, report.sentence
+    assert report.fit_after < 0.97 * report.fit_before or report.force_after < 0.9 * report.force_before
+    if boot is not None:
+        assert abs(found.segments[0][0] - (boot - ZERO_S)) <= 1.5, report.sentence
+    assert any("accelerometer at 5 Hz" in word for word in report.lacks)
+
+
+def test_three_nominal_aircraft_of_one_recording_are_left_in_peace(sitl: Path, base: Baseline) -> None:
+    flights = read_flights(sitl / "s10_multi3_nominal.tlog.xz", CARD)
+    assert len(flights) == 3
+    for flight in flights:
+        report = diagnose(flight, base)
+        assert report.outcome is Outcome.NONE, report.sentence
+
+
+def test_nominal_flights_left_out_in_turn_are_not_named(nominal: list[Flight]) -> None:
+    for one in nominal:
+        report = diagnose(one, calibrate([flight for flight in nominal if flight is not one], CARD))
+        assert report.outcome in (Outcome.NONE, Outcome.SUSPECTED), report.sentence
