@@ -1,0 +1,96 @@
+"""Every effect, injected into our own simulation at three magnitudes, is found again by the diagnosis."""
+
+from dataclasses import dataclass
+from functools import cache
+from math import isfinite
+
+import numpy as np
+import pytest
+from effect_flights import CARD, Plan, flown
+
+from fleet.effects import Effect, Onset, catalogue
+from twin_worker.diagnose.baseline import Baseline
+from twin_worker.diagnose.calibrate import calibrate
+from twin_worker.diagnose.diagnose import diagnose
+from twin_worker.diagnose.flight import Flight
+from twin_worker.diagnose.guess import Guess, When
+from twin_worker.diagnose.report import Finding, Outcome, Report
+
+ALL = catalogue("")
+SINCE_S = 35.0
+BUMP_S = 47.0, 6.0  # a gust or thermal of 150 m
+ON = {  # what an effect befalls here
+    **dict.fromkeys(("actuator_deadband", "actuator_rate_limit", "actuator_saturation"), "aileron"),
+    **dict.fromkeys(("actuator_lag", "actuator_offset", "control_effectiveness_loss"), "elevator"),
+    "actuator_delay": "all surfaces",
+    "actuator_stuck": "rudder",  # a flight that goes on
+    "accel_bias": "x",
+    "gyro_bias": "r",
+    "stall": "8 deg",
+}
+NOMINAL, CONTROLS = range(4), range(200, 204)
+WITHIN = 0.25  # of the change the effect makes to its first number, at the largest magnitude; or 3 sigma
+CASES = [pytest.param(name, size, id=f"{name}-{size}") for name in ALL for size in range(3)]
+
+
+@dataclass(frozen=True)
+class Flown:
+    """A calibration, and the flights to diagnose by it."""
+
+    base: Baseline
+    flights: dict[str, Flight]
+
+
+def injected(effect: Effect, size: int) -> Guess:
+    """Give an effect at work, coming in flight where it can."""
+    when = When()
+    if Onset.STEP in effect.onsets:
+        when = When(Onset.STEP, SINCE_S)
+    elif Onset.ALWAYS not in effect.onsets:
+        when = When(Onset.BUMP, *BUMP_S)
+    return Guess(effect, ON.get(effect.name, ""), effect.examples[size], when)
+
+
+@cache
+def fly() -> Flown:
+    """Calibrate on four flights, and fly all others, side by side."""
+    base = calibrate(flown([Plan(f"nominal {seed}", seed) for seed in NOMINAL]), CARD)
+    plans = [Plan(f"control {seed}", seed) for seed in CONTROLS]
+    for i, (name, effect) in enumerate(ALL.items()):
+        plans += [Plan(f"{name} {size}", 10 + 3 * i + size, (injected(effect, size),)) for size in range(3)]
+    return Flown(base, {flight.name: flight for flight in flown(plans)})
+
+
+@pytest.fixture(scope="module")
+def made() -> Flown:
+    """All of it, once."""
+    return fly()
+
+
+@pytest.mark.parametrize(("name", "size"), CASES)
+def test_an_effect_flown_is_the_effect_named(name: str, size: int, made: Flown) -> None:
+    report = diagnose(made.flights[f"{name} {size}"], made.base)
+    assert report.findings, report.sentence
+    first = report.findings[0]
+    assert name in (first.guess.effect.name, *first.rivals), report.sentence
+    if size > 0:
+        assert report.outcome is Outcome.NAMED, report.sentence
+    if size == 2:
+        assert first.guess.effect.name == name, report.sentence
+        assert first.guess.of == ON.get(name, ""), report.sentence
+        assert_close(first, made.base)
+
+
+def assert_close(found: Finding, base: Baseline) -> None:
+    """Hold the first number of what was found against what was flown."""
+    effect, body = found.guess.effect, base.card.body
+    name, truth = next(iter(effect.told(effect, np.array(effect.examples[2]), body).items()))
+    nothing = effect.told(effect, np.zeros(effect.size), body)[name]
+    change = abs(truth - nothing) if isfinite(nothing) else abs(truth)
+    assert abs(found.told[name] - truth) <= max(WITHIN * change, 3.0 * found.sigma[name]), found.told
+
+
+@pytest.mark.parametrize("seed", CONTROLS)
+def test_nothing_flown_is_nothing_named(seed: int, made: Flown) -> None:
+    report = diagnose(made.flights[f"control {seed}"], made.base)
+    assert report.outcome in (Outcome.NONE, Outcome.SUSPECTED), report.sentence

@@ -1,0 +1,65 @@
+"""A new effect is one new file: dropped into a folder at run time it is listed, flown, found and proven."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from effect_flights import CARD, Plan, flown
+
+from fleet import cli
+from fleet.effects import FOLDERS, Onset, catalogue
+from twin_worker.diagnose.calibrate import calibrate
+from twin_worker.diagnose.diagnose import HELD, diagnose
+from twin_worker.diagnose.guess import Guess, When
+from twin_worker.diagnose.report import Outcome
+
+DOOR = '''
+"""A door that jammed open on the right: it pushes to the left, turns the nose to the right, and drags."""
+
+from fleet.effects import Effect, Parameter, Stage
+
+
+def act(flow, open):
+    """Push and turn with the dynamic pressure, more where air comes from the door's side."""
+    caught = open * (1.0 + 2.0 * flow.beta)
+    return {"C_Y": -0.05 * caught, "C_n": 0.01 * caught, "C_D": 0.03 * open}
+
+
+EFFECT = Effect(
+    name="door_jammed",
+    stage=Stage.WRENCH,
+    channel="yaw",
+    equation="C_Y = -0.05 open (1 + 2 beta), C_n = 0.01 open (1 + 2 beta), C_D = 0.03 open",
+    source="round numbers",
+    parameters=(Parameter("open", "-", "how far it stands open", step=0.05, low=0.0, high=2.0),),
+    act=act,
+    examples=((0.2,), (0.4,), (0.8,)),
+)
+'''
+
+
+@pytest.fixture
+def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The file in a folder of its own, which the environment names."""
+    (tmp_path / "door_jammed.py").write_text(DOOR)
+    monkeypatch.setenv(FOLDERS, str(tmp_path))
+    catalogue.cache_clear()
+    yield
+    catalogue.cache_clear()
+
+
+def test_a_new_file_is_listed_flown_found_and_proven(door: None, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["effects"]) == 0
+    assert "door_jammed" in capsys.readouterr().out
+    jammed = Guess(catalogue()["door_jammed"], "", (0.4,), When(Onset.STEP, 35.0))
+    plans = [Plan(f"nominal {seed}", seed) for seed in range(3)]
+    *nominal, flight = flown([*plans, Plan("door", 7, (jammed,))])
+    report = diagnose(flight, calibrate(nominal, CARD))
+    assert report.outcome is Outcome.NAMED, report.sentence
+    first = report.findings[0]
+    assert first.guess.effect.name == "door_jammed", report.sentence
+    assert first.told["open"] == pytest.approx(0.4, abs=max(0.05, 3 * first.sigma["open"]))
+    assert first.guess.when.t0 == pytest.approx(35.0, abs=1.0)
+    assert 1.0 - report.fit_after / report.fit_before > HELD
+    without = dict(zip(("before", "after"), (report.force_before, report.force_after), strict=True))
+    assert without["after"] < 0.9 * without["before"], without
