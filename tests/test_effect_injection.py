@@ -14,7 +14,7 @@ from twin_worker.diagnose.calibrate import calibrate
 from twin_worker.diagnose.diagnose import diagnose
 from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.guess import Guess, When
-from twin_worker.diagnose.report import Finding, Outcome, Report
+from twin_worker.diagnose.report import Finding, Outcome
 
 ALL = catalogue("")
 SINCE_S = 35.0
