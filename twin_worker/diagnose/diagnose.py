@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.freely import stray
 from twin_worker.diagnose.guess import ALWAYS, Guess
 from twin_worker.diagnose.prove import HELD, Proof
+from twin_worker.diagnose.refine import refine
 from twin_worker.diagnose.report import Finding, Outcome, Report, Series, Tried
 from twin_worker.diagnose.residual import Case
 from twin_worker.diagnose.scan import Found
@@ -57,11 +59,10 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     if gusts > _GUSTY and gusts > sum(one.found.gain for one in named):
         named = []
         sight.grant(weather)
-    guesses = tuple(one.found.guess for one in named)
-    after, white_after = sight.left() / base.usual, _profiled(sight)
     say("proving")
-    proof = prove.held_out(case, weather, guesses, before) if named else Proof(np.nan, np.nan, (), ())
-    findings = _findings(sight, weather, named, proof)
+    named, proof, findings = _proven(sight, weather, named, before)
+    sight.grant((*weather, *(one.found.guess for one in named)))
+    after, white_after = sight.left() / base.usual, _profiled(sight)
     if not any(map(_significant, findings)):
         findings = ()
     if (gust := _gusts(sight, not named)) is not None:
@@ -141,6 +142,25 @@ def _ranking(ranked: list[Found], named: list[Named]) -> tuple[Tried, ...]:
 def _profiled(sight: Sight) -> np.ndarray:
     e = sight.raw + sight.Jn @ sight.xn
     return np.where(sight.ok[:, None], e, np.nan)
+
+
+def _proven(
+    sight: Sight, weather: tuple[Guess, ...], named: list[Named], before: np.ndarray
+) -> tuple[list[Named], Proof, tuple[Finding, ...]]:
+    """Prove what was named; what stands beside the first and is not borne out on held-out data goes."""
+    while True:
+        if not named:
+            return [], Proof(np.nan, np.nan, (), ()), ()
+        proof = prove.held_out(sight.case, weather, tuple(one.found.guess for one in named), before)
+        findings = _findings(sight, weather, named, proof)
+        order = sorted(range(len(named)), key=lambda k: -named[k].found.gain)
+        weak = [k for k in order[1:] if findings[k].held < _KEPT or not _significant(findings[k])]
+        if not weak:
+            return named, proof, findings
+        named = [one for k, one in enumerate(named) if k != weak[-1]]
+        for i, one in enumerate(named):
+            sight.grant((*weather, *(other.found.guess for k, other in enumerate(named) if k != i)))
+            named[i] = replace(one, found=refine(sight, one.found.guess))
 
 
 def _findings(sight: Sight, weather: tuple[Guess, ...], named: list[Named], proof: Proof) -> tuple[Finding, ...]:

@@ -4,7 +4,7 @@ Each has a spread: of the sensor's specification, or learnt from nominal flights
 absorbed; past it the difference is handed to the hypotheses.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fleet.effects import Effect, Parameter, Stage, catalogue
 from twin_worker.diagnose.guess import ALWAYS, Guess
@@ -16,6 +16,7 @@ WEATHER_MPS = 1.0  # nominal flights that differ by more had weather: a mean win
 
 _SHARES = ("L:delta_a", "L:p", "L:beta", "M:delta_e", "M:c_z", "M:q", "N:delta_r", "N:r", "N:beta")
 _OFFSETS = ("C_L", "C_D", "C_l", "C_m", "C_n", "thrust", "rho", "side")
+_QNH_M, _LAPSE = 30.0, 5.0  # sea level pressure as a height [m], and lapse rate [m per 100 m], unknown
 
 
 def _act(flow: object, x: object, of: str) -> dict[str, object]:
@@ -33,7 +34,10 @@ SCATTER = Effect(
     examples=((0.01,),),
     of=(*_SHARES, *_OFFSETS),
 )
-DENSITY = Effect(**{**SCATTER.__dict__, "stage": Stage.AIR})
+LAPSE = Effect(
+    **{**SCATTER.__dict__, "name": "lapse", "act": lambda flow, x: {"baro": x * flow.height / 100.0}, "of": ()}
+)
+DENSITY = replace(SCATTER, stage=Stage.AIR)
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,7 @@ class Nuisance:
     @property
     def scatter(self) -> bool:
         """Tell whether no effect stands for it, so that it can be handed to none."""
-        return self.of == "side"
+        return self.of == "side" or self.name in ("baro", "lapse")
 
     @property
     def weather(self) -> bool:
@@ -101,6 +105,8 @@ def nuisances(vane: bool) -> tuple[Nuisance, ...]:
         "side": 0.05,
     }
     out += [Nuisance(of, DENSITY if of == "rho" else SCATTER, of, 0, floors[of], floors[of]) for of in _OFFSETS]
+    out.append(Nuisance("baro", known["baro_bias"], "", 0, _QNH_M, 1.0))
+    out.append(Nuisance("lapse", LAPSE, "", 0, _LAPSE, 0.5))
     if not vane:
         out += [Nuisance(of, SCATTER, of, 0, _SHARE, _SHARE) for of in _SHARES]
     return tuple(out)

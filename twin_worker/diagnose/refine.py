@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleet.effects import Onset
+from fleet.effects import Onset, Stage
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.scan import Found
 from twin_worker.diagnose.sight import Sight
@@ -10,6 +10,7 @@ from twin_worker.diagnose.sight import Sight
 _ROUNDS = 5
 _ENOUGH = 0.5  # gain below which fitting stops
 _MOVES_S = (8.0, 4.0, 2.0, 1.0, 0.5, 0.2)
+_NEAR_S, _NEARER_S = np.arange(-2.0, 2.1, 0.2), np.arange(-0.16, 0.17, 0.04)  # a sensor's jump is sought
 _STRETCH = (1.5, 1.2, 1.1)
 
 
@@ -59,11 +60,24 @@ def normal(sight: Sight, guess: Guess) -> tuple[np.ndarray, np.ndarray]:
     return A, b
 
 
+def _jump(sight: Sight, guess: Guess, now: float) -> tuple[Guess, float]:
+    """Search a sensor's jump around a guess: its slope shows only where it is met to the sample."""
+    for moves in (_NEAR_S, _NEARER_S):
+        trials = [guess.at(np.array(guess.par), guess.when.moved(dt)) for dt in moves]
+        costs = [sight.cost((trial,)) for trial in trials]
+        k = int(np.argmin(costs))
+        if costs[k] < now:
+            guess, now = trials[k], costs[k]
+    return guess, now
+
+
 def _onset(sight: Sight, guess: Guess, now: float) -> tuple[Guess, float]:
     """Move the onset, and stretch the duration, while that gains."""
     if guess.when.kind is Onset.ALWAYS:
         return guess, now
     best = guess
+    if guess.effect.stage is Stage.SENSOR and guess.when.kind is Onset.STEP:
+        best, now = _jump(sight, guess, now)
     for move in _MOVES_S:
         for dt in (move, -move):
             trial = best.at(np.array(best.par), best.when.moved(dt))

@@ -62,11 +62,12 @@ class Case:
         return rotation(*(self._smooth[name] for name in ("phi", "theta", "psi")))
 
     @cached_property
-    def level(self) -> tuple[np.ndarray, np.ndarray]:
-        """Give a constant and height, (n, 2), and what finds their coefficients in trusted rows, (2, n_ok)."""
+    def trend(self) -> np.ndarray:
+        """Give the recorded barometer's offset, sea level pressure and lapse rate being unknown, (n,) [m]."""
         h = self._smooth["h"]
         A = np.column_stack([np.ones_like(h), h - h.mean()])
-        return A, np.linalg.pinv(A[self.ok])
+        off = self._smooth["baro"] - h
+        return A @ np.linalg.lstsq(A[self.ok], off[self.ok], rcond=None)[0]
 
     @cached_property
     def _delta(self) -> np.ndarray:
@@ -237,7 +238,7 @@ def channels(case: Case, made: Terms) -> np.ndarray:
         out[:, 7:10] = (aside["derived"] - np.stack([aside["a_x"], aside["a_y"], aside["a_z"]])).T
     out[:, 10:13] = _turning(flow, aside)
     if "baro" in readings:
-        out[:, 13] = _detrended(aside["baro"] - aside["h"], case)
+        out[:, 13] = aside["baro"] - aside["h"] - case.trend - add.get("baro", 0.0)
     out[:, 7:13] = slow(out[:, 7:13])
     return out
 
@@ -264,12 +265,6 @@ def _turning(flow: Flow, aside: Series) -> np.ndarray:
         ],
         axis=1,
     )
-
-
-def _detrended(x: np.ndarray, case: Case) -> np.ndarray:
-    """Take off a constant and a slope with height: sea level pressure and lapse rate are unknown, never evidence."""
-    A, find = case.level
-    return x - A @ (find @ x[case.ok])
 
 
 def rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
