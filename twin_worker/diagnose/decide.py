@@ -19,6 +19,7 @@ _SECOND = 300.0  # and of every further one
 _CHANCE = 1.2  # over what nominal flights reach by chance
 _SHARE = 0.02  # of the first one's gain a further one must bring
 _FINE, _COARSE = 0.02, 0.15  # tie: by the accelerometer; by plain telemetry, whose baseline is wrong by about as much
+_GUSTS = 1.2, 1.5  # of the air channels' scatter over the usual: least, median
 _LEAST_TIE = 20.0
 
 Say = Callable[[str], None]
@@ -151,7 +152,7 @@ def turbulent(sight: Sight) -> tuple[float, float]:
     calm = [CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z", "gyro_roll", "gyro_pitch", "gyro_yaw")]
     left = sight.left() / sight.base.usual
     ratio = left[kept]
-    if ratio.min() < 1.5 or left[calm].mean() > 1.5:
+    if ratio.min() < _GUSTS[0] or np.median(ratio) < _GUSTS[1] or left[calm].mean() > _GUSTS[1]:
         return 0.0, 1.0
     rows = int(sight.ok.sum())
     return float(sum(rows * (x - 1 - np.log(x)) for x in ratio)), float(np.median(ratio))

@@ -238,11 +238,9 @@ def _significant(one: Finding) -> bool:
 
 
 def _at_its_end(one: Finding) -> bool:
-    """Tell whether a parameter that counts stopped at what is physically possible: then it is no explanation."""
-    return any(
-        x and x in (p.low, p.high) and not p.aside
-        for p, x in zip(one.guess.effect.parameters, one.guess.par, strict=True)
-    )
+    """Tell whether a number that counts stopped at what is physically possible, a whole share apart: no explanation."""
+    counted = zip(one.guess.effect.parameters, one.guess.par, strict=True)
+    return any(x and x in (p.low, p.high) and x != 1.0 and not p.aside for p, x in counted)
 
 
 def _series(case: Case, before: np.ndarray, after: np.ndarray, force: foretell.Forces) -> Series:

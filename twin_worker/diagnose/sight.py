@@ -11,7 +11,8 @@ from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.nuisance import RELEASED, WEATHER_MPS, Nuisance, nuisances
 from twin_worker.diagnose.residual import Case
 
-CLIP = 6.0  # whitened residuals beyond count as much [-]
+CLIP = 6.0  # whitened residuals beyond count as much [-]; or
+_WIDE = 3.0  # beyond so many times the scatter a channel has on this flight
 _TIGHT = 1e14  # precision of a nuisance that was handed to the hypotheses
 _QUIETEST = 0.45  # a flight may be quieter than the nominal ones by this much
 _LOUDEST = 3.0  # and, where weather is nominal, louder in the air's channels by this
@@ -36,6 +37,11 @@ class Sight:
         self.noise = self._scaled()
         self.weather = is_weather(self.base)
         self.nuisances: tuple[Nuisance, ...] = nuisances(self.base.vane)
+        self.clip = np.full(len(CHANNELS), CLIP)
+        self.granted = granted
+        if self.ok.any():
+            scatter = 1.4826 * np.median(np.abs(self.whitened(())[self.ok]), axis=0)
+            self.clip = np.maximum(CLIP, _WIDE * scatter)
         self.grant(granted)
 
     def part(self, span: np.ndarray) -> "Sight":
@@ -69,14 +75,14 @@ class Sight:
         return e
 
     def clipped(self, guesses: Sequence[Guess]) -> np.ndarray:
-        """Give the same, no row counting more than `CLIP`."""
-        return np.clip(self.whitened(guesses), -CLIP, CLIP)
+        """Give the same, no row counting more than `clip`."""
+        return np.clip(self.whitened(guesses), -self.clip, self.clip)
 
     def grant(self, granted: tuple[Guess, ...]) -> None:
         """Take guesses for granted from now on."""
         self.granted = granted
         self.raw = self.whitened(())
-        self.e = np.clip(self.raw, -CLIP, CLIP)
+        self.e = np.clip(self.raw, -self.clip, self.clip)
         steps = [self.whitened((n.guess(n.step),)) for n in self.nuisances]
         columns = [(e - self.raw) / n.step for e, n in zip(steps, self.nuisances, strict=True)]
         columns += [self._varied(k) - self.raw for k in range(len(self.base.others))]
