@@ -18,6 +18,9 @@ from twin_worker.diagnose.sight import Sight, is_weather
 _ROUNDS = 10  # of expectation and maximisation
 _FADED = 4.0  # residual rows that count as one while spreads are learnt: whitening is never whole
 _SAFE = 1.05  # noise of flights not calibrated on, over that of those that were
+_SLOPES = 2.5, 10.0  # a wing's lift slope [1/rad]
+_ODD = 4.0  # rms residual of a flight over that of the others, from which it is not nominal
+_FLOWN = CHANNELS.index("gps_x")  # channels before compare the simulation, those after two sensors
 _LEAST_USUAL = 0.6
 
 Say = Callable[[str], None]
@@ -46,6 +49,8 @@ def calibrate(flights: Sequence[Flight], card: Card, say: Say = lambda word: Non
     cases = [Case(one, without) for one, without in zip(parts, left, strict=True)]
     others = tuple({name: b.coef[name] - x for name, x in base.coef.items()} for b in left)
     base = replace(base, others=others)
+    _believable(base)
+    _alike(cases)
     base = _with_noise(base, cases)
     cases = [replaced(case, base) for case in cases]
     say("what nominal flights reach by chance")
@@ -57,6 +62,37 @@ def calibrate(flights: Sequence[Flight], card: Card, say: Say = lambda word: Non
         for found in best(sight, ()):
             chance[found.kind] = max(chance.get(found.kind, 0.0), found.gain)
     return replace(base, chance=chance, usual=np.maximum(np.median(usual, axis=0), _LEAST_USUAL))
+
+
+def _believable(base: Baseline) -> None:
+    """Refuse what cannot be nominal flights of this aircraft."""
+    worst = min(base.r2, key=lambda name: base.r2[name])
+    if base.r2[worst] < 0.0:
+        raise ValueError(
+            f"{', '.join(base.flights)}: found that they contradict each other ({worst} explained to "
+            f"{base.r2[worst]:.0%}), expected nominal flights of one aircraft; leave out those with a fault or wind"
+        )
+    slope = -1.0 / base.coef["alpha"][1]
+    if base.card.known and base.vane and not _SLOPES[0] < slope < _SLOPES[1]:
+        raise ValueError(
+            f"{base.card.name}: found a lift slope of {slope:.1f} per rad with its mass and wing area, expected "
+            f"{_SLOPES[0]:g} to {_SLOPES[1]:g}; is it the card of this aircraft?"
+        )
+
+
+def _alike(cases: list[Case]) -> None:
+    """Refuse nominal flights of which one is none."""
+    rows = [case.residuals(wind(fit_wind(case, np.zeros(4))))[case.ok] for case in cases]
+    rms = np.array([np.sqrt((x**2).mean(axis=0)) for x in rows])
+    for k, case in enumerate(cases):
+        ratio = rms[k] / np.maximum(np.median(np.delete(rms, k, axis=0), axis=0), 1e-6)
+        ratio = np.where(np.arange(len(CHANNELS)) < _FLOWN, ratio, 0.0)
+        worst = int(np.argmax(ratio))
+        if ratio[worst] > _ODD:
+            raise ValueError(
+                f"{case.flight.name}: found {CHANNELS[worst]} {ratio[worst]:.0f} times as far from the simulation as "
+                "on the other flights, expected nominal flights; leave it out, and diagnose it"
+            )
 
 
 def halves(flight: Flight) -> list[Flight]:

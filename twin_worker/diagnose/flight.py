@@ -92,6 +92,9 @@ def lay(name: str, history: History, params: dict[str, float], card: Card) -> Fl
         ValueError: when something indispensable is missing; the sentence says what.
     """
     rows = {kind: history.rows(kind) for kind in ("attitude", "velocity", "position", "servo", "air", "imu")}
+    length = np.ptp(rows["attitude"][0]) if len(rows["attitude"][0]) else 0.0
+    if length < _LEAST_S:
+        raise ValueError(f"{name}: found {length:.0f} s, expected {_LEAST_S:.0f} s of flight at least; record longer")
     for kind in ("attitude", "velocity", "position", "servo"):
         if len(rows[kind][0]) < 50:
             raise ValueError(f"{name}: found no {kind} in it, expected telemetry of a flight; record that message too")

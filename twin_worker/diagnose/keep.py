@@ -46,7 +46,9 @@ def load(path: Path) -> tuple[Baseline, tuple[Guess, ...]]:
     try:
         found = json.loads(path.read_text())
     except (ValueError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path.name}: found no JSON ({error}), expected a model of `fleet calibrate`") from None
+        raise ValueError(
+            f"{path.name}: found no JSON ({error}), expected a model; make it with `fleet calibrate`"
+        ) from None
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         named = found.get("format") if isinstance(found, dict) else type(found).__name__
         raise ValueError(f"{path.name}: found format {named!r}, expected {FORMAT}; make it with `fleet calibrate`")
