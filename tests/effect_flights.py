@@ -32,12 +32,12 @@ COEF = {  # of a light aircraft at half its size
 }
 CRAFT = Baseline(CARD, {k: np.array(x) for k, x in COEF.items()}, speed=33.0, timing=Timing(servo=0.06, engine=0.25))
 
-# from when [s]: bank [deg], height [m], airspeed [m/s]; low and level, a climbing turn, slow, slower, a fast descent
+# from when [s]: bank [deg], height [m], airspeed [m/s]; hops off the ground, a climbing turn, slow, slower, a descent
 COURSE = np.array(
     [
-        *((0, 0, 1.2, 29), (5, 15, 1.2, 29), (10, -15, 1.2, 29), (15, 0, 30, 30), (18, 35, 60, 30), (30, 0, 60, 32)),
-        *((33, -35, 62, 31), (43, 0, 60, 25), (48, 25, 62, 22.5), (56, -15, 60, 21.5), (61, 0, 40, 28)),
-        *((65, 40, 25, 34), (72, -30, 25, 36), (77, 0, 25, 34)),
+        *((0, 0, 0, 27), (4, 10, 4, 26), (7, -10, 0, 26), (12, 10, 4, 26), (15, -10, 0, 26), (21, 0, 10, 28)),
+        *((24, 0, 25, 30), (26, 35, 45, 30), (34, -35, 50, 31), (43, 0, 50, 25), (48, 25, 50, 22.5)),
+        *((56, -15, 45, 21.5), (60, 0, 20, 27), (63, 40, 12, 32), (69, -30, 0, 33), (72, 10, 0, 32), (76, 0, 4, 32)),
     ],
     float,
 )
@@ -101,7 +101,7 @@ class Hand:
         row = COURSE[np.searchsorted(COURSE[:, 0], t, side="right") - 1]
         Va = self._simulation.airspeed(x, self._simulation.begins + t)
         phi, theta, h, up = x[6], x[7], x[9], -x[2]
-        climb = np.clip(0.5 * (row[2] - h), -4.0, 4.0) - up
+        climb = np.clip(0.8 * (row[2] - h), -5.0, 4.0) - up
         self._trim[0] = np.clip(self._trim[0] + 0.02 * climb * DT, -0.2, 0.35)
         wrong = np.clip(self._trim[0] + 0.03 * climb, -0.3, 0.4) - theta
         self._trim[1] = np.clip(self._trim[1] - 0.8 * wrong * DT, -0.7, 0.5)
@@ -125,7 +125,7 @@ def flown(plans: Sequence[Plan], base: Baseline = CRAFT, seconds: float = LONG_S
     acting = [(gusts, *plan.guesses) for gusts, plan in zip(day, plans, strict=True)]
     simulation = Simulation(base, acting, np.zeros(len(plans)))
     start = np.zeros((len(STATE), len(plans)))
-    start[0], start[7], start[9] = 29.0, 0.07, 1.2
+    start[0], start[7], start[9] = 29.0, 0.07, 1.0
     runs = simulation.fly(start, Hand(plans, simulation), int(seconds / DT))
     return [recorded(plan, runs, i) for i, plan in enumerate(plans)]
 
@@ -141,7 +141,7 @@ def recorded(plan: Plan, runs: Runs, i: int) -> Flight:
     readings["Va"] = runs.Va[:, i] * np.sqrt(runs.rho[:, i] / RHO_0)
     readings["baro"] = readings["h"].copy()
     noise = {"v_n": 0.05, "v_e": 0.05, "v_d": 0.05, "p": 0.002, "q": 0.002, "r": 0.002, "h": 0.05}
-    noise |= {"a_x": 0.1, "a_y": 0.1, "a_z": 0.1, "Va": 0.25, "baro": 0.3}
+    noise |= {"a_x": 0.05, "a_y": 0.05, "a_z": 0.05, "Va": 0.25, "baro": 0.3}
     place = np.cumsum(x[:, :2], axis=0) * DT
     readings = {name: y + noise.get(name, 0.0) * rng.standard_normal(n) for name, y in readings.items()}
     for name in ("phi", "theta", "psi"):  # an estimator's attitude wanders by about 0.2 deg

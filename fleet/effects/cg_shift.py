@@ -18,7 +18,7 @@ EFFECT = Effect(
     source="Stevens, Lewis & Johnson 2016, section 2.4 (moments about another point)",
     parameters=(Parameter("dx_m", "m", "moved forward", step=0.01, low=-0.5, high=0.5),),
     act=act,
-    examples=((0.01,), (-0.03,), (0.06,)),
+    examples=((0.015,), (-0.03,), (0.06,)),
     confused={
         "mass_change": "shows in lift too; what drops out often does both: fly pull-ups",
         "actuator_offset": "an offset of the elevator grows with dynamic pressure: fly at two speeds",

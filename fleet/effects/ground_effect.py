@@ -33,7 +33,7 @@ EFFECT = Effect(
     ),
     act=act,
     onsets=(Onset.ALWAYS,),
-    examples=((0.1, 0.3, 0.0), (0.2, 0.7, -0.005), (0.3, 1.0, -0.01)),
+    examples=((0.2, 0.8, -0.03), (0.3, 1.0, -0.05), (0.45, 1.0, -0.08)),
     confused={
         "wind_shear": "a gradient of wind shows in airspeed, by heading",
         "updraft": "one bump, not bound to the ground",

@@ -21,7 +21,7 @@ EFFECT = Effect(
         Parameter("ratio", "1/rad", "thrust line moved, in propeller diameters", step=0.1, low=-10.0, high=10.0),
     ),
     act=act,
-    examples=((0.3,), (-0.8,), (1.5,)),
+    examples=((0.3,), (-0.6,), (1.0,)),
     confused={
         "thrust_asymmetry": "does not follow the angle of attack: fly slow and fast at one power",
         "prop_torque": "rolls instead of yawing",

@@ -19,7 +19,7 @@ EFFECT = Effect(
     parameters=(Parameter("speed_mps", "m/s", "air upwards at its height", step=0.3, low=-15.0, high=15.0),),
     act=act,
     onsets=(Onset.BUMP,),
-    examples=((0.8,), (-2.0,), (4.0,)),
+    examples=((2.5,), (-4.0,), (6.0,)),
     confused={
         "gust_discrete": "a gust along the ground shows in airspeed and sideslip, by heading",
         "turbulence": "one coherent bump, not scatter all along",
