@@ -16,6 +16,7 @@ _TRIED = 12  # guesses fitted properly at each step
 _LEAST, _LEAST_COARSE = 150.0, 400.0  # gain of a first effect, by the accelerometer and without
 _CANCEL = 1.5  # an effect that gains this much more beside the others than all together only undoes one of them
 _SECOND = 300.0  # and of every further one
+_NEAR = 0.6  # of the best one's worth, from which an onset is worth a search
 _CHANCE = 1.2  # over what nominal flights reach by chance
 _SHARE = 0.02  # of the first one's gain a further one must bring
 _FINE, _COARSE = 0.02, 0.15  # tie: by the accelerometer; by plain telemetry, whose baseline is wrong by about as much
@@ -96,7 +97,11 @@ def best(sight: Sight, beside: Sequence[Guess], only: tuple[str, ...] = ()) -> l
             tried.append(found)
         if len(tried) >= _TRIED:
             break
-    return sorted((refine(sight, found.guess) for found in tried), key=lambda found: -rank(sight, found))
+    fitted = sorted((refine(sight, found.guess, move=False) for found in tried), key=lambda one: -rank(sight, one))
+    if not fitted:
+        return []
+    near = [one for one in fitted if rank(sight, one) > _NEAR * rank(sight, fitted[0])]
+    return sorted((refine(sight, one.guess) for one in near), key=lambda one: -rank(sight, one)) + fitted[len(near) :]
 
 
 def rank(sight: Sight, found: Found) -> float:
