@@ -23,7 +23,7 @@ EFFECT = Effect(
     parameters=(Parameter("lost", "-", "travel lost at either end", step=0.1, low=0.0, high=0.99),),
     act=act,
     of=SURFACES,
-    starts=((0.7,), (0.8,), (0.88,), (0.94,)),
+    starts=((0.5,), (0.6,), (0.7,), (0.8,), (0.88,), (0.94,)),
     examples=((0.6,), (0.75,), (0.85,)),
     confused={
         "control_effectiveness_loss": "a share is lost of small and large movements alike",

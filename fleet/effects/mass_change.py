@@ -26,7 +26,7 @@ EFFECT = Effect(
     parameters=(Parameter("share", "-", "mass added", step=0.02, low=-0.6, high=1.0),),
     act=act,
     told=told,
-    examples=((0.03,), (-0.07,), (0.15,)),
+    examples=((0.05,), (-0.09,), (0.15,)),
     confused={
         "cg_shift": "pitches, and leaves lift as it is; what drops out often does both",
         "icing": "ice takes drag along",
