@@ -28,32 +28,32 @@ TERMS = {"alpha": ALPHA, "beta": BETA, "X": X, "T": THRUST, "L": LATERAL, "M": (
 
 def alpha_terms(c_z: Any, c_z_dot: Any, q_hat: Any, delta_e: Any) -> np.ndarray:
     """Stack the terms of alpha, (6, n)."""
-    return np.stack([np.ones_like(c_z), c_z, c_z * c_z, q_hat, c_z_dot, delta_e])
+    return np.array([np.ones_like(c_z), c_z, c_z * c_z, q_hat, c_z_dot, delta_e])
 
 
 def beta_terms(c_y: Any, p_hat: Any, r_hat: Any, delta_r: Any) -> np.ndarray:
     """Stack the terms of beta, (5, n)."""
-    return np.stack([np.ones_like(c_y), c_y, p_hat, r_hat, delta_r])
+    return np.array([np.ones_like(c_y), c_y, p_hat, r_hat, delta_r])
 
 
 def force_terms(c_z: Any, delta_e: Any, beta: Any) -> np.ndarray:
     """Stack the terms of the axial force coefficient, (5, n)."""
-    return np.stack([np.ones_like(c_z), c_z, c_z * c_z, delta_e, np.abs(beta)])
+    return np.array([np.ones_like(c_z), c_z, c_z * c_z, delta_e, np.abs(beta)])
 
 
 def lateral_terms(beta: Any, rates: tuple[Any, Any], deltas: tuple[Any, Any], c_z: Any) -> np.ndarray:
     """Stack the terms of rolling and yawing moment coefficients, (9, n); c_z for weight beside the middle."""
     p, r = rates
-    return np.stack([np.ones_like(c_z), beta, p, r, *deltas, c_z * r, c_z * p, c_z])
+    return np.array([np.ones_like(c_z), beta, p, r, *deltas, c_z * r, c_z * p, c_z])
 
 
 def pitch_terms(c_z: Any, q_hat: Any, delta_e: Any, c_z_dot: Any, c_x: Any) -> np.ndarray:
     """Stack the terms of the pitching moment coefficient, (7, n); c_x for drag above or below the centre of gravity."""
-    return np.stack([np.ones_like(c_z), c_z, q_hat, delta_e, c_z_dot, c_z * c_z, c_x])
+    return np.array([np.ones_like(c_z), c_z, q_hat, delta_e, c_z_dot, c_z * c_z, c_x])
 
 
 def thrust_terms(delta_t: Any, Va: Any, density: Any, speed: float) -> np.ndarray:
     """Stack the terms of thrust, (6, n); Va in shares of the usual speed, density in shares of sea level."""
     v = Va / speed
-    full = np.stack([delta_t, delta_t**2, delta_t**3])
+    full = np.array([delta_t, delta_t**2, delta_t**3])
     return np.concatenate([full, full * v]) * density

@@ -46,7 +46,7 @@ class Case:
     def __init__(self, flight: Flight, base: Baseline, like: "Case | None" = None) -> None:
         self.flight, self.base = flight, base
         if like is not None:  # the same flight: what was filtered is filtered
-            self._smooth = like._smooth
+            self._smooth, self._still = like._smooth, like._still
             if like.base.timing == base.timing:
                 self._delta = like._delta
         self.t = thinned(flight.t)
@@ -58,8 +58,23 @@ class Case:
         return self._filtered(self.flight.readings)
 
     @cached_property
-    def _turned(self) -> np.ndarray:
-        return rotation(*(self._smooth[name] for name in ("phi", "theta", "psi")))
+    def _still(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self._agreement(self._smooth)
+
+    def agreement(self, s: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Give what only a sensor fault changes: body axes (3, 3, n), dV/dt less gravity in them (3, n) [m/s2], and
+        how far sensors disagree, (n, 6): channels gps_x to gyro_yaw.
+        """
+        return self._still if s is self._smooth else self._agreement(s)
+
+    def _agreement(self, s: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        R = rotation(s["phi"], s["theta"], s["psi"])
+        derived = np.einsum("ijn,in->jn", R, np.array([s["v_n_dot"], s["v_e_dot"], s["v_d_dot"] - G]))
+        out = np.zeros((len(self.t), 6))
+        if "a_x" in s:
+            out[:, :3] = (derived - np.array([s["a_x"], s["a_y"], s["a_z"]])).T
+        out[:, 3:] = _turning(s)
+        return R, derived, slow(out)
 
     @cached_property
     def trend(self) -> np.ndarray:
@@ -141,14 +156,12 @@ class Case:
         s, (d_a, d_e, d_r, d_t) = self.sensed(guesses), self.inputs(guesses)
         flow = Flow(self.t, s["h"], s["h"] - self.flight.ground, body, delta_t=d_t, used=self.used)
         air = self._increments(flow, guesses, (Stage.AIR,))
-        R = self._turned if s["psi"] is self._smooth["psi"] else rotation(s["phi"], s["theta"], s["psi"])
-        ground = np.stack(
+        R, derived, apart = self.agreement(s)
+        ground = np.array(
             [s["v_n"] - air.get("w_n", 0.0), s["v_e"] - air.get("w_e", 0.0), s["v_d"] - air.get("w_d", 0.0)]
         )
         u, v, w = np.einsum("ijn,in->jn", R, ground)
-        lift_off = np.stack([s["v_n_dot"], s["v_e_dot"], s["v_d_dot"] - G])
-        derived = np.einsum("ijn,in->jn", R, lift_off)
-        f = np.stack([s["a_x"], s["a_y"], s["a_z"]]) if base.vane else derived
+        f = np.array([s["a_x"], s["a_y"], s["a_z"]]) if base.vane else derived
         Va = np.maximum(np.sqrt(u * u + v * v + w * w), 1.0)
         flow.Va, flow.alpha, flow.beta = Va, np.arctan2(w, u), np.arcsin(np.clip(v / Va, -1, 1))
         flow.p, flow.q, flow.r = s["p"], s["q"], s["r"]
@@ -190,10 +203,9 @@ class Case:
             "beta": flow.beta,
             "airspeed": s.get("Va", np.zeros_like(Va)),
         }
-        aside = {"mass": mass, "force": force, "c_z": c_z, "derived": derived, "f": f}
-        aside["delta"] = np.stack([d_a, d_e, d_r, d_t])
-        aside |= {name: s.get(name, np.zeros_like(Va)) for name in ("a_x", "a_y", "a_z", "baro", "h")}
-        aside |= {name: s[name] for name in ("phi", "theta", "phi_dot", "theta_dot", "psi_dot")}
+        aside = {"mass": mass, "force": force, "c_z": c_z, "apart": apart, "f": f, "h": s["h"]}
+        aside["delta"] = np.array([d_a, d_e, d_r, d_t])
+        aside["baro"] = s.get("baro", s["h"])
         scale = {"X": q_S, "L": q_S * body.b, "N": q_S * body.b, "M": q_S * body.c}
         return Terms(flow, add, terms, measured, aside, scale)
 
@@ -234,12 +246,9 @@ def channels(case: Case, made: Terms) -> np.ndarray:
     readings = case.flight.readings
     if "Va" in readings:
         out[:, 6] = made.measured["airspeed"] / base.airspeed - flow.Va * np.sqrt(flow.rho / RHO_0)
-    if "a_x" in readings:
-        out[:, 7:10] = (aside["derived"] - np.stack([aside["a_x"], aside["a_y"], aside["a_z"]])).T
-    out[:, 10:13] = _turning(flow, aside)
+    out[:, 7:13] = aside["apart"]
     if "baro" in readings:
         out[:, 13] = aside["baro"] - aside["h"] - case.trend - add.get("baro", 0.0)
-    out[:, 7:13] = slow(out[:, 7:13])
     return out
 
 
@@ -253,18 +262,12 @@ def valued(base: Baseline, add: Series, equation: str, terms: np.ndarray) -> np.
     return out
 
 
-def _turning(flow: Flow, aside: Series) -> np.ndarray:
-    phi, theta = aside["phi"], aside["theta"]
-    sf, cf, p, q, r = np.sin(phi), np.cos(phi), flow.p, flow.q, flow.r
-    turn = (q * sf + r * cf) / np.cos(theta)
-    return np.stack(
-        [
-            aside["phi_dot"] - p - np.sin(theta) * turn,
-            aside["theta_dot"] - (q * cf - r * sf),
-            aside["psi_dot"] - turn,
-        ],
-        axis=1,
-    )
+def _turning(s: Series) -> np.ndarray:
+    """Give Euler rates less what the gyros make of them, (n, 3) [rad/s]."""
+    sf, cf, p, q, r = np.sin(s["phi"]), np.cos(s["phi"]), s["p"], s["q"], s["r"]
+    turn = (q * sf + r * cf) / np.cos(s["theta"])
+    rates = (s["phi_dot"] - p - np.sin(s["theta"]) * turn, s["theta_dot"] - (q * cf - r * sf), s["psi_dot"] - turn)
+    return np.array(rates).T
 
 
 def rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
