@@ -30,7 +30,7 @@ class Flight:
         name: of the recording
         t: since its first attitude, equally spaced, (n,) [s]
         zero: that first instant [s since 1970]
-        readings: by the names in `fleet.effects.READINGS`, (n,) each; psi unwrapped
+        readings: by the names in `fleet.effects.READINGS`, (n,) each, psi unwrapped; and gnss, the satellites' height
         commands: delta_a delta_e delta_r delta_t as commanded, (n, 4) [-]
         place: north and east from the first position, (n, 2) [m]
         ground: height of home above mean sea level [m]
@@ -159,6 +159,9 @@ def _readings(
     if len(pressure_t) > 20:
         height = (1.0 - (np.clip(pressure[:, 0], 2e4, 1.2e5) / _SEA_LEVEL) ** (1 / _POWER)) / _LAPSE
         out["baro"] = np.interp(t, pressure_t - zero, height)
+        gnss_t, gnss = history.rows("gnss")
+        if len(gnss_t) > 50:  # an estimator's height follows the barometer: only the satellites' can judge it
+            out["gnss"] = np.interp(t, gnss_t - zero, gnss[:, 0] * 1e-3)
     else:
         lacks.append("no static pressure: the barometer cannot be judged")
     return out, vane

@@ -81,7 +81,7 @@ class Case:
         """Give the recorded barometer's offset, sea level pressure and lapse rate being unknown, (n,) [m]."""
         h = self._smooth["h"]
         A = np.column_stack([np.ones_like(h), h - h.mean()])
-        off = self._smooth["baro"] - h
+        off = self._smooth["baro"] - self._smooth.get("gnss", h)
         return A @ np.linalg.lstsq(A[self.ok], off[self.ok], rcond=None)[0]
 
     @cached_property
@@ -203,9 +203,9 @@ class Case:
             "beta": flow.beta,
             "airspeed": s.get("Va", np.zeros_like(Va)),
         }
-        aside = {"mass": mass, "force": force, "c_z": c_z, "apart": apart, "f": f, "h": s["h"]}
+        aside = {"mass": mass, "force": force, "c_z": c_z, "apart": apart, "f": f}
         aside["delta"] = np.array([d_a, d_e, d_r, d_t])
-        aside["baro"] = s.get("baro", s["h"])
+        aside["baro"] = s.get("baro", s["h"]) - s.get("gnss", s["h"])
         scale = {"X": q_S, "L": q_S * body.b, "N": q_S * body.b, "M": q_S * body.c}
         return Terms(flow, add, terms, measured, aside, scale)
 
@@ -248,7 +248,7 @@ def channels(case: Case, made: Terms) -> np.ndarray:
         out[:, 6] = made.measured["airspeed"] / base.airspeed - flow.Va * np.sqrt(flow.rho / RHO_0)
     out[:, 7:13] = aside["apart"]
     if "baro" in readings:
-        out[:, 13] = aside["baro"] - aside["h"] - case.trend - add.get("baro", 0.0)
+        out[:, 13] = aside["baro"] - case.trend - add.get("baro", 0.0)
     return out
 
 
