@@ -118,7 +118,7 @@ def _finding(one: Finding) -> str:
     )
     rivals = ", ".join(_rival(name, effect) for name in one.rivals)
     apart = f"Cannot be told from: {rivals}." if rivals else "Told apart from every other effect."
-    held = f"Takes {100 * one.held:.0f} % of the held-out residual, gain" if one.held else "Gain"
+    held = f"{100 * one.held:.0f} % of its gain shows on held-out data too; gain" if one.held else "Gain"
     return (
         f"<h3>{_safe(one.guess.label)}</h3><p><code>{_safe(effect.equation)}</code></p>"
         f"<p>Where: {_safe(where)}. When: {times(one.segments)}. "

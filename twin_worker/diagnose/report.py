@@ -29,7 +29,7 @@ class Finding:
         rivals: names of effects it cannot be told from
         channel, surface: where it lives; surface may be empty
         segments: when, seconds since the flight's zero
-        held: share of the residual that went on data held out
+        held: share of the gain that shows on data held out
     """
 
     guess: Guess
