@@ -97,11 +97,14 @@ def best(sight: Sight, beside: Sequence[Guess], only: tuple[str, ...] = ()) -> l
             tried.append(found)
         if len(tried) >= _TRIED:
             break
-    fitted = sorted((refine(sight, found.guess, move=False) for found in tried), key=lambda one: -rank(sight, one))
+    fitted = [refine(sight, found.guess, move=False) for found in tried]
     if not fitted:
         return []
-    near = [one for one in fitted if rank(sight, one) > _NEAR * rank(sight, fitted[0])]
-    return sorted((refine(sight, one.guess) for one in near), key=lambda one: -rank(sight, one)) + fitted[len(near) :]
+    least = _NEAR * max(rank(sight, one) for one in fitted)
+    # a bump a little early gains next to nothing before it is moved: the scan's word counts too
+    near = [max(rank(sight, one), found.worth) > least for one, found in zip(fitted, tried, strict=True)]
+    moved = [refine(sight, one.guess) if good else one for one, good in zip(fitted, near, strict=True)]
+    return sorted(moved, key=lambda one: -rank(sight, one))
 
 
 def rank(sight: Sight, found: Found) -> float:

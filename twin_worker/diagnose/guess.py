@@ -34,8 +34,9 @@ class When:
         return replace(self, t0=self.t0 + dt)
 
     def stretched(self, by: float) -> "When":
-        """Stretch the duration."""
-        return replace(self, T=self.T * by)
+        """Stretch the duration; what passes by is stretched about its middle."""
+        earlier = 0.5 * (by - 1.0) * self.T if self.kind is Onset.BUMP else 0.0
+        return replace(self, t0=self.t0 - earlier, T=self.T * by)
 
 
 ALWAYS = When()

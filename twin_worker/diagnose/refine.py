@@ -11,6 +11,7 @@ _ROUNDS = 5
 _ENOUGH = 0.5  # gain below which fitting stops
 _MOVES_S = (8.0, 4.0, 2.0, 1.0, 0.5, 0.2)
 _NEAR_S, _NEARER_S = np.arange(-2.0, 2.1, 0.2), np.arange(-0.16, 0.17, 0.04)  # a sensor's jump is sought
+_TURNS = {Onset.BUMP: 3}  # of moving and fitting: a bump sought beside its place is fitted too small at first
 _STRETCH = (1.5, 1.2, 1.1)
 
 
@@ -22,8 +23,10 @@ def refine(sight: Sight, guess: Guess, rounds: int = _ROUNDS, move: bool = True)
         half = guess.at(0.5 * np.array(guess.par))
         now, guess = min((now, guess), (sight.cost((half,)), half), key=lambda found: found[0])
     guess, now = _newton(sight, guess, now, rounds)
-    moved, cost = _onset(sight, guess, now) if move else (guess, now)
-    if moved is not guess:
+    for _ in range(_TURNS.get(guess.when.kind, 1) if move else 0):
+        moved, cost = _onset(sight, guess, now)
+        if moved is guess:
+            break
         guess, now = _newton(sight, moved, cost, 2)
     return Found(before - now, guess)
 
