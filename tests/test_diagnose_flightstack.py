@@ -3,16 +3,17 @@
 from pathlib import Path
 
 import pytest
+from left_out import left_out
 
-from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.calibrate import calibrate
 from twin_worker.diagnose.card import read
-from twin_worker.diagnose.diagnose import diagnose
 from twin_worker.diagnose.flight import Flight, read_flights
-from twin_worker.diagnose.report import Outcome
+from twin_worker.diagnose.report import Outcome, Report
+from twin_worker.diagnose.share import shared
 
 pytestmark = pytest.mark.recordings
 CARD = read(Path("skywalker"))
+MULTI = "s10_multi3_nominal"
 ZERO_S = 2.045  # boot time of each flight's first attitude [s]
 CHANGED = {  # flight -> truth: effect, number, value, boot time of the change [s] or None from the start
     "s04_wind_step": ("wind_steady", "speed_mps", 9.0, 266.2),
@@ -34,15 +35,15 @@ def nominal(sitl: Path) -> list[Flight]:
 
 
 @pytest.fixture(scope="module")
-def base(nominal: list[Flight]) -> Baseline:
-    return calibrate(nominal, CARD)
+def reports(sitl: Path, nominal: list[Flight]) -> dict[str, Report]:
+    files = [sitl / f"{name}.tlog.xz" for name in (*CHANGED, MULTI)]
+    return {one.flight: one for found, _ in shared(files, calibrate(nominal, CARD), 2, print) for one in found}
 
 
 @pytest.mark.parametrize("name", CHANGED)
-def test_a_change_in_flight_is_named_sized_and_dated(name: str, sitl: Path, base: Baseline) -> None:
+def test_a_change_in_flight_is_named_sized_and_dated(name: str, reports: dict[str, Report]) -> None:
     effect, number, truth, boot = CHANGED[name]
-    flight = read_flights(sitl / f"{name}.tlog.xz", CARD)[0]
-    report = diagnose(flight, base)
+    report = reports[name]
     assert report.outcome is Outcome.NAMED and len(report.findings) == 1, report.sentence
     found = report.findings[0]
     assert found.guess.effect.name == effect and len(found.rivals) <= 2, report.sentence
@@ -54,15 +55,13 @@ def test_a_change_in_flight_is_named_sized_and_dated(name: str, sitl: Path, base
     assert any("accelerometer at 5 Hz" in word for word in report.lacks)
 
 
-def test_three_nominal_aircraft_of_one_recording_are_left_in_peace(sitl: Path, base: Baseline) -> None:
-    flights = read_flights(sitl / "s10_multi3_nominal.tlog.xz", CARD)
-    assert len(flights) == 3
-    for flight in flights:
-        report = diagnose(flight, base)
+def test_three_nominal_aircraft_of_one_recording_are_left_in_peace(reports: dict[str, Report]) -> None:
+    found = [report for name, report in reports.items() if name.startswith(MULTI)]
+    assert len(found) == 3
+    for report in found:
         assert report.outcome is Outcome.NONE, report.sentence
 
 
 def test_nominal_flights_left_out_in_turn_are_not_named(nominal: list[Flight]) -> None:
-    for one in nominal:
-        report = diagnose(one, calibrate([flight for flight in nominal if flight is not one], CARD))
+    for report in left_out(nominal, CARD):
         assert report.outcome in (Outcome.NONE, Outcome.SUSPECTED), report.sentence

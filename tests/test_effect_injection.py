@@ -11,10 +11,9 @@ from effect_flights import CARD, Plan, flown
 from fleet.effects import Effect, Onset, catalogue
 from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.calibrate import calibrate
-from twin_worker.diagnose.diagnose import diagnose
-from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.guess import Guess, When
-from twin_worker.diagnose.report import Finding, Outcome
+from twin_worker.diagnose.report import Finding, Outcome, Report
+from twin_worker.diagnose.share import shared
 
 ALL = catalogue("")
 SINCE_S = 35.0
@@ -38,7 +37,7 @@ class Flown:
     """A calibration, and the flights to diagnose by it."""
 
     base: Baseline
-    flights: dict[str, Flight]
+    reports: dict[str, Report]
 
 
 def injected(effect: Effect, size: int) -> Guess:
@@ -58,7 +57,8 @@ def fly() -> Flown:
     plans = [Plan(f"control {seed}", seed) for seed in CONTROLS]
     for i, (name, effect) in enumerate(ALL.items()):
         plans += [Plan(f"{name} {size}", 10 + 3 * i + size, (injected(effect, size),)) for size in range(3)]
-    return Flown(base, {flight.name: flight for flight in flown(plans)})
+    told = shared(flown(plans), base, 2, print)
+    return Flown(base, {report.flight: report for reports, _ in told for report in reports})
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def made() -> Flown:
 
 @pytest.mark.parametrize(("name", "size"), CASES)
 def test_an_effect_flown_is_the_effect_named(name: str, size: int, made: Flown) -> None:
-    report = diagnose(made.flights[f"{name} {size}"], made.base)
+    report = made.reports[f"{name} {size}"]
     assert report.findings, report.sentence
     first = report.findings[0]
     assert name in (first.guess.effect.name, *first.rivals), report.sentence
@@ -92,5 +92,5 @@ def assert_close(found: Finding, base: Baseline) -> None:
 
 @pytest.mark.parametrize("seed", CONTROLS)
 def test_nothing_flown_is_nothing_named(seed: int, made: Flown) -> None:
-    report = diagnose(made.flights[f"control {seed}"], made.base)
+    report = made.reports[f"control {seed}"]
     assert report.outcome in (Outcome.NONE, Outcome.SUSPECTED), report.sentence

@@ -23,23 +23,33 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--airframe", type=Path, metavar="CARD", help="with --against: the aircraft, as for calibrate")
     parser.add_argument("--json", type=Path, metavar="OUT", help="write verdicts to OUT, predictions beside it")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that share the recordings (1)")
     parser.add_argument(
         "--report", type=Path, metavar="DIR", help="write figures, a page and corrected models into DIR"
     )
 
 
-def run(args: argparse.Namespace) -> int:
-    """Start the diagnosis; its exit code is ours.
+def check(args: argparse.Namespace) -> None:
+    """Refuse wrong use before anything is read.
 
     Raises:
-        ValueError: when it is not said what to compare with.
+        ValueError: when an option makes no sense; the sentence says which.
     """
+    if not 1 <= args.jobs <= 64:
+        raise ValueError(f"--jobs: found {args.jobs}, expected 1..64; change it")
     if bool(args.model) == bool(args.against):
         raise ValueError("expected either --model or --against; name one thing to compare the flights with")
+    for option, path in (("--json", args.json), ("--report", args.report)):
+        if path and not path.absolute().parent.is_dir():
+            raise ValueError(f"{option}: found no folder {str(path.parent)!r}, expected one; make it first")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start the diagnosis; its exit code is ours."""
+    check(args)
     stop = stop_on_signal()
-    options = [
-        f"--{name}={getattr(args, name)}" for name in ("model", "airframe", "json", "report") if getattr(args, name)
-    ]
+    given = {name: getattr(args, name) for name in ("model", "airframe", "json", "report", "jobs")}
+    options = [f"--{name}={value}" for name, value in given.items() if value]
     simulated = ["--against", *map(str, args.against)] if args.against else []
     code = run_until(stop, "twin_worker.diagnose", *options, *simulated, "--", *map(str, args.file))
     if stop.is_set():

@@ -5,32 +5,26 @@ import sys
 from pathlib import Path
 
 from fleet.cli import guarded, parser_for
-from fleet.commands.diagnose import EXAMPLES, arguments
+from fleet.commands.diagnose import EXAMPLES, arguments, check
 from twin_worker.diagnose import keep, written
 from twin_worker.diagnose.baseline import Baseline
-from twin_worker.diagnose.diagnose import diagnose
-from twin_worker.diagnose.flight import read_flights
 from twin_worker.diagnose.learn import card_of, learn, say
 from twin_worker.diagnose.report import Outcome, Report
+from twin_worker.diagnose.share import shared
 
 
 def _run(args: argparse.Namespace) -> int:
-    for option, path in (("--json", args.json), ("--report", args.report)):
-        if path and not path.absolute().parent.is_dir():
-            raise ValueError(f"{option}: found no folder {str(path.parent)!r}, expected one; make it first")
+    check(args)
     base = keep.load(args.model)[0] if args.model else learn(args.against, card_of(args.airframe))
     reports: list[Report] = []
     refused = 0
-    for path in args.file:
-        try:
-            flights = read_flights(path, base.card)
-            for flight in flights:
-                say(f"{flight.name}: {flight.seconds:.0f} s of flight")
-                reports.append(diagnose(flight, base, say))
-                print(f"{flight.name}: {reports[-1].sentence}", flush=True)
-        except (ValueError, OSError) as error:  # one bad recording loses no other
+    for found, why in shared(args.file, base, args.jobs, say):
+        for report in found:
+            print(f"{report.flight}: {report.sentence}", flush=True)
+        reports += found
+        if why:
             refused += 1
-            say(str(error))
+            say(why)
     if args.json:
         written.write(reports, args.json)
     if args.report:
