@@ -41,7 +41,7 @@ run: setup
 	@exec $(BIN)/fleet up $(UP)
 
 test: setup browser
-	@$(BIN)/python -m pytest $(TESTS)
+	@$(BIN)/python -m pytest -n 2 --dist loadfile $(TESTS)
 
 lint: setup
 	@$(BIN)/ruff check .
