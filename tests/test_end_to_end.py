@@ -22,7 +22,7 @@ from fleet.bus import Bus, connect
 from fleet.commands.status import fleet_rows
 from fleet.contract import Account, FleetState, Mission, Model, Outcome, Params, Prediction, Sample, State, Status
 
-PATIENCE_S = 120.0  # an upper bound on a cold machine; every wait ends with its condition
+PATIENCE_S = 300.0  # an upper bound on a cold machine; every wait ends with its condition
 ROW = {"uav", "state", "verdict", "fit", "horizon_s", "worker", "sample_age_s", "prediction_age_s"}
 NAN = float("nan")
 

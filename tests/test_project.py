@@ -26,7 +26,7 @@ PEERS = {
     "pysindy",
     "sippy-unipi",
 }  # of the bench, in an environment of their own
-TOOLS = {"ruff", "mypy", "pytest"}  # development dependencies that are run rather than imported
+TOOLS = {"ruff", "mypy", "pytest", "pytest-xdist"}  # development dependencies that are run rather than imported
 
 
 # --- tracked files ---------------------------------------------------------------------------------------------------
