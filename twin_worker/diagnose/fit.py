@@ -184,26 +184,28 @@ def fit_wind(case: Case, w: np.ndarray) -> np.ndarray:
 
 
 def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
-    """Find the lags and the delay that leave the least innovations, one after the other, twice.
+    """Find the lags and the delay that leave the least innovations, lag and delay of the servos together.
 
-    Pitch tells of the servos: in roll, damping and lag look alike within the band. Axial force tells of the engine.
+    Pitch and yaw tell of the servos: in roll, damping and lag look alike within the band. Axial force tells of the
+    engine.
     """
     best = Timing()
     base, winds = fit(flights, card, best, vane)
     cases = [Case(flight, base) for flight in flights]
 
     def left(timing: Timing) -> dict[str, float]:
-        """Give what the pitch and axial equations leave unexplained."""
+        """Give what pitch and yaw leave unexplained, and axial force."""
         timed = _with(cases, replace(base, timing=timing))
         made = [case.terms(wind(w)) for case, w in zip(timed, winds, strict=True)]
         axial = _axial(timed, made)
         coef = {"T": _solve(axial, 0)[0][len(eq.X) :]}
-        return {"M": _surprise(_pitch(timed, made, coef)), "X": _surprise(axial)}
+        yaw = _Rows(timed, made, "N")
+        return {"servo": _surprise(_pitch(timed, made, coef)) + _surprise(yaw), "engine": _surprise(axial)}
 
-    for _ in range(2):
-        for name, grid, equation in (("servo", _LAGS, "M"), ("delay", _DELAYS, "M"), ("engine", _ENGINES, "X")):
-            trials = [replace(best, **{name: value}) for value in grid]
-            best = min(trials, key=lambda timing: left(timing)[equation])
+    # a longer lag looks much like a longer delay: one after the other stops beside the best pair
+    pairs = [replace(best, servo=servo, delay=delay) for servo in _LAGS for delay in _DELAYS]
+    best = min(pairs, key=lambda timing: left(timing)["servo"])
+    best = min((replace(best, engine=engine) for engine in _ENGINES), key=lambda timing: left(timing)["engine"])
     return best
 
 
