@@ -28,7 +28,7 @@ ON = {  # what an effect befalls here
     "stall": "8 deg",
 }
 NOMINAL, CONTROLS = range(4), range(200, 204)
-WITHIN = 0.25  # of the change the effect makes to its first number, at the largest magnitude; or 3 sigma
+WITHIN = 0.15  # of the change the effect makes to its first number, at the largest magnitude; or 3 sigma
 CASES = [pytest.param(name, size, id=f"{name}-{size}") for name in ALL for size in range(3)]
 
 

@@ -21,7 +21,7 @@ EFFECT = Effect(
     ),
     act=act,
     onsets=(Onset.ALWAYS,),
-    examples=((0.12,), (0.2,), (0.4,)),
+    examples=((0.15,), (0.25,), (0.4,)),
     confused={
         "thrust_loss": "comes at once or with time, not with the charge used",
         "drag_increase": "drag grows with dynamic pressure, not with the charge used",
