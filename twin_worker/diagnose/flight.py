@@ -1,6 +1,6 @@
 """A recording as one flight on one grid: every reading the diagnosis uses, and where it may be trusted."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +49,6 @@ class Flight:
     ok: np.ndarray
     vane: bool
     lacks: tuple[str, ...] = ()
-    skipped: tuple[str, ...] = field(default=(), compare=False)
 
     @property
     def seconds(self) -> float:
