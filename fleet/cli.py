@@ -12,6 +12,8 @@ from collections.abc import Callable
 from fleet import __version__, commands
 from fleet.children import PARENT
 
+GRACE_S = 30.0  # an orphan may take so long to end by its own door [s]
+
 Run = Callable[[argparse.Namespace], int]
 
 
@@ -53,6 +55,8 @@ def _outlive_nobody(parent: int, stop: threading.Event) -> None:
     while not stop.wait(1.0):
         if os.getppid() != parent:
             stop.set()
+            threading.Event().wait(GRACE_S)  # whoever hangs in a foreign library, as on a router that died, ends here
+            os._exit(1)
 
 
 def id_range(text: str) -> range:

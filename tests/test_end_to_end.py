@@ -18,6 +18,7 @@ from conftest import ROOT, unused_port
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import Talker
 
+from fleet import cli
 from fleet.bus import Bus, connect
 from fleet.commands.status import fleet_rows
 from fleet.contract import Account, FleetState, Mission, Model, Outcome, Params, Prediction, Sample, State, Status
@@ -120,6 +121,14 @@ def test_a_fleet_whose_parent_is_killed_ends_all_the_same() -> None:
         assert len(children) == 3
         up.kill()
         wait(lambda: not any(_alive(pid) for pid in children))
+
+
+def test_an_orphan_that_hangs_ends_too() -> None:
+    hangs = "import threading; from fleet import cli; cli.GRACE_S = 0.1; cli.stop_on_signal(); threading.Event().wait()"
+    done = subprocess.run(
+        [sys.executable, "-c", hangs], cwd=ROOT, env=os.environ | {cli.PARENT: "1"}, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == 1
 
 
 def _alive(pid: int) -> bool:
