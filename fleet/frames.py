@@ -75,22 +75,23 @@ def to_geodetic(origin: Origin, ned: np.ndarray) -> np.ndarray:
 
 def body_to_ned(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, body: np.ndarray) -> np.ndarray:
     """Rotate body vectors to NED. Angles (n,) [rad], body FRD (n, 3). Source: Beard & McLain eq. 2.5."""
-    return np.einsum("nij,nj->ni", _rotation(phi, theta, psi), body)
+    return np.einsum("nij,nj->ni", np.moveaxis(rotation(phi, theta, psi), -1, 0), body)
 
 
 def ned_to_body(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, ned: np.ndarray) -> np.ndarray:
     """Rotate NED vectors to the body. Angles (n,) [rad], NED (n, 3)."""
-    return np.einsum("nji,nj->ni", _rotation(phi, theta, psi), ned)
+    return np.einsum("nji,nj->ni", np.moveaxis(rotation(phi, theta, psi), -1, 0), ned)
 
 
-def _rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
+def rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
+    """Give the matrices from body to NED, (3, 3, n); angles (n,) [rad]. Source: Beard & McLain eq. 2.5."""
     cf, sf, ct, st, cp, sp = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta), np.cos(psi), np.sin(psi)
     rows = [
         [ct * cp, sf * st * cp - cf * sp, cf * st * cp + sf * sp],
         [ct * sp, sf * st * sp + cf * cp, cf * st * sp - sf * cp],
         [-st, sf * ct, cf * ct],
     ]
-    return np.moveaxis(np.array(rows), -1, 0)
+    return np.array(rows)
 
 
 @nb.njit(cache=True)

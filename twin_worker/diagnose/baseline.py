@@ -12,7 +12,6 @@ CHANNELS = (
 )
 """Residuals: fx [m/s2]; beta, alpha [deg]; p', q', r' [rad/s2]; airspeed [m/s]; dV/dt against the accelerometer
 [m/s2]; Euler rates against the gyros [rad/s]; barometric height [m]."""
-EQUATION = {"force_x": "X", "side": "beta", "lift": "alpha", "roll": "L", "pitch": "M", "yaw": "N"}
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ class Baseline:
     usual: np.ndarray = field(default_factory=lambda: np.ones(len(CHANNELS)))
     flights: tuple[str, ...] = ()
 
-    def varied(self, k: int, by: float = 1.0) -> "Baseline":
+    def varied(self, k: int) -> "Baseline":
         """Give the baseline with its coefficients moved towards those of the k-th left out."""
-        coef = {name: x + by * self.others[k][name] for name, x in self.coef.items()}
+        coef = {name: x + self.others[k][name] for name, x in self.coef.items()}
         return replace(self, coef=coef)

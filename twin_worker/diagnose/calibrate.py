@@ -106,7 +106,7 @@ def replaced(case: Case, base: Baseline) -> Case:
     own = replace(
         case.base, noise=base.noise, spread=base.spread, usual=base.usual, chance=base.chance, others=base.others
     )
-    return Case(case.flight, own)
+    return Case(case.flight, own, like=case)
 
 
 def own_weather(case: Case) -> tuple[Guess, ...]:

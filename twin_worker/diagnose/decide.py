@@ -1,6 +1,7 @@
 """Name what explains a flight: up to three effects, chosen beside each other, each with what it is not told from."""
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ _CANCEL = 1.5  # an effect that gains this much more beside the others than all 
 _SECOND = 300.0  # and of every further one
 _NEAR = 0.6  # of the best one's worth, from which an onset is worth a search
 _CHANCE = 1.2  # over what nominal flights reach by chance
-_SHARE = 0.02  # of the first one's gain a further one must bring
+_SHARE, _SHARE_COARSE = 0.02, 0.25  # of the first one's gain a further one must bring
 _FINE, _COARSE = 0.02, 0.15  # tie: by the accelerometer; by plain telemetry, whose baseline is wrong by about as much
 _GUSTS = 1.2, 1.5  # of the air channels' scatter over the usual: least, median
 _LEAST_TIE = 20.0
@@ -40,7 +41,7 @@ class Named:
 
 
 def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: None) -> tuple[list[Named], list[Found]]:
-    """Find what explains the flight, and the first ranking; `sight` ends with everything found taken for granted.
+    """Find what explains the flight, and the first ranking; what `sight` takes for granted changes.
 
     Args:
         sight: the flight with nothing but its weather granted
@@ -49,7 +50,7 @@ def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: Non
     """
     named: list[Named] = []
     ranking: list[Found] = []
-    first = Joint(sight, weather)
+    first = Joint(sight)
     while len(named) < MOST:
         say(f"effect {len(named) + 1}")
         found = best(sight, [one.found.guess for one in named])
@@ -64,15 +65,14 @@ def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: Non
                 break
         named = more
         sight.grant((*weather, *(one.found.guess for one in named)))
-    sight.grant((*weather, *(one.found.guess for one in named)))
     return named, ranking
 
 
 class Joint:
     """What several effects gain together, all reckoned alike."""
 
-    def __init__(self, sight: Sight, weather: tuple[Guess, ...]) -> None:
-        self._sight = Sight(sight.case, weather)
+    def __init__(self, sight: Sight) -> None:
+        self._sight = copy(sight)
         self._none = self._sight.cost(())
 
     def gain(self, named: list[Named]) -> float:
@@ -86,11 +86,11 @@ class Joint:
         return not cancelling and gain - self.gain(fewer) > needed(self._sight, fewer, more[-1].found)
 
 
-def best(sight: Sight, beside: Sequence[Guess], only: tuple[str, ...] = ()) -> list[Found]:
+def best(sight: Sight, beside: Sequence[Guess]) -> list[Found]:
     """Scan, and fit the most promising properly; best first."""
     taken = {guess.label for guess in beside}
     tried: list[Found] = []
-    for found in scan(sight, only=only):
+    for found in scan(sight):
         if found.guess.label in taken or found.gain < 40.0:
             continue
         if sum(other.guess.label == found.guess.label for other in tried) < 2:
@@ -139,7 +139,7 @@ def needed(sight: Sight, named: list[Named], found: Found) -> float:
     least = _LEAST if sight.base.vane else _LEAST_COARSE
     if not named:
         return max(least, chance)
-    return max(_SECOND, least, chance, (_SHARE if sight.base.vane else 0.25) * named[0].found.gain)
+    return max(_SECOND, least, chance, (_SHARE if sight.base.vane else _SHARE_COARSE) * named[0].found.gain)
 
 
 def _again(sight: Sight, named: list[Named], weather: tuple[Guess, ...]) -> list[Named]:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -18,8 +19,9 @@ from twin_worker.diagnose.prove import HELD, Proof
 from twin_worker.diagnose.refine import refine
 from twin_worker.diagnose.report import Finding, Outcome, Report, Series, Tried
 from twin_worker.diagnose.residual import Case
-from twin_worker.diagnose.scan import Found
+from twin_worker.diagnose.scan import WELL, Found
 from twin_worker.diagnose.sight import Sight
+from twin_worker.diagnose.smooth import thinned
 from twin_worker.diagnose.spread import covariances, told_sigma
 from twin_worker.diagnose.unexplained import free_form, stretches
 from twin_worker.diagnose.words import sentence, since
@@ -55,12 +57,12 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     before, white_before = sight.left() / base.usual, _profiled(sight)
     gusts, _ = turbulent(sight)
     say("naming")
+    plain = copy(sight)
     named, ranked = decide(sight, weather, say)
     if gusts > _GUSTY and gusts > sum(one.found.gain for one in named):
         named = []
-        sight.grant(weather)
     say("proving")
-    named, proof, findings = _proven(sight, weather, named, before)
+    named, proof, findings = _proven(plain, named, before)
     sight.grant((*weather, *(one.found.guess for one in named)))
     after, white_after = sight.left() / base.usual, _profiled(sight)
     if not any(map(_significant, findings)):
@@ -117,8 +119,6 @@ def _fits(flight: Flight, base: Baseline) -> None:
 
 def uncovered(base: Baseline) -> tuple[str, ...]:
     """Say which axes the nominal flights did not calibrate."""
-    from twin_worker.diagnose.scan import WELL
-
     doublets = {"L": "roll", "M": "pitch", "N": "yaw"}
     cure = {"L": "aileron", "M": "elevator", "N": "rudder"}
     return tuple(
@@ -144,14 +144,13 @@ def _profiled(sight: Sight) -> np.ndarray:
     return np.where(sight.ok[:, None], e, np.nan)
 
 
-def _proven(
-    sight: Sight, weather: tuple[Guess, ...], named: list[Named], before: np.ndarray
-) -> tuple[list[Named], Proof, tuple[Finding, ...]]:
+def _proven(plain: Sight, named: list[Named], before: np.ndarray) -> tuple[list[Named], Proof, tuple[Finding, ...]]:
     """Prove what was named; what stands beside the first and is not borne out on held-out data goes."""
+    sight, weather = copy(plain), plain.granted
     while True:
         if not named:
             return [], Proof(np.nan, np.nan, (), ()), ()
-        proof = prove.held_out(sight.case, weather, tuple(one.found.guess for one in named), before)
+        proof = prove.held_out(plain, tuple(one.found.guess for one in named), before)
         findings = _findings(sight, weather, named, proof)
         order = sorted(range(len(named)), key=lambda k: -named[k].found.gain)
         weak = [k for k in order[1:] if findings[k].held < _KEPT or not _significant(findings[k])]
@@ -244,7 +243,7 @@ def _at_its_end(one: Finding) -> bool:
 
 
 def _series(case: Case, before: np.ndarray, after: np.ndarray, force: foretell.Forces) -> Series:
-    place = np.column_stack([case.flight.place[::5], case.flight.readings["h"][::5]])
+    place = thinned(np.column_stack([case.flight.place, case.flight.readings["h"]]))
     return Series(
         t=case.t,
         ok=case.ok,

@@ -30,16 +30,11 @@ def blocks(t: np.ndarray, odd: bool) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Forces:
-    """Specific force on the thinned grid, (n, 3) each [m/s2]: recorded, and told without and with the effects.
-
-    Attributes:
-        way: how lift, side force and dynamic pressure were told
-    """
+    """Specific force on the thinned grid, (n, 3) each [m/s2]: recorded, and told without and with the effects."""
 
     measured: np.ndarray
     base: np.ndarray
     model: np.ndarray
-    way: tuple[str, str, str]
 
 
 def forces(case: Case, weather: tuple[Guess, ...], fitted: tuple[Guess, ...]) -> Forces:
@@ -49,7 +44,7 @@ def forces(case: Case, weather: tuple[Guess, ...], fitted: tuple[Guess, ...]) ->
     ways = [w for w in product(LIFT, SIDE, PRESSURE) if w[2] == "velocity" or "Va" in case.flight.readings]
     if not fitted:
         told = tell(case, before, ways[0])
-        return Forces(measured, told, told, ways[0])
+        return Forces(measured, told, told)
     even = case.ok & blocks(case.t, odd=False)
 
     def gained(way: tuple[str, str, str]) -> float:
@@ -57,7 +52,7 @@ def forces(case: Case, weather: tuple[Guess, ...], fitted: tuple[Guess, ...]) ->
         return float(1.0 - np.sqrt(errors[1] / max(errors[0], 1e-12)))
 
     best = max(ways, key=gained)
-    return Forces(measured, tell(case, before, best), tell(case, after, best), best)
+    return Forces(measured, tell(case, before, best), tell(case, after, best))
 
 
 def rms(case: Case, error: np.ndarray) -> float:

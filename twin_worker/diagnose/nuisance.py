@@ -34,9 +34,7 @@ SCATTER = Effect(
     examples=((0.01,),),
     of=(*_SHARES, *_OFFSETS),
 )
-LAPSE = Effect(
-    **{**SCATTER.__dict__, "name": "lapse", "act": lambda flow, x: {"baro": x * flow.height / 100.0}, "of": ()}
-)
+LAPSE = replace(SCATTER, name="lapse", act=lambda flow, x: {"baro": x * flow.height / 100.0}, of=())
 DENSITY = replace(SCATTER, stage=Stage.AIR)
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from twin_worker.diagnose.foretell import blocks
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.refine import refine
-from twin_worker.diagnose.residual import Case
 from twin_worker.diagnose.sight import Sight
 
 HELD = 0.03  # share of the residual that must go on held-out data for a name
@@ -35,16 +34,16 @@ class Proof:
         return 1.0 - self.after / self.before if self.before > 0 else 0.0
 
 
-def held_out(case: Case, weather: tuple[Guess, ...], guesses: tuple[Guess, ...], shows: np.ndarray) -> Proof:
+def held_out(sight: Sight, guesses: tuple[Guess, ...], shows: np.ndarray) -> Proof:
     """Fit on even blocks, judge on odd ones.
 
     Args:
-        case: the flight; weather: granted throughout
+        sight: the flight with nothing but its weather granted; it is left as it is
         guesses: as fitted on the whole flight
         shows: each channel's residual over its usual, (c,)
     """
-    sight = Sight(case, weather)
-    even, odd = (sight.part(blocks(case.t, odd=side)) for side in (False, True))
+    weather = sight.granted
+    even, odd = (sight.part(blocks(sight.case.t, odd=side)) for side in (False, True))
     fitted = list(guesses)
     for _ in range(1 + (len(guesses) > 1)):
         for i, guess in enumerate(fitted):

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Flow, Stage
-from fleet.frames import G
+from fleet.frames import G, rotation
 from twin_worker.diagnose import equations as eq
 from twin_worker.diagnose.baseline import CHANNELS, Baseline
 from twin_worker.diagnose.flight import Flight
@@ -268,18 +268,6 @@ def _turning(s: Series) -> np.ndarray:
     turn = (q * sf + r * cf) / np.cos(s["theta"])
     rates = (s["phi_dot"] - p - np.sin(s["theta"]) * turn, s["theta_dot"] - (q * cf - r * sf), s["psi_dot"] - turn)
     return np.array(rates).T
-
-
-def rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
-    """Give the matrices from body to NED, (3, 3, n)."""
-    cf, sf, ct, st, cp, sp = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta), np.cos(psi), np.sin(psi)
-    return np.stack(
-        [
-            np.stack([ct * cp, sf * st * cp - cf * sp, cf * st * cp + sf * sp]),
-            np.stack([ct * sp, sf * st * sp + cf * cp, cf * st * sp - sf * cp]),
-            np.stack([-st, sf * ct, cf * ct]),
-        ]
-    )
 
 
 def _of(guess: Guess) -> dict[str, str]:

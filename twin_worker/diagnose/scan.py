@@ -38,19 +38,10 @@ class Found:
         return self.gain - PRICE * self.guess.size
 
 
-def scan(sight: Sight, skip: tuple[str, ...] = (), only: tuple[str, ...] = ()) -> list[Found]:
-    """Give for every effect, object and kind of onset the best found, best first.
-
-    Args:
-        sight: what is left to explain
-        skip: labels of guesses not to try again
-        only: labels to try; empty: all
-    """
+def scan(sight: Sight) -> list[Found]:
+    """Give for every effect, object and kind of onset the best found, best first."""
     out = []
     for effect, of in candidates(sight):
-        label = f"{effect.name}:{of}" if of else effect.name
-        if label in skip or (only and label not in only):
-            continue
         out += _by_start(sight, effect, of) if effect.starts else _by_slope(sight, effect, of)
     return sorted(out, key=lambda found: -found.worth)
 

@@ -42,7 +42,7 @@ class Sight:
         if self.ok.any():
             scatter = 1.4826 * np.median(np.abs(self.whitened(())[self.ok]), axis=0)
             self.clip = np.maximum(CLIP, _WIDE * scatter)
-        self.grant(granted)
+        self._lay()
 
     def part(self, span: np.ndarray) -> "Sight":
         """Give the same with only the rows of `span`, (n,) bool, counting."""
@@ -80,7 +80,12 @@ class Sight:
 
     def grant(self, granted: tuple[Guess, ...]) -> None:
         """Take guesses for granted from now on."""
-        self.granted = granted
+        if granted != self.granted:
+            self.granted = granted
+            self._lay()
+
+    def _lay(self) -> None:
+        """Reckon residuals and nuisances with what is granted."""
         self.raw = self.whitened(())
         self.e = np.clip(self.raw, -self.clip, self.clip)
         steps = [self.whitened((n.guess(n.step),)) for n in self.nuisances]

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Flow, Onset, Stage
-from fleet.frames import G
+from fleet.frames import G, rotation
 from twin_worker.diagnose import equations as eq
 from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.guess import Guess
-from twin_worker.diagnose.residual import RHO_0, density, rotation
+from twin_worker.diagnose.residual import RHO_0, density
 from twin_worker.diagnose.smooth import DT
 
 STATE = ("v_n", "v_e", "v_d", "p", "q", "r", "phi", "theta", "psi", "h")
@@ -24,6 +24,7 @@ _SLOWEST = 3.0  # airspeed the equations are used down to [m/s]
 _WILDEST = 8.0  # body rates beyond which a run counts as lost [rad/s]
 
 Pilot = Callable[[int, np.ndarray], np.ndarray]
+Memories = dict[tuple[int, int, int], np.ndarray]  # run, input, effect -> what its servo remembers
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Simulation:
         x = np.array(start, float)
         states, force = np.empty((n, len(STATE), self.runs)), np.empty((n, 3, self.runs))
         commands, speed, rho = np.empty((n, 4, self.runs)), np.empty((n, self.runs)), np.empty((n, self.runs))
-        memories: dict[tuple[int, int], np.ndarray] = {}
+        memories: Memories = {}
         acting: np.ndarray | None = None
         used = np.zeros(self.runs)
         half, whole = self._share(0.5 * DT), self._share(DT)
@@ -105,7 +106,7 @@ class Simulation:
                     share[column, run] = 1.0
         return share
 
-    def _moved(self, commands: np.ndarray, t: np.ndarray, memories: dict[tuple[int, int], np.ndarray]) -> np.ndarray:
+    def _moved(self, commands: np.ndarray, t: np.ndarray, memories: Memories) -> np.ndarray:
         """Have faulty servos do to the commands what they do."""
         out = commands.copy()
         for run, guess in self._servos:
@@ -113,7 +114,7 @@ class Simulation:
                 if guess.of not in (name, ALL_SURFACES):
                     continue
                 u = out[column, run : run + 1].copy()
-                memory = memories.setdefault((run, column, id(guess)), np.full(MEMORY, u[0]))  # type: ignore[arg-type]
+                memory = memories.setdefault((run, column, id(guess)), np.full(MEMORY, u[0]))
                 par = np.asarray(guess.par)[:, None] * guess.when.gate(t[run : run + 1])
                 if guess.effect.takes_lag:
                     par[0] += self.base.timing.servo + self.base.timing.delay

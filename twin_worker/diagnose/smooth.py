@@ -46,13 +46,7 @@ def whole(ok: np.ndarray, reach: int = REACH // 2) -> np.ndarray:
 
 def _thin(taps: np.ndarray, x: np.ndarray) -> np.ndarray:
     half = len(taps) // 2
-    n = (len(x) + EVERY - 1) // EVERY
-    # the output at input k*EVERY lies at (half + k*EVERY) of the full convolution of the padded series
-    padded = np.concatenate([np.full(half, x[0]), x, np.full(half + EVERY, x[-1])])
-    full = upfirdn(taps, padded, 1, EVERY)
-    first = 2 * half / EVERY
-    whole_steps = int(np.ceil(first))
-    if whole_steps * EVERY != 2 * half:
-        padded = np.concatenate([np.full(whole_steps * EVERY - 2 * half, x[0]), padded])
-        full = upfirdn(taps, padded, 1, EVERY)
-    return full[whole_steps : whole_steps + n]
+    lead = -2 * half % EVERY  # so that the first output falls on a multiple of the thinning
+    padded = np.concatenate([np.full(lead + half, x[0]), x, np.full(half + EVERY, x[-1])])
+    first = (2 * half + lead) // EVERY
+    return upfirdn(taps, padded, 1, EVERY)[first : first + (len(x) + EVERY - 1) // EVERY]
