@@ -96,13 +96,14 @@ def test_files_of_flights_are_never_the_same_nor_elsewhere() -> None:
     assert "Flug_ü" in names
 
 
-def test_several_flights_begin_with_an_overview(tmp_path: Path) -> None:
-    reports = [made("one", seed=1), made("one", Outcome.NONE, seed=2), made("two", Outcome.UNKNOWN, seed=3)]
-    text = write(reports, tmp_path).read_text()
+def test_several_flights_have_a_page_each_and_an_overview(tmp_path: Path) -> None:
+    reports = [made("one", seed=1), made("one", Outcome.NONE, seed=2), made("index", Outcome.UNKNOWN, seed=3)]
+    overview = write(reports, tmp_path).read_text()
     read(tmp_path / "index.html")
-    overview = text[: text.index("<section>")]
-    for k, report in enumerate(reports, 1):
-        assert report.sentence in overview and f'href="#flight-{k}"' in overview and f'id="flight-{k}"' in text
+    for stem, report in zip(("one", "one-2", "index-2"), reports, strict=True):
+        assert report.sentence in overview and f'href="{stem}.html"' in overview
+        page = read(tmp_path / f"{stem}.html")
+        assert report.sentence in " ".join(page.words) and len(page.images) == 4
     assert len(list(tmp_path.glob("*.png"))) == 12
 
 

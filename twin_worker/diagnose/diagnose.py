@@ -9,6 +9,7 @@ import numpy as np
 
 from fleet.effects import Onset, Stage, catalogue
 from twin_worker.diagnose import foretell, prove
+from twin_worker.diagnose.apart import manoeuvre
 from twin_worker.diagnose.baseline import CHANNELS, Baseline
 from twin_worker.diagnose.calibrate import own_weather
 from twin_worker.diagnose.decide import Named, decide, turbulent
@@ -170,6 +171,7 @@ def _findings(sight: Sight, weather: tuple[Guess, ...], named: list[Named], proo
     out = []
     for i, (one, covariance) in enumerate(zip(named, covariances(sight, weather, guesses), strict=True)):
         guess = one.found.guess
+        rivals = [rival.guess for rival in one.rivals]
         surface = guess.of if guess.effect.stage is Stage.DELTA else ""
         out.append(
             Finding(
@@ -178,7 +180,8 @@ def _findings(sight: Sight, weather: tuple[Guess, ...], named: list[Named], proo
                 told=guess.effect.told(guess.effect, np.array(guess.par), body),
                 sigma=told_sigma(guess, covariance, body),
                 doubt=tuple(np.sqrt(np.diag(covariance)).tolist()),
-                rivals=tuple(dict.fromkeys(rival.guess.effect.name for rival in one.rivals)),
+                rivals=tuple(rival.effect.name for rival in rivals),
+                apart=tuple(manoeuvre(sight, guess, rival) for rival in rivals),
                 channel=guess.effect.channel,
                 surface=surface,
                 segments=(_segment(guess, float(sight.case.t[0]), float(sight.case.t[-1])),),
@@ -209,7 +212,7 @@ def _gusts(sight: Sight, alone: bool) -> Finding | None:
     whole = (float(sight.case.t[0]), float(sight.case.t[-1]))
     told = effect.told(effect, np.array([intensity]), sight.base.card.body)
     sigma = {name: _GUESSED * x for name, x in told.items()}
-    return Finding(guess, gain, told, sigma, (_GUESSED * intensity,), (), "air", "", (whole,), 1.0)
+    return Finding(guess, gain, told, sigma, (_GUESSED * intensity,), (), (), "air", "", (whole,), 1.0)
 
 
 def _outcome(

@@ -1,14 +1,12 @@
-"""One self-contained page for people: what was found in every flight, how it shows, what else it may be."""
+"""One self-contained page a flight, for people: what was found in every flight, how it shows, what else it may be."""
 
 import base64
 from collections.abc import Iterator, Sequence
-from html import escape
 from math import floor, isfinite, log10
 from pathlib import Path
 
 from fleet.effects import Effect
-from fleet.page.ink import BAD, GOOD, GRID, INK, LINES, MUTED, ROUTE
-from fleet.sheet import plain
+from fleet.page.html import document, safe
 from twin_worker.diagnose.figures import draw, stems
 from twin_worker.diagnose.marks import MEANING, SAID, times
 from twin_worker.diagnose.report import Finding, Outcome, Report
@@ -32,59 +30,43 @@ _CAPTIONS = (
     "Proof: measured against simulated; shaded blocks were held out of the fit",
     "Candidates: what each would gain, and what cannot be told from the chosen",
 )
-_GUARD = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # nothing is fetched, nothing runs
-_COLOURS = {"ink": INK, "muted": MUTED, "line": GRID, "good": GOOD, "bad": BAD, "doubt": LINES[3], "odd": ROUTE}
 
 
 def write(reports: Sequence[Report], folder: Path) -> Path:
-    """Write `index.html` with its figures inside, and the figures beside it; give the page's path.
+    """Write a page for every flight with its figures inside, and an overview of several; give what to open first.
 
     Args:
         reports: one for each flight, in the order they shall appear
-        folder: made where it is missing
+        folder: made where it is missing; the figures stand in it too
     """
     folder.mkdir(parents=True, exist_ok=True)
-    names = stems([report.flight for report in reports])
-    sections = [
-        _section(report, k, draw(report, folder, stem))
-        for k, (report, stem) in enumerate(zip(reports, names, strict=True), 1)
-    ]
-    path = folder / "index.html"
-    path.write_text(_page(reports, sections), encoding="utf-8")
-    return path
+    _, *names = stems(["index", *(report.flight for report in reports)])
+    index = folder / "index.html"
+    for report, stem in zip(reports, names, strict=True):
+        path = index if len(reports) == 1 else folder / f"{stem}.html"
+        whole = document(f"Diagnosis of {report.flight}", _section(report, draw(report, folder, stem)))
+        path.write_text(whole, encoding="utf-8")
+    if len(reports) != 1:
+        title = f"Diagnosis of {len(reports)} flights"
+        index.write_text(document(title, _overview(title, reports, names)), encoding="utf-8")
+    return index
 
 
-def _page(reports: Sequence[Report], sections: Sequence[str]) -> str:
-    colours = "".join(f"--{name}:{colour};" for name, colour in _COLOURS.items())
-    style = f":root{{{colours}}}\n" + Path(__file__).with_name("page.css").read_text(encoding="utf-8")
-    title = f"Diagnosis of {_safe(reports[0].flight) if len(reports) == 1 else f'{len(reports)} flights'}"
-    head = (
-        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_GUARD}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-    )
-    overview = _overview(reports) if len(reports) != 1 else ""
-    body = "\n".join((overview, *sections))
-    return (
-        f'<!DOCTYPE html>\n<html lang="en"><head>{head}<title>{title}</title>\n<style>{style}</style></head>\n'
-        f"<body><main>\n{body}\n</main></body></html>\n"
-    )
-
-
-def _overview(reports: Sequence[Report]) -> str:
+def _overview(title: str, reports: Sequence[Report], names: Sequence[str]) -> str:
     """Tabulate every flight with its sentence."""
     rows = "".join(
-        f'<tr><td>{_chip(one.outcome)}</td><td><a href="#flight-{k}">{_safe(one.flight)}</a></td>'
-        f'<td>{_safe(one.sentence)}</td><td class="num">{_change(one.fit_before, one.fit_after)}</td></tr>'
-        for k, one in enumerate(reports, 1)
+        f'<tr><td>{_chip(one.outcome)}</td><td><a href="{name}.html">{safe(one.flight)}</a></td>'
+        f'<td>{safe(one.sentence)}</td><td class="num">{_change(one.fit_before, one.fit_after)}</td></tr>'
+        for name, one in zip(names, reports, strict=True)
     )
     head = "<tr><th>outcome</th><th>flight</th><th>in a sentence</th><th class='num'>held-out residual</th></tr>"
-    return f'<h1>Diagnosis of {len(reports)} flights</h1>\n<table class="all">{head}{rows}</table>'
+    return f'<h1>{title}</h1>\n<table class="all">{head}{rows}</table>'
 
 
-def _section(report: Report, number: int, figures: Sequence[Path]) -> str:
+def _section(report: Report, figures: Sequence[Path]) -> str:
     parts = (
-        f'<h2 id="flight-{number}">{_chip(report.outcome)} {_safe(report.flight)}</h2>',
-        f'<p class="say">{_safe(report.sentence)}</p>',
+        f"<h2>{_chip(report.outcome)} {safe(report.flight)}</h2>",
+        f'<p class="say">{safe(report.sentence)}</p>',
         _cards(report),
         *(_finding(one) for one in report.findings),
         _unknown(report),
@@ -112,26 +94,27 @@ def _finding(one: Finding) -> str:
     effect = one.guess.effect
     where = ", ".join(filter(None, (one.channel, one.surface)))
     rows = "".join(
-        f'<tr><td>{_safe(name)}</td><td class="num">{amount(value, one.sigma.get(name, float("nan")))}</td>'
-        f"<td>{_safe(unit(name, effect))}</td></tr>"
+        f'<tr><td>{safe(name)}</td><td class="num">{amount(value, one.sigma.get(name, float("nan")))}</td>'
+        f"<td>{safe(unit(name, effect))}</td></tr>"
         for name, value in one.told.items()
     )
-    rivals = ", ".join(_rival(name, effect) for name in one.rivals)
-    apart = f"Cannot be told from: {rivals}." if rivals else "Told apart from every other effect."
+    rivals = "".join(_rival(name, apart, effect) for name, apart in zip(one.rivals, one.apart, strict=True))
+    apart = f"<p>Cannot be told from:</p><ul>{rivals}</ul>" if rivals else "<p>Told apart from every other effect.</p>"
     held = f"{100 * one.held:.0f} % of its gain shows on held-out data too; gain" if one.held else "Gain"
     return (
-        f"<h3>{_safe(one.guess.label)}</h3><p><code>{_safe(effect.equation)}</code></p>"
-        f"<p>Where: {_safe(where)}. When: {times(one.segments)}. "
+        f"<h3>{safe(one.guess.label)}</h3><p><code>{safe(effect.equation)}</code></p>"
+        f"<p>Where: {safe(where)}. When: {times(one.segments)}. "
         f'<span class="soft">{held} {one.gain:,.0f}.</span></p>'
         f'<table><tr><th>number</th><th class="num">value ± standard deviation</th><th>unit</th></tr>{rows}</table>'
         f"<p>{apart}</p>"
     )
 
 
-def _rival(name: str, effect: Effect) -> str:
-    """Name a rival, and what would tell it apart where the effect knows."""
-    apart = effect.confused.get(name)
-    return f"<b>{_safe(name)}</b>" + (f' <span class="soft">({_safe(apart)})</span>' if apart else "")
+def _rival(name: str, apart: str, effect: Effect) -> str:
+    """Name a rival, what tells it apart where the effect knows, and what to fly."""
+    known = effect.confused.get(name)
+    words = ". ".join(filter(None, (known, f"To tell them apart: {apart}")))
+    return f'<li><b>{safe(name)}</b> <span class="soft">{safe(words)}.</span></li>'
 
 
 def _unknown(report: Report) -> str:
@@ -139,12 +122,12 @@ def _unknown(report: Report) -> str:
     if report.outcome is not Outcome.UNKNOWN:
         return ""
     channel, segments = report.where
-    where = _safe(MEANING.get(channel, channel) or "no one channel")
+    where = safe(MEANING.get(channel, channel) or "no one channel")
     said = f"<h3>Unknown</h3><p>Where: {where}. When: {times(segments)}.</p>"
     if not report.terms:
         return said
     rows = "".join(
-        f'<tr><td>{_safe(term)}</td><td class="num">{coefficient:.3g}</td></tr>'
+        f'<tr><td>{safe(term)}</td><td class="num">{coefficient:.3g}</td></tr>'
         for term, coefficient in report.terms.items()
     )
     head = '<tr><th>term</th><th class="num">coefficient</th></tr>'
@@ -153,7 +136,7 @@ def _unknown(report: Report) -> str:
 
 
 def _lacks(report: Report) -> str:
-    items = "".join(f"<li>{_safe(words)}</li>" for words in report.lacks)
+    items = "".join(f"<li>{safe(words)}</li>" for words in report.lacks)
     return f"<h3>What was lacking</h3><ul>{items}</ul>" if items else ""
 
 
@@ -162,7 +145,7 @@ def _figures(report: Report, figures: Sequence[Path]) -> Iterator[str]:
         data = base64.b64encode(path.read_bytes()).decode()
         yield (
             f"<figure><figcaption>{caption}</figcaption>"
-            f'<img alt="{_safe(report.flight)}: {caption}" src="data:image/png;base64,{data}"></figure>'
+            f'<img alt="{safe(report.flight)}: {caption}" src="data:image/png;base64,{data}"></figure>'
         )
 
 
@@ -193,8 +176,3 @@ def _change(before: float, after: float) -> str:
 
 def _chip(outcome: Outcome) -> str:
     return f'<span class="chip {outcome.value}">{SAID[outcome]}</span>'
-
-
-def _safe(text: str) -> str:
-    """Escape what came with the data: a flight is named after its file."""
-    return escape(plain(text))

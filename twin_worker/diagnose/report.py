@@ -27,6 +27,7 @@ class Finding:
         told, sigma: its numbers in the units people want, and their standard deviations
         doubt: standard deviations of the effect's own parameters
         rivals: names of effects it cannot be told from
+        apart: for each of them, what to fly so that they can
         channel, surface: where it lives; surface may be empty
         segments: when, seconds since the flight's zero
         held: share of the gain that shows on data held out
@@ -38,6 +39,7 @@ class Finding:
     sigma: dict[str, float]
     doubt: tuple[float, ...]
     rivals: tuple[str, ...]
+    apart: tuple[str, ...]
     channel: str
     surface: str
     segments: tuple[tuple[float, float], ...]

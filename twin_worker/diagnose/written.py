@@ -31,6 +31,7 @@ def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
         "sentence": report.sentence,
         "named": [one.guess.effect.name for one in named],
         "equivalents": [list(one.rivals) for one in named],
+        "told_apart_by": [list(one.apart) for one in named],
         "located": located,
         "parameters": [_finite(one.told) for one in named],
         "sigma": [_finite(one.sigma) for one in named],
