@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 from fleet.cli import id_range, stop_on_signal
 
 if TYPE_CHECKING:
+    from fleet.pretend.faults.fault import Fault
     from fleet.pretend.uav import PretendUav
 
 EXAMPLES = """
   fleet fly --uavs 0-7
   fleet fly --uavs 0-49 --to 127.0.0.1:14550 --wind 6 --turbulence 4 --loss 0.05
   fleet fly --uavs 0-1 --autopilot px4 --aircraft c172p
+  fleet fly --uavs 0-3 --fault drag_increase,dCD=0.03,at=120 --fault actuator_lag:elevator,tau_s=0.3 --fault-uav 2
   fleet fly --uavs 0 --seed 3 --for 300 --tlog flight.tlog     as fast as possible, no network
 """
 AUTOPILOTS, AIRCRAFT = ("ardupilot", "px4"), ("small", "c172p")  # as in `fleet.pretend.tuning`, which loads slowly
@@ -39,7 +41,20 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--loss", type=float, default=0.02, metavar="SHARE", help="share of frames lost (0.02)")
     parser.add_argument("--for", dest="seconds", type=float, metavar="S", help="how long (for ever; 300 with --tlog)")
+    fault_arguments(parser)
     parser.add_argument("--tlog", type=Path, metavar="FILE", help="fly as fast as possible into this .tlog instead")
+
+
+def fault_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what may be wrong with one of the aircraft."""
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="NAME[:OF],KEY=VALUE,...[,at=S]",
+        help="what is wrong with one aircraft, from S seconds on; may be given again",
+    )
+    parser.add_argument("--fault-uav", type=int, metavar="ID", help="which one (the first)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -57,7 +72,10 @@ def run(args: argparse.Namespace) -> int:
     level = turbulence_level(args.turbulence)
     host, port = _address(args.to)
     kind = {"autopilot": args.autopilot, "aircraft": args.aircraft}
-    uavs = [PretendUav(i, args.seed, wind=args.wind, turbulence=level, **kind) for i in args.uavs]
+    faulty = faults_of(args, args.uavs)
+    uavs = [
+        PretendUav(i, args.seed, wind=args.wind, turbulence=level, **kind, faults=faulty.get(i, ())) for i in args.uavs
+    ]
     print("fly: compiling the autopilot, once", flush=True)
     PretendUav(args.uavs[0], args.seed).step(0.2)
     if args.tlog is not None:
@@ -67,6 +85,23 @@ def run(args: argparse.Namespace) -> int:
     worst = drive.to_udp(uavs, (host, port), seconds=args.seconds, loss=args.loss, seed=args.seed, stop=stop)
     print(f"fly: stopped; at worst {worst * 1e3:.0f} ms behind real time", flush=True)
     return 0
+
+
+def faults_of(args: argparse.Namespace, uavs: range) -> "dict[int, tuple[Fault, ...]]":
+    """Give the faults of the one aircraft that has any.
+
+    Raises:
+        ValueError: when a fault is none that such an aircraft can carry, or the aircraft is none of them.
+    """
+    from fleet.pretend.faults.kinds import read
+
+    which = uavs[0] if args.fault_uav is None else args.fault_uav
+    if args.fault_uav is not None and not args.fault:
+        raise ValueError(f"fault-uav: found {which} but no fault, expected one; add --fault")
+    if which not in uavs:
+        raise ValueError(f"fault-uav: found {which}, expected one of {uavs[0]}-{uavs[-1]}; change --fault-uav")
+    faults = tuple(read(text, args.aircraft) for text in args.fault)
+    return {which: faults} if faults else {}
 
 
 def _check(args: argparse.Namespace) -> None:

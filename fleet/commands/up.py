@@ -15,7 +15,7 @@ from rich.text import Text
 from fleet.bus import ROUTER, Bus, connect, open_router, reachable
 from fleet.children import Children
 from fleet.cli import stop_on_signal
-from fleet.commands.fly import AIRCRAFT, AUTOPILOTS
+from fleet.commands.fly import AIRCRAFT, AUTOPILOTS, fault_arguments, faults_of
 from fleet.commands.replay import check as check_playing
 from fleet.commands.replay import link
 from fleet.commands.status import as_objects, fleet_rows, table
@@ -24,6 +24,7 @@ from fleet.contract import FleetRow, FleetState, State
 EXAMPLES = """
   fleet up --uavs 8
   fleet up --uavs 4 --autopilot px4 --aircraft c172p
+  fleet up --uavs 4 --fault drag_increase,dCD=0.04,at=120 --fault-uav 2      and see whether its twin finds out
   fleet up --link udpin:0.0.0.0:14550
   fleet up --replay flight.tlog.xz log7.bin --speed 4
   fleet up --replay monday.parauav --results
@@ -39,6 +40,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--uavs", type=int, default=8, metavar="N", help="simulated aircraft, ids 0 to N-1 (8)")
     parser.add_argument("--autopilot", choices=AUTOPILOTS, default="ardupilot", help="theirs (ardupilot)")
     parser.add_argument("--aircraft", choices=AIRCRAFT, default="small", help="their type (small)")
+    fault_arguments(parser)
     parser.add_argument("--mavlink", default=_MAVLINK, metavar="HOST:PORT", help=f"where they send UDP ({_MAVLINK})")
     parser.add_argument("--link", action="append", default=[], help="real aircraft instead, e.g. udpin:0.0.0.0:14550")
     parser.add_argument(
@@ -80,6 +82,9 @@ def _check(args: argparse.Namespace) -> None:
     if not 0 <= args.seconds < float("inf"):
         raise ValueError(f"--for: found {args.seconds} s, expected 0 (until Ctrl-C) or more; change it")
     check_playing(args)
+    if args.fault and (args.link or args.replay):
+        raise ValueError("--fault: found --link or --replay, expected simulated aircraft to carry it; leave one out")
+    faults_of(args, range(args.uavs))
     if args.results and not args.replay:
         raise ValueError("--results: found no --replay, expected a recording made by `fleet record`; name one")
     for name in args.replay:
@@ -116,6 +121,8 @@ def _start(children: Children, args: argparse.Namespace) -> None:
         children.start("gateway", "gateway", f"--link=udpin:{args.mavlink}", "--offset=-1", *router)
         aircraft = ["--uavs", f"0-{args.uavs - 1}", "--to", args.mavlink, "--seed", str(args.seed)]
         aircraft += ["--autopilot", args.autopilot, "--aircraft", args.aircraft]
+        aircraft += [f"--fault={text}" for text in args.fault]
+        aircraft += [] if args.fault_uav is None else [f"--fault-uav={args.fault_uav}"]
         children.start("aircraft", "fleet.cli", "fly", *aircraft)
     if not args.no_viewer:
         children.start("viewer", "viewer", "--port", str(args.port), *router)

@@ -15,7 +15,7 @@ from fleet.pretend.types import CRUISE, TYPES, Type
 from fleet.pretend.weather import FT, wind_at_20ft
 
 DT = 0.01  # physics step [s]
-_KG_TO_LB = 2.2046226218
+KG_TO_LB = 2.2046226218
 _SLUG_FT3 = 515.378819  # [kg/m3]
 _READ = (
     *("position/lat-geod-rad", "position/long-gc-rad", "position/geod-alt-ft"),
@@ -27,6 +27,7 @@ _READ = (
 )
 _SURFACES = ("fcs/aileron-cmd-norm", "fcs/elevator-cmd-norm", "fcs/rudder-cmd-norm")
 _MIXTURE = 0.87  # of a piston engine at these heights [-]
+_HERE = Path(__file__).parent
 __all__ = ["CRUISE", "DT", "Aircraft", "Truth"]
 
 
@@ -58,7 +59,7 @@ class Aircraft:
         Raises:
             RuntimeError: when JSBSim refuses its aircraft file; reinstall the package.
         """
-        self._fdm, self._kind = _executive(kind), kind
+        self._fdm, self.kind = _executive(kind), kind
         self._driven = (*_SURFACES, kind.motor)
         self._nodes = {name: self._fdm.get_property_manager().get_node(name) for name in (*_READ, *self._driven)}
         self._read = [self._nodes[name].get_double_value for name in _READ]
@@ -71,13 +72,13 @@ class Aircraft:
         self._seed = seed
 
     def _vary(self, rng: np.random.Generator) -> None:
-        self.payload_kg = rng.uniform(*self._kind.payload_kg)
-        self._fdm["inertia/pointmass-weight-lbs[1]" if self._kind.shipped else "inertia/pointmass-weight-lbs"] = (
-            self.payload_kg * _KG_TO_LB
+        self.payload_kg = rng.uniform(*self.kind.payload_kg)
+        self._fdm["inertia/pointmass-weight-lbs[1]" if self.kind.shipped else "inertia/pointmass-weight-lbs"] = (
+            self.payload_kg * KG_TO_LB
         )
-        for name, spread in self._kind.spread.items():
+        for name, spread in self.kind.spread.items():
             self._fdm[f"vary/{name}"] = 1 + spread * float(np.clip(rng.standard_normal(), -2, 2))
-        for name, spread in self._kind.offsets.items():
+        for name, spread in self.kind.offsets.items():
             self._fdm[f"vary/{name}"] = spread * float(np.clip(rng.standard_normal(), -2, 2))
 
     def start(self, p: np.ndarray, psi: float, Va: float, wind: tuple[float, float]) -> tuple[float, float, float]:
@@ -99,7 +100,7 @@ class Aircraft:
         fdm["ic/h-sl-ft"] = (self._origin.alt_mm * 1e-3 - p[2]) / FT
         fdm["ic/psi-true-rad"] = psi
         fdm["ic/phi-rad"] = 0.0
-        trim = self._trim_engine(Va) if self._kind.shipped else self._trim(Va)
+        trim = self._trim_engine(Va) if self.kind.shipped else self._trim(Va)
         fdm["ic/vw-mag-fps"] = hypot(*wind) / FT
         fdm["ic/vw-dir-deg"] = degrees(atan2(wind[1], wind[0])) % 360
         fdm["ic/vn-fps"] = (Va * cos(psi) + wind[0]) / FT
@@ -110,7 +111,7 @@ class Aircraft:
         fdm["atmosphere/turbulence/milspec/severity"] = float(self._turbulence)
         fdm.run_ic()
         fdm.set_trim_status(False)
-        if self._kind.shipped:
+        if self.kind.shipped:
             fdm["propulsion/set-running"] = -1
         self.blow(*wind)
         return trim
@@ -120,11 +121,11 @@ class Aircraft:
         fdm = self._fdm
         fdm["ic/vt-fps"], fdm["ic/gamma-deg"] = Va / FT, 0.0
         fdm["propulsion/magneto_cmd"], fdm["fcs/mixture-cmd-norm"] = 3, _MIXTURE
-        fdm[self._kind.motor] = 0.6
+        fdm[self.kind.motor] = 0.6
         fdm.run_ic()
         fdm["propulsion/set-running"] = -1
         fdm["simulation/do_simple_trim"] = 0  # longitudinal
-        theta, delta_e, delta_t = fdm["attitude/theta-rad"], -fdm["fcs/pitch-trim-cmd-norm"], fdm[self._kind.motor]
+        theta, delta_e, delta_t = fdm["attitude/theta-rad"], -fdm["fcs/pitch-trim-cmd-norm"], fdm[self.kind.motor]
         fdm["fcs/pitch-trim-cmd-norm"] = 0.0
         fdm["ic/alpha-rad"] = fdm["ic/theta-rad"] = theta
         self.drive(0.0, delta_e, 0.0, delta_t)
@@ -156,10 +157,11 @@ class Aircraft:
         for name, value in zip(self._driven, (delta_a, -delta_e, -delta_r, delta_t), strict=True):
             self._nodes[name].set_double_value(value)
 
-    def blow(self, w_n: float, w_e: float) -> None:
+    def blow(self, w_n: float, w_e: float, w_d: float = 0.0) -> None:
         """Set the mean wind, NED, the direction it blows to [m/s]; turbulence comes on top."""
         self._fdm["atmosphere/wind-north-fps"] = w_n / FT
         self._fdm["atmosphere/wind-east-fps"] = w_e / FT
+        self._fdm["atmosphere/wind-down-fps"] = w_d / FT
 
     def step(self) -> None:
         """Advance by DT."""
@@ -183,12 +185,24 @@ class Aircraft:
         """Read any JSBSim property by its own name, in its own unit."""
         return float(self._fdm[name])
 
+    def __setitem__(self, name: str, value: float) -> None:
+        """Set any JSBSim property by its own name, in its own unit: what a fault changes."""
+        self._fdm[name] = value
+
+
+def model_file(kind: Type) -> Path:
+    """Find the aircraft file of a type: in the jsbsim package, or beside this file."""
+    root = Path(jsbsim.get_default_root_dir()) if kind.shipped else _HERE
+    return root / "aircraft" / kind.model / f"{kind.model}.xml"
+
 
 def _executive(kind: Type) -> Any:
     """Make a silent JSBSim executive with an aircraft loaded."""
     jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.ERROR))
-    fdm = jsbsim.FGFDMExec(None if kind.shipped else str(Path(__file__).parent))
+    fdm = jsbsim.FGFDMExec(None if kind.shipped else str(_HERE))
     fdm.set_debug_level(0)
+    if kind.folder is not None:
+        fdm.set_aircraft_path(str(kind.folder))
     if not fdm.load_model(kind.model):
         place = "in the jsbsim package" if kind.shipped else "beside this file"
         raise RuntimeError(f"jsbsim: found no loadable {kind.model!r}, expected it {place}; reinstall the package")

@@ -1,5 +1,6 @@
 """The types of pretend aircraft: what JSBSim loads, how fast it flies, how large its missions are, what differs."""
 
+from pathlib import Path
 from typing import NamedTuple
 
 from fleet.pretend.missions import SMALL, Field
@@ -18,6 +19,10 @@ class Type(NamedTuple):
     payload_kg: tuple[float, float]  # least and most
     spread: dict[str, float]  # standard deviation of each factor vary/* between aircraft of one type [-]
     offsets: dict[str, float]  # of each offset vary/*: what building by hand leaves askew [-]
+    strength: str  # JSBSim's property that the thrust of its engine goes with
+    load: str  # index of the point mass that may slide
+    extra: str  # index of the point mass that `altered` adds
+    folder: Path | None = None  # where its altered file lies, if it has one
 
 
 _SPREAD = {
@@ -39,11 +44,15 @@ _OFFSETS = {"C_l_0": 0.001, "C_m_0": 0.004, "C_n_0": 0.0004}
 
 TYPES = {
     # 9.5 kg empty, span 2.9 m, electric; ours, after Beard & McLain's Aerosonde
-    "small": Type("aerosonde", False, CRUISE, "fcs/motor-cmd-norm", SMALL, (0.5, 2.5), _SPREAD, _OFFSETS),
+    "small": Type(
+        *("aerosonde", False, CRUISE, "fcs/motor-cmd-norm", SMALL, (0.5, 2.5), _SPREAD, _OFFSETS),
+        *("vary/thrust", "", "[1]"),
+    ),
     # Cessna 172P, a ton and a piston engine, as it comes with JSBSim: only its load differs from one to the next
     "c172p": Type(
         *("c172p", True, 48.0, "fcs/throttle-cmd-norm"),
         Field(scale=5.0, circle=4.5, height=2.0, climb=0.045, sink=0.04),
         *((0.0, 90.0), {}, {}),
+        *("propulsion/engine/volumetric-efficiency", "", "[5]"),
     ),
 }

@@ -1,6 +1,6 @@
 """One pretend aircraft: physics, sensors, autopilot and voice, stepped by whoever drives it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import pi, sin
 from types import MappingProxyType
 
@@ -12,6 +12,9 @@ from fleet.autopilots.arduplane import state as memory
 from fleet.autopilots.slots import W_E, W_N
 from fleet.contract import Item
 from fleet.frames import G, Origin, to_geodetic
+from fleet.pretend.altered import altered
+from fleet.pretend.faults.carried import Carried
+from fleet.pretend.faults.fault import Fault
 from fleet.pretend.jsbsim import Aircraft
 from fleet.pretend.mavlink import MOST_AIRCRAFT, TICK_HZ, Ground, Voice
 from fleet.pretend.mavlink_said import DIALECTS, Flight
@@ -43,6 +46,7 @@ class PretendUav:
         aircraft: str = "small",
         plan: tuple[tuple[Item, ...], Start] | None = None,
         more: Mapping[str, float] = MappingProxyType({}),
+        faults: Sequence[Fault] = (),
     ):
         """Put one aircraft in the air.
 
@@ -56,6 +60,7 @@ class PretendUav:
             aircraft: name in `types.TYPES`
             plan: mission to fly instead of its own, and where on it the aircraft is found
             more: autopilot parameters beside its own
+            faults: what is wrong with it, and since when
         Raises:
             ValueError: when MAVLink has no system id for it.
         """
@@ -65,7 +70,7 @@ class PretendUav:
         own = int(np.random.SeedSequence((seed, uav_id)).generate_state(1)[0])
         rng = np.random.default_rng((own, 4))
         self.uav_id, self.origin = uav_id, origin
-        self._kind = kind = TYPES[aircraft]
+        self._kind = kind = altered(aircraft) if faults else TYPES[aircraft]
         self._law = _LAWS[autopilot]
         self._first = legs_of.FIRST.get(autopilot, 1)
         self.items, start = plan or mission(own, kind.cruise, origin, kind.field, autopilot)
@@ -82,6 +87,7 @@ class PretendUav:
         self._believed = self._wind_hat.measure(blowing)
         self._phi_c = 0.0
         self._theta_c, delta_e, self._delta_t = self.aircraft.start(start.p, start.psi, kind.cruise, blowing)
+        self._carried = Carried(faults, self.aircraft, DT, DT * _INNER) if faults else None
         self.pulses = Servos.pulses(0.0, delta_e, 0.0, self._delta_t)
         self.now: Estimate = self._sensors.measure(self.aircraft.truth())
         self._engage(start.seq)
@@ -124,19 +130,33 @@ class PretendUav:
 
     def _tick(self) -> list[bytes]:
         if self.tick % _OUTER == 0:
-            blowing = self._wind.step(-self.now.p[2])
-            self._believed = self._wind_hat.measure(blowing)
-            self.aircraft.blow(*blowing)
+            self._weather()
         if self.tick % _INNER == 0:
             self._control()
+        if self._carried is not None:
+            self._carried.press(self.tick * DT)
+            self.aircraft.drive(*self._carried.move(self.tick * DT, Servos.commands(self.pulses)))
         frames = self._voice.telemetry(self.tick, self._flight)
         self.aircraft.step()
         self.tick += 1
         return frames
 
+    def _weather(self) -> None:
+        """Let the wind blow, and the autopilot estimate it."""
+        height = -float(self.now.p[2])
+        blowing = (*self._wind.step(height), 0.0)
+        if self._carried is not None:
+            w_n, w_e, w_d = blowing + self._carried.wind(self.tick * DT, height)
+            blowing = float(w_n), float(w_e), float(w_d)
+        self._believed = self._wind_hat.measure(blowing[:2])
+        self.aircraft.blow(*blowing)
+
     def _control(self) -> None:
         """Measure, let the autopilot decide, move the servos."""
-        e = self.now = self._sensors.measure(self.aircraft.truth())
+        e = self._sensors.measure(self.aircraft.truth())
+        if self._carried is not None:
+            e = self._carried.sense(self.tick * DT, e)
+        self.now = e
         self.down = not -e.p[2] > _GROUND_M
         if self.tick % _OUTER == 0:
             Va_dot = float(e.force[0]) - G * sin(e.euler[1])

@@ -1,0 +1,123 @@
+"""Aircraft files with knobs: what may go wrong with the airframe becomes a JSBSim property.
+
+The files are read where they lie and written anew into a folder that goes with the process; no copy is kept. At its
+default every knob does nothing, and the aircraft flies as before.
+
+    conceal/C_D         drag coefficient added                      conceal/lift    factor of all lift
+    conceal/C_n_beta, C_Y_beta, C_l_p, C_m_q    factors of those derivatives (c172p; the small one has its own, vary/*)
+    conceal/slipstream  share of the propeller's wash that the tail's surfaces feel (c172p; 1 as JSBSim has it)
+    conceal/p_factor    the thrust line moves aside by so much per angle of attack (c172p) [in/rad]
+    and one more point mass at the empty centre of gravity, the last in the list
+"""
+
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+from fleet.pretend.jsbsim import model_file
+from fleet.pretend.types import TYPES, Type
+
+_FACTORS = {  # knob: functions it multiplies
+    "conceal/C_n_beta": ("aero/coefficient/Cnb",),
+    "conceal/C_Y_beta": ("aero/coefficient/CYb",),
+    "conceal/C_l_p": ("aero/coefficient/Clp",),
+    "conceal/C_m_q": ("aero/coefficient/Cmq", "aero/coefficient/Cmadot"),
+}
+_WASH = "aero/function/qbar-induced-psf"
+_TAIL = ("aero/coefficient/Cmde", "aero/coefficient/Cndr")
+_P_FACTOR = {"z": ("-1", "aero/alpha-rad"), "y": ("1", "aero/beta-rad")}  # thrust moves right: the nose goes left
+
+
+def altered(name: str) -> Type:
+    """Give the type `name` of `types.TYPES`, loaded from a file with knobs."""
+    return TYPES[name]._replace(folder=Path(_folder(name).name))
+
+
+@cache
+def _folder(name: str) -> TemporaryDirectory:
+    """Write the file of one type; the folder is removed with the process."""
+    kind = TYPES[name]
+    tree = ElementTree.parse(model_file(kind))
+    root = tree.getroot()
+    _knob_forces(root)
+    if kind.shipped:
+        _knob_derivatives(root)
+        _knob_propeller(root)
+    folder = TemporaryDirectory(prefix="parauav-")
+    place = Path(folder.name, kind.model)
+    place.mkdir()
+    tree.write(place / f"{kind.model}.xml", encoding="unicode", xml_declaration=True)
+    return folder
+
+
+def _knob_forces(root: Element) -> None:
+    """Add knobs of drag, lift and mass."""
+    air = _one(root, "aerodynamics")
+    for knob, value in (("conceal/C_D", "0"), ("conceal/lift", "1")):
+        air.insert(0, _property(knob, value))
+    for function in _one(air, "axis[@name='LIFT']").findall("function"):
+        SubElement(_one(function, "product"), "property").text = "conceal/lift"
+    drag = SubElement(_one(air, "axis[@name='DRAG']"), "function", name="conceal/drag")
+    _product(drag, "aero/qbar-psf", "metrics/Sw-sqft", "conceal/C_D")
+    balance = _one(root, "mass_balance")
+    mass = SubElement(balance, "pointmass", name="concealed")
+    SubElement(mass, "weight", unit="LBS").text = "0"
+    mass.append(_one(balance, "location[@name='CG']"))
+
+
+def _knob_derivatives(root: Element) -> None:
+    air = _one(root, "aerodynamics")
+    for knob, names in _FACTORS.items():
+        air.insert(0, _property(knob, "1"))
+        for name in names:
+            SubElement(_one(air, f".//function[@name='{name}']/product"), "property").text = knob
+
+
+def _knob_propeller(root: Element) -> None:
+    """Let the wash over the tail be a matter of degree, and the thrust line move with the flow."""
+    air = _one(root, "aerodynamics")
+    felt = Element("function", name="conceal/qbar-tail-psf")
+    whole = SubElement(felt, "sum")
+    SubElement(whole, "property").text = "aero/qbar-psf"
+    more = SubElement(whole, "product")
+    SubElement(more, "property").text = "conceal/slipstream"
+    difference = SubElement(more, "difference")
+    for name in (_WASH, "aero/qbar-psf"):
+        SubElement(difference, "property").text = name
+    air.insert(list(air).index(_one(air, f"function[@name='{_WASH}']")) + 1, felt)
+    air.insert(0, _property("conceal/slipstream", "1"))
+    for name in _TAIL:
+        for found in air.findall(f".//function[@name='{name}']/product/property"):
+            found.text = "conceal/qbar-tail-psf" if found.text == _WASH else found.text
+    outside = Element("external_reactions")
+    outside.append(_property("conceal/p_factor", "0"))
+    for axis, (sign, angle) in _P_FACTOR.items():
+        moment = SubElement(outside, "moment", name=f"p-factor-{axis}", frame="BODY")
+        arm = _product(SubElement(moment, "function"), "propulsion/engine/thrust-lbs", "conceal/p_factor", angle)
+        SubElement(arm, "value").text = str(1 / 12)
+        way = SubElement(moment, "direction")
+        for name in "xyz":
+            SubElement(way, name).text = sign if name == axis else "0"
+    root.insert(list(root).index(air), outside)
+
+
+def _one(root: Element, path: str) -> Element:
+    found = root.find(path)
+    if found is None:
+        raise RuntimeError(f"jsbsim: found no {path} in its aircraft file, expected one; install JSBSim 1.3")
+    return found
+
+
+def _property(name: str, value: str) -> Element:
+    knob = Element("property", value=value)
+    knob.text = name
+    return knob
+
+
+def _product(parent: Element, *names: str) -> Element:
+    product = SubElement(parent, "product")
+    for name in names:
+        SubElement(product, "property").text = name
+    return product
