@@ -17,6 +17,7 @@ from fleet.pretend.weather import FT, wind_at_20ft
 DT = 0.01  # physics step [s]
 KG_TO_LB = 2.2046226218
 _SLUG_FT3 = 515.378819  # [kg/m3]
+_PSF = 47.880259  # [Pa]
 _READ = (
     *("position/lat-geod-rad", "position/long-gc-rad", "position/geod-alt-ft"),
     *("velocities/v-north-fps", "velocities/v-east-fps", "velocities/v-down-fps"),
@@ -24,6 +25,7 @@ _READ = (
     *("velocities/p-rad_sec", "velocities/q-rad_sec", "velocities/r-rad_sec"),
     *("accelerations/a-pilot-x-ft_sec2", "accelerations/a-pilot-y-ft_sec2", "accelerations/a-pilot-z-ft_sec2"),
     *("velocities/vt-fps", "aero/alpha-rad", "aero/beta-rad", "atmosphere/rho-slugs_ft3"),
+    *("atmosphere/P-psf", "atmosphere/T-R"),
 )
 _SURFACES = ("fcs/aileron-cmd-norm", "fcs/elevator-cmd-norm", "fcs/rudder-cmd-norm")
 _MIXTURE = 0.87  # of a piston engine at these heights [-]
@@ -43,12 +45,23 @@ class Truth(NamedTuple):
     alpha: float  # [rad]
     beta: float  # [rad]
     rho: float  # air density [kg/m3]
+    P: float  # static pressure [Pa]
+    T: float  # of the air outside [K]
+
+
+class Gusts(NamedTuple):
+    """Turbulence of one flight."""
+
+    seed: int
+    w20_fps: float  # wind at 20 ft, which the intensity below 1000 ft goes with
 
 
 class Aircraft:
     """One JSBSim aircraft, with the small differences that every built aircraft has."""
 
-    def __init__(self, origin: Origin, seed: int, turbulence: int = 0, kind: Type = TYPES["small"]):
+    def __init__(
+        self, origin: Origin, seed: int, turbulence: int = 0, kind: Type = TYPES["small"], gusts: Gusts | None = None
+    ):
         """Load the model and draw what makes this aircraft its own.
 
         Args:
@@ -56,6 +69,7 @@ class Aircraft:
             seed: draws mass, coefficients and turbulence
             turbulence: MIL-F-8785C severity, 0..7
             kind: what to load
+            gusts: the turbulence in detail, where the severity is not enough
         Raises:
             RuntimeError: when JSBSim refuses its aircraft file; reinstall the package.
         """
@@ -67,9 +81,11 @@ class Aircraft:
         corner = np.array([[origin.lat_e7 + 10_000, origin.lon_e7 + 10_000, origin.alt_mm]])  # to_ned is linear
         north, east, _ = to_ned(origin, *corner.T)[0]
         self._per_rad = north / np.radians(1e-3), east / np.radians(1e-3)  # [m/rad]
+        for name, value in kind.settings.items():
+            self._fdm[name] = value
         self._vary(np.random.default_rng((seed, 1)))
         self._turbulence = turbulence
-        self._seed = seed
+        self._gusts = gusts or Gusts(seed, wind_at_20ft(turbulence))
 
     def _vary(self, rng: np.random.Generator) -> None:
         self.payload_kg = rng.uniform(*self.kind.payload_kg)
@@ -93,7 +109,7 @@ class Aircraft:
             theta [rad], delta_e, delta_t at trim
         """
         fdm = self._fdm
-        fdm["simulation/randomseed"] = self._seed % 2**31
+        fdm["simulation/randomseed"] = self._gusts.seed % 2**31
         fdm["ic/terrain-elevation-ft"] = self._origin.alt_mm * 1e-3 / FT
         fdm["ic/lat-geod-deg"] = self._origin.lat_e7 * 1e-7 + degrees(p[0] / self._per_rad[0])
         fdm["ic/long-gc-deg"] = self._origin.lon_e7 * 1e-7 + degrees(p[1] / self._per_rad[1])
@@ -107,7 +123,7 @@ class Aircraft:
         fdm["ic/ve-fps"] = (Va * sin(psi) + wind[1]) / FT
         fdm["ic/vd-fps"] = 0.0
         fdm["atmosphere/turb-type"] = 3 if self._turbulence else 0
-        fdm["atmosphere/turbulence/milspec/windspeed_at_20ft_AGL-fps"] = wind_at_20ft(self._turbulence)
+        fdm["atmosphere/turbulence/milspec/windspeed_at_20ft_AGL-fps"] = self._gusts.w20_fps
         fdm["atmosphere/turbulence/milspec/severity"] = float(self._turbulence)
         fdm.run_ic()
         fdm.set_trim_status(False)
@@ -178,7 +194,14 @@ class Aircraft:
                 origin.alt_mm * 1e-3 - x[2] * FT,
             ]
         )
-        air = float(x[15] * FT), float(x[16]), float(x[17]), float(x[18] * _SLUG_FT3)
+        air = (
+            float(x[15] * FT),
+            float(x[16]),
+            float(x[17]),
+            float(x[18] * _SLUG_FT3),
+            float(x[19] * _PSF),
+            float(x[20] / 1.8),
+        )
         return Truth(p, x[3:6] * FT, x[6:9], x[9:12], x[12:15] * FT, *air)
 
     def __getitem__(self, name: str) -> float:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.pretend.sensors import Estimate
+from fleet.pretend.sensors import SEA_LEVEL_RHO, Estimate
 
 AUTO = 10  # ArduPlane custom_mode
 MISSION = 4 << 24 | 4 << 16  # PX4 custom_mode: sub mode MISSION of main mode AUTO
@@ -135,6 +135,24 @@ def _wind_cov(f: Flight) -> Any:
     return mav.MAVLink_wind_cov_message(round(f.t * 1e6), *f.wind, 0.0, 0.2, 0.0, altitude, 0.4, 0.0)
 
 
+def _local(f: Flight) -> Any:
+    return mav.MAVLink_local_position_ned_message(_boot_ms(f.t), *map(float, f.now.p), *map(float, f.now.v))
+
+
+def _pressure(f: Flight) -> Any:
+    felt = 0.5 * SEA_LEVEL_RHO * f.now.Va**2  # [Pa]
+    warmth = round((f.now.warmth - 273.15) * 100)
+    return mav.MAVLink_scaled_pressure_message(_boot_ms(f.t), f.now.pressure * 0.01, felt * 0.01, warmth)
+
+
+def _satellites(f: Flight) -> Any:
+    height = f.home[2] + round(f.now.satellites * 1e3)
+    ground, course = hypot(f.now.v[0], f.now.v[1]), round(degrees(atan2(f.now.v[1], f.now.v[0])) * 100) % 36_000
+    return mav.MAVLink_gps_raw_int_message(
+        round(f.t * 1e6), mav.GPS_FIX_TYPE_3D_FIX, *f.place[:2], height, 80, 120, round(ground * 100), course, 14
+    )
+
+
 Table = tuple[tuple[float, int, Callable[[Flight], Any]], ...]
 """Rate [Hz], phase [ticks], maker."""
 
@@ -161,6 +179,19 @@ TELEMETRY_PX4: Table = (
     (1, 43, _wind_cov),
     (0.5, 53, _home),
 )
+_RECORDED: Table = (  # on board, where no radio is a bottleneck
+    (25, 0, _attitude),
+    (25, 2, _imu),
+    (25, 1, _servos),
+    (10, 0, _position),
+    (10, 2, _local),
+    (10, 5, _hud),
+    (10, 6, _pressure),
+    (5, 8, _satellites),
+    (5, 7, _nav),
+    (1, 11, _mission_current),
+    (1, 23, _heartbeat),
+)
 _WHOLE = ("PWM_MAIN_", "CA_SV_CS", "FW_ARSP_SCALE_EN", "NPFG_LB_PERIOD")  # parameters of PX4 that are integers
 
 
@@ -176,6 +207,9 @@ DIALECTS = {
     "ardupilot": Dialect(TELEMETRY, 0x040600FF, ()),  # 4.6.0, official release
     "px4": Dialect(TELEMETRY_PX4, 0x011000FF, _WHOLE),  # 1.16.0
 }
+
+
+RECORDED = Dialect(_RECORDED, 0x040600FF, ())
 
 
 def value_message(name: str, value: float, counts: tuple[int, int], dialect: Dialect) -> Any:

@@ -92,7 +92,7 @@ def mission(
     """
     rng = np.random.default_rng((seed, 2))
     walk, px4 = _Walk(rng, field), autopilot == "px4"
-    items = [_item(0, WAYPOINT, origin, (0.0, 0.0, 0.0), frame=ABSOLUTE)]
+    items = [item(0, WAYPOINT, origin, (0.0, 0.0, 0.0), frame=ABSOLUTE)]
     loiter_at = int(rng.integers(3, LEGS))
     before = walk.spot()
     for leg in range(LEGS):
@@ -107,14 +107,14 @@ def mission(
             radius = float(rng.choice([-1, 1])) * rng.uniform(80, 120) * field.circle
             turn_s = round(2 * pi * abs(radius) / cruise)
             command, params = (LOITER_TIME, (turn_s, 1.0, radius)) if px4 else (LOITER_TURNS, (1.0, 0.0, radius))
-            items.append(_item(len(items), command, origin, walk.spot(), params=params))
+            items.append(item(len(items), command, origin, walk.spot(), params=params))
         else:
-            items.append(_item(len(items), WAYPOINT, origin, walk.spot()))
+            items.append(item(len(items), WAYPOINT, origin, walk.spot()))
         if leg in (3, 7):
             speed = cruise * float(rng.choice([0.9, 1.0, 1.12]))
-            items.append(_item(len(items), DO_CHANGE_SPEED, origin, params=(0.0, round(speed, 1), -1.0)))
+            items.append(item(len(items), DO_CHANGE_SPEED, origin, params=(0.0, round(speed, 1), -1.0)))
         before = walk.spot()
-    items.append(_item(len(items), DO_JUMP, origin, params=(1.0, -1.0)))
+    items.append(item(len(items), DO_JUMP, origin, params=(1.0, -1.0)))
     return (tuple(_from_zero(items[1:])), start._replace(seq=start.seq - 1)) if px4 else (tuple(items), start)
 
 
@@ -133,7 +133,7 @@ def _before_turn(rng: np.random.Generator, leg: tuple[tuple, tuple], seq: int, s
     return Start(seq, p + (q - p) * max(share, 0.05), atan2(q[1] - p[1], q[0] - p[0]))
 
 
-def _item(
+def item(
     seq: int,
     command: int,
     origin: Origin,

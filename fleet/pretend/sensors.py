@@ -6,7 +6,7 @@ bias; airspeed has a scale error of 2 % and 0.25 m/s of noise. The autopilot fli
 Source: orders of magnitude of EKF innovations in ArduPlane flight logs; Beard & McLain (2012) ch. 7 for the sensors.
 """
 
-from math import radians, sqrt
+from math import nan, radians, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +29,12 @@ _ERRORS = (
 )
 AIRSPEED_SCALE = 0.02  # standard deviation of the pitot tube's scale error [-]
 SEA_LEVEL_RHO = 1.225  # [kg/m3]
+BOARD_K = 14.0  # warmer than the air outside [K]
+_HEIGHTS = {  # standard deviation, correlation time [s]
+    "pressure": (2.0, 0.0),  # [Pa]
+    "pressure_wander": (3.0, 60.0),  # [Pa]
+    "satellites": (1.5, 100.0),  # [m]
+}
 
 
 class Estimate(NamedTuple):
@@ -40,17 +46,20 @@ class Estimate(NamedTuple):
     rates: np.ndarray
     force: np.ndarray
     Va: float  # equivalent airspeed, as a pitot tube feels it: Va_true sqrt(rho / 1.225) [m/s]
+    pressure: float = nan  # static [Pa]; this and what follows only where it is recorded
+    warmth: float = nan  # of the board [K]
+    satellites: float = nan  # height above home by satellites alone [m]
 
 
 class Sensors:
     """The sensors and the estimator of one aircraft."""
 
-    def __init__(self, rng: np.random.Generator, dt: float):
-        """Draw biases and the airspeed scale; `dt` is the time between two calls of `measure` [s]."""
+    def __init__(self, rng: np.random.Generator, dt: float, own: np.random.Generator | None = None):
+        """Draw biases, and the airspeed scale, which may be its own; `dt`: time between two calls of `measure` [s]."""
         sigma = np.concatenate([np.full(n, s) for _, s, _, n in _ERRORS])
         tau = np.concatenate([np.full(n, t) for _, _, t, n in _ERRORS])
         self._noise = GaussMarkov(rng, sigma, tau, dt)
-        self.airspeed_scale = 1 + AIRSPEED_SCALE * float(np.clip(rng.standard_normal(), -2, 2))
+        self.airspeed_scale = 1 + AIRSPEED_SCALE * float(np.clip((own or rng).standard_normal(), -2, 2))
 
     def measure(self, truth: Truth) -> Estimate:
         """Add this instant's errors."""
@@ -62,6 +71,22 @@ class Sensors:
             truth.rates + e[15:18] + e[18:21],
             truth.force + e[21:24] + e[24:27],
             float(truth.Va * sqrt(truth.rho / SEA_LEVEL_RHO) * self.airspeed_scale + e[27]),
+        )
+
+
+class Heights:
+    """Barometer and satellites, each by itself: two heights that err apart."""
+
+    def __init__(self, rng: np.random.Generator, dt: float):
+        """Draw the first errors; `dt` is the time between two calls of `measure` [s]."""
+        sigma, tau = zip(*_HEIGHTS.values(), strict=True)
+        self._noise = GaussMarkov(rng, np.array(sigma), np.array(tau), dt)
+
+    def measure(self, e: Estimate, truth: Truth) -> Estimate:
+        """Add to an estimate what these two sensors say."""
+        white, wander, up = map(float, self._noise.step())
+        return e._replace(
+            pressure=truth.P + white + wander, warmth=truth.T + BOARD_K, satellites=up - float(truth.p[2])
         )
 
 

@@ -1,6 +1,8 @@
 """The types of pretend aircraft: what JSBSim loads, how fast it flies, how large its missions are, what differs."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 from fleet.pretend.missions import SMALL, Field
@@ -23,6 +25,7 @@ class Type(NamedTuple):
     load: str  # index of the point mass that may slide
     extra: str  # index of the point mass that `altered` adds
     folder: Path | None = None  # where its altered file lies, if it has one
+    settings: Mapping[str, float] = MappingProxyType({})  # JSBSim's properties, where not as in the file
 
 
 _SPREAD = {

@@ -15,19 +15,20 @@ from fleet.frames import G, Origin, to_geodetic
 from fleet.pretend.altered import altered
 from fleet.pretend.faults.carried import Carried
 from fleet.pretend.faults.fault import Fault
-from fleet.pretend.jsbsim import Aircraft
+from fleet.pretend.jsbsim import Aircraft, Gusts
 from fleet.pretend.mavlink import MOST_AIRCRAFT, TICK_HZ, Ground, Voice
-from fleet.pretend.mavlink_said import DIALECTS, Flight
+from fleet.pretend.mavlink_said import DIALECTS, RECORDED, Flight
 from fleet.pretend.missions import HOME, Start, mission
-from fleet.pretend.sensors import Estimate, Sensors, Servos, WindEstimate
+from fleet.pretend.sensors import Estimate, Heights, Sensors, Servos, WindEstimate
+from fleet.pretend.situation import Situation, Weather
 from fleet.pretend.tuning import tuned
 from fleet.pretend.types import TYPES
-from fleet.pretend.weather import Wind
 
 DT = 1 / TICK_HZ
 _INNER, _OUTER = 2, 10  # attitude loop at 50 Hz, guidance at 10 Hz [ticks]
 _LEGS_AHEAD = 200
 _LAWS = {"ardupilot": "arduplane", "px4": "px4"}
+JITTER_S = 0.001  # of time stamps on board [s]
 _GROUND_M = 3.0  # below this height above home the flight is over
 
 
@@ -47,6 +48,7 @@ class PretendUav:
         plan: tuple[tuple[Item, ...], Start] | None = None,
         more: Mapping[str, float] = MappingProxyType({}),
         faults: Sequence[Fault] = (),
+        situation: Situation | None = None,
     ):
         """Put one aircraft in the air.
 
@@ -61,6 +63,7 @@ class PretendUav:
             plan: mission to fly instead of its own, and where on it the aircraft is found
             more: autopilot parameters beside its own
             faults: what is wrong with it, and since when
+            situation: one flight of several of this aircraft, instead of the one the seed draws
         Raises:
             ValueError: when MAVLink has no system id for it.
         """
@@ -68,28 +71,36 @@ class PretendUav:
             most = MOST_AIRCRAFT - 1
             raise ValueError(f"uav-{uav_id}: found id {uav_id}, expected 0..{most} (MAVLink ids); fly fewer aircraft")
         own = int(np.random.SeedSequence((seed, uav_id)).generate_state(1)[0])
-        rng = np.random.default_rng((own, 4))
-        self.uav_id, self.origin = uav_id, origin
-        self._kind = kind = altered(aircraft) if faults else TYPES[aircraft]
+        if situation is None:
+            kind = altered(aircraft) if faults else TYPES[aircraft]
+            weather = Weather(wind, np.random.default_rng((seed, 5)).uniform(-pi, pi), turbulence)
+            plan = plan or mission(own, kind.cruise, origin, kind.field, autopilot)
+            situation = Situation(own, kind, plan, weather)
+        rng = np.random.default_rng((situation.flight, 4))
+        self.uav_id, self.origin, self.situation = uav_id, origin, situation
         self._law = _LAWS[autopilot]
         self._first = legs_of.FIRST.get(autopilot, 1)
-        self.items, start = plan or mission(own, kind.cruise, origin, kind.field, autopilot)
+        self.items, start = situation.plan
         self.params = {**tuned(own, autopilot, aircraft), **more}
         self.boot_s = float(rng.uniform(60, 600))  # on the ground before the world began [s]
         self.tick = 0
         self.down = False  # it hit the ground
-        self._wind = Wind(wind, rng, DT * _OUTER, np.random.default_rng((seed, 5)).uniform(-pi, pi))
-        self._sensors = Sensors(rng, DT * _INNER)
-        self._wind_hat = WindEstimate(np.random.default_rng((own, 8)), DT * _OUTER)
-        self._voice = Voice(uav_id + 1, self.items, self.params, DIALECTS[autopilot])
-        self.aircraft = Aircraft(origin, own, turbulence, kind)
+        self._wind = situation.weather.wind(rng, DT * _OUTER)
+        examined = situation.examined
+        self._sensors = Sensors(rng, DT * _INNER, np.random.default_rng((own, 9)) if examined else None)
+        self._wind_hat = WindEstimate(np.random.default_rng((situation.flight, 8)), DT * _OUTER)
+        self._heights = Heights(np.random.default_rng((situation.flight, 10)), DT * _INNER) if examined else None
+        self._jitter = np.random.default_rng((situation.flight, 11)) if examined else None
+        self._voice = Voice(uav_id + 1, self.items, self.params, RECORDED if examined else DIALECTS[autopilot])
+        gusts = Gusts(situation.flight, situation.weather.w20_fps)
+        self.aircraft = Aircraft(origin, own, situation.weather.severity, situation.kind, gusts)
         blowing = self._wind.step(-start.p[2])
         self._believed = self._wind_hat.measure(blowing)
         self._phi_c = 0.0
-        self._theta_c, delta_e, self._delta_t = self.aircraft.start(start.p, start.psi, kind.cruise, blowing)
+        self._theta_c, delta_e, self._delta_t = self.aircraft.start(start.p, start.psi, situation.kind.cruise, blowing)
         self._carried = Carried(faults, self.aircraft, DT, DT * _INNER) if faults else None
         self.pulses = Servos.pulses(0.0, delta_e, 0.0, self._delta_t)
-        self.now: Estimate = self._sensors.measure(self.aircraft.truth())
+        self.now: Estimate = self._measure()
         self._engage(start.seq)
 
     def _engage(self, seq: int) -> None:
@@ -151,12 +162,17 @@ class PretendUav:
         self._believed = self._wind_hat.measure(blowing[:2])
         self.aircraft.blow(*blowing)
 
+    def _measure(self) -> Estimate:
+        """Give what the autopilot believes, faults and all."""
+        truth = self.aircraft.truth()
+        e = self._sensors.measure(truth)
+        if self._heights is not None:
+            e = self._heights.measure(e, truth)
+        return e if self._carried is None else self._carried.sense(self.tick * DT, e)
+
     def _control(self) -> None:
         """Measure, let the autopilot decide, move the servos."""
-        e = self._sensors.measure(self.aircraft.truth())
-        if self._carried is not None:
-            e = self._carried.sense(self.tick * DT, e)
-        self.now = e
+        e = self.now = self._measure()
         self.down = not -e.p[2] > _GROUND_M
         if self.tick % _OUTER == 0:
             Va_dot = float(e.force[0]) - G * sin(e.euler[1])
@@ -169,7 +185,11 @@ class PretendUav:
         delta_a, delta_e, delta_r = laws.stabilise(
             self._ctl, self._par, self._phi_c, self._theta_c, e.euler, e.rates, e.Va, DT * _INNER
         )
-        self.pulses = Servos.pulses(delta_a, delta_e, delta_r, self._delta_t)
+        commands = (delta_a, delta_e, delta_r, self._delta_t)
+        if self.situation.pilot is not None:
+            more = self.situation.pilot(self.tick * DT)
+            commands = (delta_a + more[0], delta_e + more[1], delta_r + more[2], self._delta_t + more[3])
+        self.pulses = Servos.pulses(*commands)
         self.aircraft.drive(*Servos.commands(self.pulses))
 
     def _renew(self) -> None:
@@ -180,10 +200,11 @@ class PretendUav:
     def _flight(self) -> Flight:
         e, leg = self.now, self.leg
         target = leg[legs_of.P_N : legs_of.P_D + 1] - e.p
-        commanded = leg[legs_of.VA_C] if leg[legs_of.VA_C] > 0 else self._kind.cruise
+        commanded = leg[legs_of.VA_C] if leg[legs_of.VA_C] > 0 else self.situation.kind.cruise
         place = to_geodetic(self.origin, e.p)
+        late = 0.0 if self._jitter is None else float(self._jitter.uniform(-JITTER_S, JITTER_S))
         return Flight(
-            t=self.boot_s + self.tick * DT,
+            t=self.boot_s + self.tick * DT + late,
             now=e,
             place=(int(place[0]), int(place[1]), int(place[2])),
             height=float(-e.p[2]),

@@ -7,6 +7,7 @@ import numpy as np
 FT = 0.3048  # [m]
 _W20_FPS = (0.0, 8.0, 16.0, 25.0, 50.0, 62.0, 75.0, 88.0)
 REFERENCE_M = 100.0  # height the mean wind is given at
+HELLMANN = 0.143  # exponent of the mean wind over height, over open ground
 
 
 class GaussMarkov:
@@ -39,7 +40,16 @@ class Wind:
     Source: power law 1/7 (Hellmann exponent over open ground).
     """
 
-    def __init__(self, mean: float, rng: np.random.Generator, dt: float, towards: float | None = None):
+    def __init__(
+        self,
+        mean: float,
+        rng: np.random.Generator,
+        dt: float,
+        towards: float | None = None,
+        *,
+        exponent: float = HELLMANN,
+        drift: float = 1.0,
+    ):
         """Choose a direction.
 
         Args:
@@ -47,15 +57,18 @@ class Wind:
             rng: source of chance
             dt: step of `step` [s]
             towards: direction it blows to, from north clockwise [rad]; None draws one
+            exponent: of the height profile; 0 for none
+            drift: share of the drift above
         """
         self._mean = mean
         self._towards = rng.uniform(-pi, pi) if towards is None else towards
-        sigma = 0.12 * mean + 0.1 if mean > 0 else 0.0
+        self._exponent = exponent
+        sigma = drift * (0.12 * mean + 0.1) if mean > 0 else 0.0
         self._drift = GaussMarkov(rng, np.full(2, sigma), np.full(2, 90.0), dt)
 
     def step(self, height: float) -> tuple[float, float]:
         """Advance by dt and give the wind, NED north and east, at `height` above ground [m/s]."""
-        speed = self._mean * (max(height, 5.0) / REFERENCE_M) ** 0.143
+        speed = self._mean * (max(height, 5.0) / REFERENCE_M) ** self._exponent
         d_n, d_e = self._drift.step()
         return speed * cos(self._towards) + d_n, speed * sin(self._towards) + d_e
 
