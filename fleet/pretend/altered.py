@@ -1,7 +1,7 @@
 """Aircraft files with knobs: what may go wrong with the airframe becomes a JSBSim property.
 
-The files are read where they lie and written anew into a folder that goes with the process; no copy is kept. At its
-default every knob does nothing, and the aircraft flies as before.
+The files are read where they are installed, and changed in memory; no copy is kept. At its default every knob does
+nothing, and the aircraft flies as before.
 
     conceal/C_D         drag coefficient added                      conceal/lift    factor of all lift
     conceal/C_n_beta, C_Y_beta, C_l_p, C_m_q    factors of those derivatives (c172p; the small one has its own, vary/*)
@@ -11,8 +11,6 @@ default every knob does nothing, and the aircraft flies as before.
 """
 
 from functools import cache
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
@@ -31,25 +29,20 @@ _P_FACTOR = {"z": ("-1", "aero/alpha-rad"), "y": ("1", "aero/beta-rad")}  # thru
 
 
 def altered(name: str) -> Type:
-    """Give the type `name` of `types.TYPES`, loaded from a file with knobs."""
-    return TYPES[name]._replace(folder=Path(_folder(name).name))
+    """Give the type `name` of `types.TYPES` with knobs on it."""
+    return TYPES[name]._replace(file=_file(name))
 
 
 @cache
-def _folder(name: str) -> TemporaryDirectory:
-    """Write the file of one type; the folder is removed with the process."""
+def _file(name: str) -> str:
+    """Write the file of one type."""
     kind = TYPES[name]
-    tree = ElementTree.parse(model_file(kind))
-    root = tree.getroot()
+    root = ElementTree.parse(model_file(kind)).getroot()
     _knob_forces(root)
     if kind.shipped:
         _knob_derivatives(root)
         _knob_propeller(root)
-    folder = TemporaryDirectory(prefix="parauav-")
-    place = Path(folder.name, kind.model)
-    place.mkdir()
-    tree.write(place / f"{kind.model}.xml", encoding="unicode", xml_declaration=True)
-    return folder
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _knob_forces(root: Element) -> None:

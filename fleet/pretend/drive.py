@@ -27,11 +27,10 @@ def to_tlog(
     seed: int,
     progress: Callable[[float], None] = lambda _: None,
     stop: Event | None = None,
-    fades_s: float = 0.0,
 ) -> int:
     """Fly as fast as possible into a .tlog: 8 bytes of microseconds since 1970, big endian, then one frame, for ever.
 
-    The recording begins where the aircraft are, with every one's mission and parameters, asked for without loss.
+    The recording begins with every aircraft's mission and parameters, asked for without loss.
 
     Args:
         path: file to write
@@ -41,19 +40,18 @@ def to_tlog(
         seed: draws losses and delays
         progress: called with the flown time [s]
         stop: ends the flight early
-        fades_s: mean time between two silences of the radio; 0 for none [s]
     Returns:
         frames written
     """
-    links = [Link(np.random.default_rng((seed, 6, uav.uav_id)), loss, fades_s) for uav in uavs]
-    written, begun = 0, max((uav.tick * TICK_S for uav in uavs), default=0.0)
+    links = [Link(np.random.default_rng((seed, 6, uav.uav_id)), loss) for uav in uavs]
+    written = 0
     with path.open("wb") as file:
-        written += _write(file, [(begun, frame) for uav in uavs for frame in uav.introduce()])
+        written += write(file, [(0.0, frame) for uav in uavs for frame in uav.introduce()])
         for k in range(1, int(seconds) + 1):
             arrived: list[tuple[float, bytes]] = []
             for uav, link in zip(uavs, links, strict=True):
-                arrived += _second(uav, link, begun + k)
-            written += _write(file, arrived)
+                arrived += _second(uav, link, float(k))
+            written += write(file, arrived)
             progress(float(k))
             if stop is not None and stop.is_set():
                 break
@@ -69,7 +67,8 @@ def _second(uav: PretendUav, link: Link, until: float) -> list[tuple[float, byte
     return link.receive(until)
 
 
-def _write(file: BinaryIO, pairs: list[tuple[float, bytes]]) -> int:
+def write(file: BinaryIO, pairs: list[tuple[float, bytes]]) -> int:
+    """Append frames to a .tlog, each with its time [s]; give how many."""
     for t, frame in sorted(pairs, key=lambda pair: pair[0]):
         file.write(struct.pack(">Q", EPOCH_US + round(t * 1e6)) + frame)
     return len(pairs)

@@ -5,6 +5,7 @@ Nothing of the twin's own physics is used here, so that the twin is judged on ph
 
 from math import atan2, cos, degrees, hypot, sin
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import jsbsim
@@ -89,9 +90,7 @@ class Aircraft:
 
     def _vary(self, rng: np.random.Generator) -> None:
         self.payload_kg = rng.uniform(*self.kind.payload_kg)
-        self._fdm["inertia/pointmass-weight-lbs[1]" if self.kind.shipped else "inertia/pointmass-weight-lbs"] = (
-            self.payload_kg * KG_TO_LB
-        )
+        self._fdm[f"inertia/pointmass-weight-lbs{self.kind.varied}"] = self.payload_kg * KG_TO_LB
         for name, spread in self.kind.spread.items():
             self._fdm[f"vary/{name}"] = 1 + spread * float(np.clip(rng.standard_normal(), -2, 2))
         for name, spread in self.kind.offsets.items():
@@ -219,14 +218,24 @@ def model_file(kind: Type) -> Path:
     return root / "aircraft" / kind.model / f"{kind.model}.xml"
 
 
+def _load(fdm: Any, kind: Type) -> bool:
+    """Load a model; JSBSim reads files only, so a changed one is written, read and gone."""
+    if kind.file is None:
+        return bool(fdm.load_model(kind.model))
+    with TemporaryDirectory(prefix="parauav-") as folder:
+        place = Path(folder, kind.model, f"{kind.model}.xml")
+        place.parent.mkdir()
+        place.write_text(kind.file)
+        fdm.set_aircraft_path(folder)
+        return bool(fdm.load_model(kind.model))
+
+
 def _executive(kind: Type) -> Any:
     """Make a silent JSBSim executive with an aircraft loaded."""
     jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.ERROR))
     fdm = jsbsim.FGFDMExec(None if kind.shipped else str(_HERE))
     fdm.set_debug_level(0)
-    if kind.folder is not None:
-        fdm.set_aircraft_path(str(kind.folder))
-    if not fdm.load_model(kind.model):
+    if not _load(fdm, kind):
         place = "in the jsbsim package" if kind.shipped else "beside this file"
         raise RuntimeError(f"jsbsim: found no loadable {kind.model!r}, expected it {place}; reinstall the package")
     fdm.set_dt(DT)

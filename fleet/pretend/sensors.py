@@ -29,6 +29,7 @@ _ERRORS = (
 )
 AIRSPEED_SCALE = 0.02  # standard deviation of the pitot tube's scale error [-]
 SEA_LEVEL_RHO = 1.225  # [kg/m3]
+_SEA_LEVEL_PA, _LAPSE, _POWER = 101_325.0, 2.25577e-5, 5.25588  # ICAO standard atmosphere [Pa, 1/m, -]
 BOARD_K = 14.0  # warmer than the air outside [K]
 _HEIGHTS = {  # standard deviation, correlation time [s]
     "pressure": (2.0, 0.0),  # [Pa]
@@ -88,6 +89,16 @@ class Heights:
         return e._replace(
             pressure=truth.P + white + wander, warmth=truth.T + BOARD_K, satellites=up - float(truth.p[2])
         )
+
+
+def pressure_height(pressure: float) -> float:
+    """Give the height of a pressure [Pa] in the standard atmosphere [m], as an altimeter does."""
+    return float((1 - (pressure / _SEA_LEVEL_PA) ** (1 / _POWER)) / _LAPSE)
+
+
+def pressure_at(height: float) -> float:
+    """Give the standard atmosphere's pressure at a height [m], in [Pa]."""
+    return float(_SEA_LEVEL_PA * (1 - _LAPSE * height) ** _POWER)
 
 
 class WindEstimate:

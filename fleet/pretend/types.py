@@ -1,7 +1,6 @@
 """The types of pretend aircraft: what JSBSim loads, how fast it flies, how large its missions are, what differs."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -22,9 +21,10 @@ class Type(NamedTuple):
     spread: dict[str, float]  # standard deviation of each factor vary/* between aircraft of one type [-]
     offsets: dict[str, float]  # of each offset vary/*: what building by hand leaves askew [-]
     strength: str  # JSBSim's property that the thrust of its engine goes with
+    varied: str  # index of the point mass that differs from one to the next
     load: str  # index of the point mass that may slide
     extra: str  # index of the point mass that `altered` adds
-    folder: Path | None = None  # where its altered file lies, if it has one
+    file: str | None = None  # its aircraft file, where it is another one than the installed
     settings: Mapping[str, float] = MappingProxyType({})  # JSBSim's properties, where not as in the file
 
 
@@ -49,13 +49,13 @@ TYPES = {
     # 9.5 kg empty, span 2.9 m, electric; ours, after Beard & McLain's Aerosonde
     "small": Type(
         *("aerosonde", False, CRUISE, "fcs/motor-cmd-norm", SMALL, (0.5, 2.5), _SPREAD, _OFFSETS),
-        *("vary/thrust", "", "[1]"),
+        *("vary/thrust", "", "", "[1]"),
     ),
     # Cessna 172P, a ton and a piston engine, as it comes with JSBSim: only its load differs from one to the next
     "c172p": Type(
         *("c172p", True, 48.0, "fcs/throttle-cmd-norm"),
         Field(scale=5.0, circle=4.5, height=2.0, climb=0.045, sink=0.04),
         *((0.0, 90.0), {}, {}),
-        *("propulsion/engine/volumetric-efficiency", "", "[5]"),
+        *("propulsion/engine/volumetric-efficiency", "[1]", "", "[5]"),
     ),
 }

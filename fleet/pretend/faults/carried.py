@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fleet.pretend.faults.fault import Fault
+from fleet.pretend.faults.oddities import ODD
 from fleet.pretend.faults.physics import CHANGES, WINDS, World
 from fleet.pretend.faults.sensing import SPOILS, Senses
 from fleet.pretend.faults.servos import MOVES, Commands, Linkage
@@ -26,11 +27,14 @@ class Carried:
         """
         self._linkage = Linkage([fault for fault in faults if fault.name in MOVES], tick_s)
         self._senses = Senses([fault for fault in faults if fault.name in SPOILS], sense_s)
+        self._odd = [(fault, ODD[fault.name](fault.values, aircraft)) for fault in faults if fault.name in ODD]
         self._world = World([fault for fault in faults if fault.name in CHANGES or fault.name in WINDS], aircraft)
 
     def press(self, t: float) -> None:
         """Change the physics."""
         self._world.press(t)
+        for fault, oddity in self._odd:
+            oddity.press(t, fault.share(t))
 
     def wind(self, t: float, height: float) -> np.ndarray:
         """Give the wind added, NED, (3,) [m/s]."""
@@ -38,8 +42,14 @@ class Carried:
 
     def sense(self, t: float, e: Estimate) -> Estimate:
         """Give what the autopilot believes."""
-        return self._senses.sense(t, e)
+        e = self._senses.sense(t, e)
+        for fault, oddity in self._odd:
+            e = oddity.sense(e, fault.share(t))
+        return e
 
     def move(self, t: float, commands: Commands) -> Commands:
         """Give where surfaces and motor go."""
-        return self._linkage.move(t, commands)
+        commands = self._linkage.move(t, commands)
+        for fault, oddity in self._odd:
+            commands = oddity.move(t, fault.share(t), commands)
+        return commands

@@ -7,7 +7,7 @@ from math import radians
 import numpy as np
 
 from fleet.pretend.faults.fault import Fault
-from fleet.pretend.sensors import Estimate
+from fleet.pretend.sensors import Estimate, pressure_at, pressure_height
 
 _OLDEST_S = 3.0  # fixes that are remembered
 
@@ -24,12 +24,12 @@ def _airspeed_bias(fault: Fault, dt: float) -> Spoil:
 
 
 def _gps_latency(fault: Fault, dt: float) -> Spoil:
-    fixes: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=round(_OLDEST_S / dt))
+    fixes: deque[tuple[np.ndarray, np.ndarray, float]] = deque(maxlen=round(_OLDEST_S / dt))
 
     def spoil(e: Estimate, share: float) -> Estimate:
-        fixes.appendleft((e.p, e.v))
-        p, v = fixes[min(round(share * fault.values["latency_s"] / dt), len(fixes) - 1)]
-        return e._replace(p=p, v=v)
+        fixes.appendleft((e.p, e.v, e.satellites))
+        p, v, satellites = fixes[min(round(share * fault.values["latency_s"] / dt), len(fixes) - 1)]
+        return e._replace(p=p, v=v, satellites=satellites)
 
     return spoil
 
@@ -73,8 +73,14 @@ def _heading_bias(fault: Fault, dt: float) -> Spoil:
 
 
 def _baro_bias(fault: Fault, dt: float) -> Spoil:
-    up = np.array([0.0, 0.0, -fault.values["bias_m"]])  # p is NED
-    return lambda e, share: e._replace(p=e.p + share * up)
+    """Let the static port tell another height; the estimator's height follows it."""
+    up = fault.values["bias_m"]
+
+    def spoil(e: Estimate, share: float) -> Estimate:
+        pressure = pressure_at(pressure_height(e.pressure) + share * up)
+        return e._replace(p=e.p - np.array([0.0, 0.0, share * up]), pressure=pressure)  # p is NED
+
+    return spoil
 
 
 SPOILS: dict[str, Callable[[Fault, float], Spoil]] = {
