@@ -27,7 +27,7 @@ ROOMS = (  # inside fleet a room imports only from rooms above it, and from itse
     ("pretend",),
     ("config",),
     ("children",),
-    ("cli", "commands"),
+    ("cli", "commands", "prove"),
 )
 RANK = {f"fleet.{name}": rank for rank, names in enumerate(ROOMS) for name in names}
 
@@ -46,7 +46,8 @@ APART = (  # who, and what it must never import
     ("fleet.pretend", ("fleet.physics", "fleet.effects", "fleet.simulate", "fleet.hybrid")),  # never our own physics
     ("fleet.effects", ("fleet.pretend",)),  # one code must never both conceal and find
     ("fleet.simulate", ("fleet.pretend",)),
-    ("twin_worker.diagnose", ("fleet.pretend",)),
+    ("twin_worker.diagnose", ("fleet.pretend", "fleet.prove")),
+    ("fleet.prove", ("fleet.physics", "fleet.effects", "fleet.simulate", "fleet.hybrid")),
 )
 
 TABLES = ("fleet/contract.py", "fleet/telemetry/dialects/")  # data, so they may be long
@@ -200,6 +201,35 @@ def test_the_house_keeps_its_law(rule: Callable[..., Iterator[str]], pytestconfi
         if rule is size and 250 < text.count("\n") <= 400:
             pytestconfig.stash[LONG_FILES].append(f"{path} ({text.count(chr(10))})")
     assert not complaints, "\n" + "\n".join(complaints)
+
+
+SHARED = (  # what concealer and finder may both stand on: words, frames, formats; nothing that flies or decides
+    *("fleet", "fleet.contract", "fleet.cli", "fleet.children", "fleet.commands", "fleet.frames", "fleet.mission"),
+    *("fleet.codec", "fleet.config"),
+)
+AUTOPILOT = "fleet.autopilots"  # flies the pretend aircraft; the finder has no use for it, but draws beside who has
+
+
+def reached(*begin: str) -> set[str]:
+    """Give every module of ours that these import, and what those import."""
+    known = {module_name(path): path for path in sources()}
+    found, queue = set(), list(begin)
+    while queue:
+        name = queue.pop()
+        name = name if name in known else name.rpartition(".")[0]  # a name inside a module
+        if name in known and name not in found:
+            found.add(name)
+            tree = ast.parse((ROOT / known[name]).read_text())
+            queue += [other for _, other in imported(known[name], tree)] + [name.rpartition(".")[0]]
+    return found
+
+
+def test_finder_and_concealer_share_nothing_that_flies_or_decides() -> None:
+    concealer = reached("fleet.prove.concealer")
+    finder = reached("twin_worker.diagnose.__main__", "twin_worker.diagnose.learn")
+    assert any(name.startswith("fleet.pretend.conceal") for name in concealer)
+    assert {"fleet.effects.icing", "twin_worker.diagnose.simulate"} <= finder | reached("fleet.effects.icing")
+    assert not {name for name in concealer & finder if name not in SHARED and not inside(name, AUTOPILOT)}
 
 
 ALLOWED = (

@@ -1,0 +1,1 @@
+"""A blind examination of the diagnosis: conceal, seal, diagnose, commit, open, score, show."""

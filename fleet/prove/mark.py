@@ -1,0 +1,160 @@
+"""Mark one report against its label: named, located, when, how much, how sure; what the scores are made of."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+_ACTUATOR = ("actuator", "pitch", "roll", "yaw")
+_LOADS = ("lift", "drag", "force_x", "force_z")
+CHANNELS: Mapping[str, tuple[str, ...]] = {  # where an effect may rightly be said to live
+    "wind_steady": ("air",),
+    "wind_shear": ("air",),
+    "turbulence": ("air",),
+    "gust_discrete": ("air",),
+    "updraft": ("air",),
+    "air_density": ("air", "dynamic_pressure"),
+    "actuator_lag": _ACTUATOR,
+    "actuator_delay": _ACTUATOR,
+    "actuator_rate_limit": _ACTUATOR,
+    "actuator_deadband": _ACTUATOR,
+    "actuator_saturation": _ACTUATOR,
+    "actuator_offset": _ACTUATOR,
+    "actuator_stuck": _ACTUATOR,
+    "control_effectiveness_loss": _ACTUATOR,
+    "prop_torque": ("roll",),
+    "p_factor": ("yaw", "pitch"),
+    "slipstream_tail": ("pitch", "yaw"),
+    "thrust_loss": ("thrust", "force_x"),
+    "thrust_asymmetry": ("yaw", "thrust"),
+    "drag_increase": ("drag", "force_x"),
+    "icing": _LOADS,
+    "flap_deployed": _LOADS,
+    "stall": _LOADS,
+    "ground_effect": _LOADS,
+    "mass_change": ("mass", "force_z", "lift"),
+    "cg_shift": ("pitch", "mass", "roll"),
+    "airspeed_scale": ("airspeed",),
+    "airspeed_bias": ("airspeed",),
+    "gps_latency": ("gps",),
+    "imu_misalignment": ("imu",),
+    "gyro_bias": ("gyro", "imu"),
+    "accel_bias": ("accel", "imu"),
+    "heading_bias": ("heading",),
+    "baro_bias": ("baro",),
+}
+_SPAN_DEG = 45.0  # a direction so far off is as wrong as a size of nothing
+_LEAST = {"density_ratio": 0.01, "scale": 0.01}  # of a ratio's distance from one
+
+
+@dataclass(frozen=True)
+class Size:
+    """One number told: its name, what was concealed, what was told, its standard deviation; None where not told."""
+
+    name: str
+    truth: float
+    told: float | None
+    sigma: float | None
+
+    @property
+    def error(self) -> float:
+        """Give the error as a share of what was concealed; directions by 45 degrees, small angles by one."""
+        if self.told is None:
+            return 1.0
+        if self.name == "from_deg":
+            return abs((self.told - self.truth + 180.0) % 360.0 - 180.0) / _SPAN_DEG
+        if self.name in _LEAST:
+            return abs(self.told - self.truth) / max(abs(self.truth - 1.0), _LEAST[self.name])
+        least = 1.0 if self.name.endswith("_deg") and self.name != "bias_deg" else 1e-6
+        return abs(self.told - self.truth) / max(abs(self.truth), least)
+
+    @property
+    def covered(self) -> bool | None:
+        """Tell whether the truth lies within two standard deviations; None where none was told."""
+        return abs((self.told or 0.0) - self.truth) <= 2.0 * self.sigma if self.sigma else None
+
+
+@dataclass(frozen=True)
+class Mark:
+    """What became of one flight.
+
+    Attributes:
+        flight, airframe, role: nominal, control, single, compound or unknown
+        concealed, named: names of effects, the latter best first
+        verdict: none, named or unknown; sentence: as reported
+        rivals: of each named one
+        late: onset told after the true one, by effect and whether a ramp's share excuses it  [s]
+        sizes: numbers of effects rightly named
+        located, surfaces: rightly or not, of effects rightly named
+        before, after: fit on held-out blocks, None where nothing was named
+        acts: how much the effect shows, in standard deviations of the sensors
+    """
+
+    flight: str
+    airframe: str
+    role: str
+    concealed: tuple[str, ...]
+    named: tuple[str, ...]
+    verdict: str
+    sentence: str
+    rivals: tuple[tuple[str, ...], ...] = ()
+    late: tuple[tuple[float, float], ...] = ()
+    sizes: tuple[tuple[str, Size], ...] = ()
+    located: tuple[bool, ...] = ()
+    surfaces: tuple[bool, ...] = ()
+    before: float | None = None
+    after: float | None = None
+    acts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def hit(self) -> bool:
+        """Tell whether it was answered as well as can be."""
+        if self.role == "control":
+            return not self.named and self.verdict != "unknown"
+        if self.role == "unknown":
+            return self.verdict == "unknown"
+        if self.role == "single":
+            return self.named[:1] == self.concealed
+        return set(self.named) == set(self.concealed)
+
+    @property
+    def in_class(self) -> bool:
+        """Tell whether a single effect is the first name or one that cannot be told from it."""
+        return self.hit or (bool(self.named) and self.concealed[0] in self.rivals[0])
+
+
+def mark(flight: str, label: Mapping[str, Any], report: Mapping[str, Any] | None) -> Mark:
+    """Mark one report; a flight without a report was given up."""
+    said = report or {"verdict": "none", "sentence": "no report: the flight was refused", "named": []}
+    named = tuple(name.split(":")[0] for name in said["named"])
+    late, sizes, located, surfaces = [], [], [], []
+    for effect in label["effects"]:
+        if effect["name"] not in named:
+            continue
+        i = named.index(effect["name"])
+        where = said["located"][i]
+        located.append(where["channel"] in CHANNELS[effect["name"]])
+        if effect.get("surface"):
+            surfaces.append(where["surface"] == effect["surface"])
+        if effect.get("t0") and where["segments"]:
+            late.append((where["segments"][0][0] - effect["t0"], 5.0 + 0.2 * effect.get("ramp_s", 0.0)))
+        sizes += [
+            (effect["name"], Size(name, truth, said["parameters"][i].get(name), said["sigma"][i].get(name)))
+            for name, truth in effect["params"].items()
+        ]
+    return Mark(
+        flight=flight,
+        airframe=label["airframe"],
+        role=label["role"],
+        concealed=tuple(effect["name"] for effect in label["effects"]),
+        named=named,
+        verdict=said["verdict"],
+        sentence=said["sentence"],
+        rivals=tuple(tuple(one) for one in said.get("equivalents", ())),
+        late=tuple(late),
+        sizes=tuple(sizes),
+        located=tuple(located),
+        surfaces=tuple(surfaces),
+        before=said.get("fit_before") if named else None,
+        after=said.get("fit_after") if named else None,
+        acts=label.get("acts", {}),
+    )
