@@ -15,7 +15,6 @@ from fleet.contract import Item
 from fleet.frames import Origin, to_geodetic, wrap
 
 HOME = Origin(474_000_000, 85_000_000, 450_000)  # over open country [1e-7 deg, 1e-7 deg, mm]
-SHORE = Origin(541_000_000, 83_000_000, 2_000)  # JSBSim reckons gusts by height above the sea [1e-7 deg, 1e-7 deg, mm]
 WAYPOINT, LOITER_TURNS, LOITER_TIME, DO_JUMP, DO_CHANGE_SPEED = 16, 18, 19, 177, 178
 ABSOLUTE, RELATIVE_ALT = 0, 3
 REACH_M = 1_300.0  # waypoints stay this near to home

@@ -9,6 +9,7 @@ from fleet.cli import guarded
 from fleet.pretend.conceal.exam import exam
 from fleet.prove.seal import seal
 
+
 _EVERY = 10
 
 

@@ -61,7 +61,7 @@ def _jobs(seed: int, flights: int) -> list[Job]:
     names = sorted(f"rec_{int(x):08x}" for x in rng.choice(2**32, len(wanted), replace=False))
     order = rng.permutation(len(wanted))
     drawn = [(name, *wanted[i]) for name, i in zip(names, order, strict=True)]
-    named = [Job(name, airframe, role, hides, number) for number, (name, airframe, role, hides) in enumerate(drawn)]
+    named = [Job(*what, number) for number, what in enumerate(drawn)]
     nominal = [
         Job(f"cal_{airframe}_{k}", airframe, "nominal", (), 1_000 + 10 * i + k, strength)
         for i, airframe in enumerate(AIRFRAMES)

@@ -9,7 +9,6 @@ from fleet.pretend.altered import altered
 from fleet.pretend.conceal.effects import HIDDEN, UNKNOWN, Hidden
 from fleet.pretend.conceal.paths import multisine, plan
 from fleet.pretend.faults.fault import Fault
-from fleet.pretend.missions import SHORE
 from fleet.pretend.situation import Situation, Weather
 from fleet.pretend.types import Type
 from fleet.pretend.uav import PretendUav
@@ -20,7 +19,7 @@ EXCITED = (1.0, 0.8, 0.4, 0.0, 0.0)  # the test pilot's strength on the nominal 
 _ONSET_S, _PASSES_S = (50.0, 110.0), (45.0, 140.0)
 _QUIET = {"propulsion/engine/propeller-sense": 0.0, "conceal/slipstream": 0.0}  # hidden only where it is the effect
 _MORE = {"c172p": {"KFF_RDDRMIX": 0.3}, "small": {}}  # its rudder would hardly move
-_W20_MPS = 1.5  # light turbulence
+_W20_MPS = 0.45  # JSBSim makes 0.2 m/s rms of gusts of it at these heights: a calm morning
 _STEEP = 0.35  # share of flights that climb and descend as far as it goes
 
 
@@ -54,7 +53,7 @@ class Planned(NamedTuple):
         pilot = multisine(rng, airframe, self.job.excited) if self.job.excited else None
         situation = Situation(self.flight, quiet(airframe), way, self._weather(rng), pilot, examined=True)
         more = _MORE[airframe]
-        return PretendUav(0, self.seed, origin=SHORE, aircraft=airframe, more=more, faults=faults, situation=situation)
+        return PretendUav(0, self.seed, aircraft=airframe, more=more, faults=faults, situation=situation)
 
     def _weather(self, rng: np.random.Generator) -> Weather:
         """Draw the wind: none for the Cessna, who would hardly notice it."""
