@@ -182,6 +182,18 @@ class Aircraft:
         """Advance by DT."""
         self._fdm.run()
 
+    def ponder(self) -> np.ndarray:
+        """Work out forces and moments anew while time stands still.
+
+        Returns:
+            pdot qdot rdot [rad/s2] and specific force, FRD [m/s2], (6,)
+        """
+        self._fdm.suspend_integration()
+        self._fdm.run()
+        self._fdm.resume_integration()
+        turning = [self._fdm[f"accelerations/{name}dot-rad_sec2"] for name in "pqr"]
+        return np.array([*turning, *(self.truth().force)])
+
     def truth(self) -> Truth:
         """Read the state in SI, NED and FRD."""
         x = np.array([read() for read in self._read])

@@ -98,7 +98,7 @@ class PretendUav:
         self._believed = self._wind_hat.measure(blowing)
         self._phi_c = 0.0
         self._theta_c, delta_e, self._delta_t = self.aircraft.start(start.p, start.psi, situation.kind.cruise, blowing)
-        self._carried = Carried(faults, self.aircraft, DT, DT * _INNER) if faults else None
+        self.carried = Carried(faults, self.aircraft, DT, DT * _INNER) if faults else None
         self.pulses = Servos.pulses(0.0, delta_e, 0.0, self._delta_t)
         self.now: Estimate = self._measure()
         self._engage(start.seq)
@@ -144,9 +144,9 @@ class PretendUav:
             self._weather()
         if self.tick % _INNER == 0:
             self._control()
-        if self._carried is not None:
-            self._carried.press(self.tick * DT)
-            self.aircraft.drive(*self._carried.move(self.tick * DT, Servos.commands(self.pulses)))
+        if self.carried is not None:
+            self.carried.press(self.tick * DT)
+            self.aircraft.drive(*self.carried.move(self.tick * DT, Servos.commands(self.pulses)))
         frames = self._voice.telemetry(self.tick, self._flight)
         self.aircraft.step()
         self.tick += 1
@@ -156,8 +156,8 @@ class PretendUav:
         """Let the wind blow, and the autopilot estimate it."""
         height = -float(self.now.p[2])
         blowing = (*self._wind.step(height), 0.0)
-        if self._carried is not None:
-            w_n, w_e, w_d = blowing + self._carried.wind(self.tick * DT, height)
+        if self.carried is not None:
+            w_n, w_e, w_d = blowing + self.carried.wind(self.tick * DT, height)
             blowing = float(w_n), float(w_e), float(w_d)
         self._believed = self._wind_hat.measure(blowing[:2])
         self.aircraft.blow(*blowing)
@@ -168,7 +168,7 @@ class PretendUav:
         e = self._sensors.measure(truth)
         if self._heights is not None:
             e = self._heights.measure(e, truth)
-        return e if self._carried is None else self._carried.sense(self.tick * DT, e)
+        return e if self.carried is None else self.carried.sense(self.tick * DT, e)
 
     def _control(self) -> None:
         """Measure, let the autopilot decide, move the servos."""

@@ -5,8 +5,8 @@ from math import degrees
 import numpy as np
 
 from fleet.pretend.altered import altered
+from fleet.pretend.conceal.paths import FIELD
 from fleet.pretend.jsbsim import KG_TO_LB, Aircraft
-from fleet.pretend.missions import HOME
 from fleet.pretend.weather import FT
 
 _SLUG_FT2 = 1.3558179483  # [kg m2]
@@ -21,7 +21,7 @@ _PROPELLER_M = {"c172p": 1.905, "small": 0.508}
 def card(airframe: str) -> dict[str, object]:
     """Give the operator's card of an airframe in SI; throws in degrees."""
     kind = altered(airframe)
-    aircraft = Aircraft(HOME, 0, kind=kind)
+    aircraft = Aircraft(FIELD, 0, kind=kind)
     aircraft[f"inertia/pointmass-weight-lbs{kind.varied}"] = sum(kind.payload_kg) / 2 * KG_TO_LB
     aircraft.start(_ALOFT, 0.0, kind.cruise, (0.0, 0.0))
     inertia = {f"I{axes}": aircraft[f"inertia/i{axes}-slugs_ft2"] * _SLUG_FT2 for axes in ("xx", "yy", "zz")}

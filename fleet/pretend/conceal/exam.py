@@ -59,9 +59,11 @@ def _jobs(seed: int, flights: int) -> list[Job]:
             share = (count + (i + k) % 2) // 2
             wanted += [(airframe, role, names) for names in _names(rng, role, airframe, share)]
     names = sorted(f"rec_{int(x):08x}" for x in rng.choice(2**32, len(wanted), replace=False))
-    order = rng.permutation(len(wanted))
-    drawn = [(name, *wanted[i]) for name, i in zip(names, order, strict=True)]
-    named = [Job(*what, number) for number, what in enumerate(drawn)]
+    shuffled = [wanted[i] for i in rng.permutation(len(wanted))]
+    named = [
+        Job(name, airframe, role, hidden, number)
+        for number, (name, (airframe, role, hidden)) in enumerate(zip(names, shuffled, strict=True))
+    ]
     nominal = [
         Job(f"cal_{airframe}_{k}", airframe, "nominal", (), 1_000 + 10 * i + k, strength)
         for i, airframe in enumerate(AIRFRAMES)
@@ -102,13 +104,11 @@ def _tried(planned: Planned, path: Path, refused: list[str]) -> Label | None:
     """Record one flight and describe it, or note why it will not do."""
     log, first = fly(planned, planned.hidden, path)
     why = why_not_sane(planned, log)
-    shown = []
+    shown: list[Label] = []
     for fault in planned.hidden if not why else ():
-        others = tuple(x for x in planned.hidden if x is not fault)
-        over_noise, channel = acts(fault, log, fly(planned, others)[0])
-        shown.append({"name": fault.name, "over_noise": round(over_noise, 1), "channel": channel})
-        if over_noise < LEAST:
-            why = f"{fault.name}:{fault.of} acts {over_noise:.1f} in {channel}"
+        shown.append(acts(planned, fault, log))
+        if shown[-1]["over_noise"] < LEAST:
+            why = f"{fault.name} {fault.of} acts {shown[-1]['over_noise']} in {shown[-1]['channel']}"
     if why:
         refused.append(why)
         path.unlink()

@@ -6,10 +6,12 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.contract import Item
-from fleet.frames import wrap
-from fleet.pretend.missions import ABSOLUTE, DO_CHANGE_SPEED, DO_JUMP, HOME, LOITER_TURNS, WAYPOINT, Start, item
+from fleet.frames import Origin, wrap
+from fleet.pretend.missions import ABSOLUTE, DO_CHANGE_SPEED, DO_JUMP, LOITER_TURNS, WAYPOINT, Start, item
 from fleet.pretend.situation import Pilot
 
+FIELD = Origin(536_500_000, 80_500_000, 5_000)  # marshland by the sea [1e-7 deg, 1e-7 deg, mm]
+"""Near sea level: JSBSim's turbulence goes with the wind at 20 ft only below 1000 ft above the sea."""
 _LEGS = 14
 _SPEEDS = (0.90, 0.95, 1.0, 1.06, 1.12)  # of cruise
 _TURNS_DEG = (30, 50, 70, 90, 110, 140)
@@ -42,20 +44,20 @@ def plan(rng: np.random.Generator, airframe: str, steep: bool = False) -> tuple[
     """
     ground = GROUNDS[airframe]
     spots = _walk(rng, ground, steep)
-    items = [item(0, WAYPOINT, HOME, (0.0, 0.0, 0.0), frame=ABSOLUTE)]
+    items = [item(0, WAYPOINT, FIELD, (0.0, 0.0, 0.0), frame=ABSOLUTE)]
     circle_at = int(rng.integers(5, 9))
     speed = 1.0
     for k, spot in enumerate(spots):
         if k % 2 == 0:
             speed = float(rng.choice([x for x in _SPEEDS if abs(x - speed) > 0.04]))
-            items.append(item(len(items), DO_CHANGE_SPEED, HOME, params=(0.0, round(speed * ground.cruise, 1), -1.0)))
+            items.append(item(len(items), DO_CHANGE_SPEED, FIELD, params=(0.0, round(speed * ground.cruise, 1), -1.0)))
         if k == circle_at:
             radius = float(rng.choice([-1, 1])) * ground.circle
-            items.append(item(len(items), LOITER_TURNS, HOME, spot, params=(1.0, 0.0, radius)))
+            items.append(item(len(items), LOITER_TURNS, FIELD, spot, params=(1.0, 0.0, radius)))
         else:
-            items.append(item(len(items), WAYPOINT, HOME, spot))
+            items.append(item(len(items), WAYPOINT, FIELD, spot))
     first = next(i.seq for i in items[1:] if i.command == WAYPOINT)
-    items.append(item(len(items), DO_JUMP, HOME, params=(1.0, -1.0)))
+    items.append(item(len(items), DO_JUMP, FIELD, params=(1.0, -1.0)))
     return tuple(items), _before(rng, spots[0], spots[1], ground, first)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from fleet.pretend.altered import altered
 from fleet.pretend.conceal.effects import HIDDEN, UNKNOWN, Hidden
-from fleet.pretend.conceal.paths import multisine, plan
+from fleet.pretend.conceal.paths import FIELD, multisine, plan
 from fleet.pretend.faults.fault import Fault
 from fleet.pretend.situation import Situation, Weather
 from fleet.pretend.types import Type
@@ -53,7 +53,7 @@ class Planned(NamedTuple):
         pilot = multisine(rng, airframe, self.job.excited) if self.job.excited else None
         situation = Situation(self.flight, quiet(airframe), way, self._weather(rng), pilot, examined=True)
         more = _MORE[airframe]
-        return PretendUav(0, self.seed, aircraft=airframe, more=more, faults=faults, situation=situation)
+        return PretendUav(0, self.seed, origin=FIELD, aircraft=airframe, more=more, faults=faults, situation=situation)
 
     def _weather(self, rng: np.random.Generator) -> Weather:
         """Draw the wind: none for the Cessna, who would hardly notice it."""

@@ -1,7 +1,7 @@
 """Fly a planned flight: into a recording, or only to see what it does; and whether it stays where flying is sane."""
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ from fleet.pretend.faults.fault import Fault
 from fleet.pretend.jsbsim import Truth
 from fleet.pretend.link import Link
 from fleet.pretend.sensors import Estimate, pressure_height
+from fleet.pretend.uav import PretendUav
 
 LOG_S = 0.1
 LOSS, FADES_S = 0.02, 45.0  # share of frames lost; mean time between two silences [s]
@@ -37,8 +38,13 @@ class Log(NamedTuple):
     rho: np.ndarray  # air density [kg/m3]
 
 
-def fly(planned: Planned, faults: tuple[Fault, ...], path: Path | None = None) -> tuple[Log, float]:
-    """Fly with `faults`, into a recording if a path is given.
+def fly(
+    planned: Planned,
+    faults: tuple[Fault, ...],
+    path: Path | None = None,
+    look: Callable[[PretendUav], None] = lambda _: None,
+) -> tuple[Log, float]:
+    """Fly with `faults`, into a recording if a path is given; let somebody look at the aircraft ten times a second.
 
     Returns:
         the log, and the time of the first ATTITUDE recorded, since the world began [s]
@@ -53,6 +59,7 @@ def fly(planned: Planned, faults: tuple[Fault, ...], path: Path | None = None) -
         for tick in range(round((until - LOG_S) / TICK_S) + 1, round(until / TICK_S) + 1):
             link.send(tick * TICK_S, uav.step(tick * TICK_S))
         arrived += link.receive(until)
+        look(uav)
         rows.append((until, uav.aircraft.truth(), uav.now, uav.pulses))
     if path is not None:
         with path.open("wb") as file:

@@ -3,12 +3,12 @@
 import numpy as np
 
 from fleet.pretend.conceal.effects import told
+from fleet.pretend.conceal.paths import FIELD
 from fleet.pretend.conceal.plan import Planned, quiet
 from fleet.pretend.conceal.record import Log
 from fleet.pretend.faults.fault import Fault
 from fleet.pretend.faults.physics import World
 from fleet.pretend.jsbsim import DT, Aircraft
-from fleet.pretend.missions import HOME
 from fleet.pretend.sensors import pressure_at
 
 _R = 287.05  # of dry air [J/(kg K)]
@@ -51,14 +51,14 @@ def _measured(planned: Planned, fault: Fault, log: Log) -> dict[str, float]:
 
 def density_ratio(log: Log) -> float:
     """Give air density over that of the standard day at the same height, mean over a flight."""
-    height = log.height + HOME.alt_mm * 1e-3
+    height = log.height + FIELD.alt_mm * 1e-3
     standard = [pressure_at(h) / (_R * (_SEA_LEVEL_K - _LAPSE_K * h)) for h in height]
     return float(np.mean(log.rho / np.array(standard)))
 
 
 def thrust_lost(planned: Planned, fault: Fault) -> float:
     """Give the share of thrust lost at the same throttle and speed, mean over a few of each."""
-    aircraft = Aircraft(HOME, planned.seed, kind=quiet(planned.job.airframe))
+    aircraft = Aircraft(FIELD, planned.seed, kind=quiet(planned.job.airframe))
     lost = [1 - _thrust(aircraft, v, u, fault) / _thrust(aircraft, v, u, None) for v in _SPEEDS for u in _THROTTLES]
     return float(np.mean(lost))
 

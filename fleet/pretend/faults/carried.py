@@ -1,14 +1,14 @@
 """All faults of one aircraft, in the four places where the aircraft asks for them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from fleet.pretend.faults.fault import Fault
 from fleet.pretend.faults.oddities import ODD
 from fleet.pretend.faults.physics import CHANGES, WINDS, World
-from fleet.pretend.faults.sensing import SPOILS, Senses
-from fleet.pretend.faults.servos import MOVES, Commands, Linkage
+from fleet.pretend.faults.sensing import SPOILS
+from fleet.pretend.faults.servos import MOVES, SURFACES, Commands, Move
 from fleet.pretend.jsbsim import Aircraft
 from fleet.pretend.sensors import Estimate
 
@@ -25,16 +25,22 @@ class Carried:
             tick_s: time between two calls of `move` [s]
             sense_s: time between two calls of `sense` [s]
         """
-        self._linkage = Linkage([fault for fault in faults if fault.name in MOVES], tick_s)
-        self._senses = Senses([fault for fault in faults if fault.name in SPOILS], sense_s)
-        self._odd = [(fault, ODD[fault.name](fault.values, aircraft)) for fault in faults if fault.name in ODD]
+        self.faults = faults
+        odd = [(fault, ODD[fault.name](fault.values, aircraft)) for fault in faults if fault.name in ODD]
+        self._presses = [(fault, oddity.press) for fault, oddity in odd]
+        self._moves = [(f, _one(f, MOVES[f.name](f.values, tick_s))) for f in faults if f.name in MOVES]
+        self._moves += [(fault, oddity.move) for fault, oddity in odd]
+        self._spoils = [(fault, SPOILS[fault.name](fault, sense_s)) for fault in faults if fault.name in SPOILS]
+        self._spoils += [(fault, oddity.sense) for fault, oddity in odd]
         self._world = World([fault for fault in faults if fault.name in CHANGES or fault.name in WINDS], aircraft)
+        self.moved = {fault: np.zeros(4) for fault in faults}  # what each last did to the commands
+        self.spoilt = {fault: np.zeros(14) for fault in faults}  # and to the estimate, see `numbers`
 
-    def press(self, t: float) -> None:
-        """Change the physics."""
-        self._world.press(t)
-        for fault, oddity in self._odd:
-            oddity.press(t, fault.share(t))
+    def press(self, t: float, without: Fault | None = None) -> None:
+        """Change the physics, by all faults or by all but one."""
+        self._world.press(t, without)
+        for fault, press in self._presses:
+            press(t, 0.0 if fault is without else fault.share(t))
 
     def wind(self, t: float, height: float) -> np.ndarray:
         """Give the wind added, NED, (3,) [m/s]."""
@@ -42,14 +48,31 @@ class Carried:
 
     def sense(self, t: float, e: Estimate) -> Estimate:
         """Give what the autopilot believes."""
-        e = self._senses.sense(t, e)
-        for fault, oddity in self._odd:
-            e = oddity.sense(e, fault.share(t))
+        for fault, spoil in self._spoils:
+            good, e = e, spoil(e, fault.share(t))
+            self.spoilt[fault] = numbers(e) - numbers(good)
         return e
 
     def move(self, t: float, commands: Commands) -> Commands:
         """Give where surfaces and motor go."""
-        commands = self._linkage.move(t, commands)
-        for fault, oddity in self._odd:
-            commands = oddity.move(t, fault.share(t), commands)
+        for fault, move in self._moves:
+            told, commands = commands, move(t, fault.share(t), commands)
+            self.moved[fault] = np.subtract(commands, told)
         return commands
+
+
+def numbers(e: Estimate) -> np.ndarray:
+    """Lay out rates, force, euler, v, Va and height, (14,)."""
+    return np.concatenate([e.rates, e.force, e.euler, e.v, [e.Va, -e.p[2]]])
+
+
+def _one(fault: Fault, move: Move) -> Callable[[float, float, Commands], Commands]:
+    """Let a servo's fault act on its own surface."""
+    i = SURFACES.index(fault.of)
+
+    def moved(t: float, share: float, commands: Commands) -> Commands:
+        deltas = list(commands)
+        deltas[i] = move(deltas[i], share)
+        return deltas[0], deltas[1], deltas[2], deltas[3]
+
+    return moved

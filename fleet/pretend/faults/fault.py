@@ -10,10 +10,14 @@ class Fault(NamedTuple):
 
     name: str  # in `kinds.KINDS`
     of: str  # the part: a surface, an axis; empty where there is but one
-    values: Mapping[str, float]  # its parameters, units in their names
+    values: Mapping[str, float]  # its parameters, units in their names; faults are told apart by identity
     t0: float = 0.0  # begins [s since the flight began]
     ramp_s: float = 0.0  # grows for so long; of what passes: the length of either edge [s]
     t1: float = inf  # is over [s]
+
+    def __hash__(self) -> int:
+        """Tell faults apart."""
+        return id(self)
 
     def share(self, t: float) -> float:
         """Give how much of it is there at `t` [s]: 0 nothing, 1 all.

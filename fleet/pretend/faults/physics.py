@@ -99,11 +99,11 @@ class World:
         self._changes = [(fault, CHANGES[fault.name](aircraft, fault.values)) for fault in others]
         self._usual = {name: aircraft[name] for _, change in self._changes for name in change}
 
-    def press(self, t: float) -> None:
-        """Set JSBSim's properties as they are at `t` [s]."""
+    def press(self, t: float, without: Fault | None = None) -> None:
+        """Set JSBSim's properties as they are at `t` [s], or as they were if one fault were not."""
         now = dict(self._usual)
         for fault, change in self._changes:
-            share = fault.share(t)
+            share = 0.0 if fault is without else fault.share(t)
             for name, most in change.items():
                 now[name] += share * most
         for name, value in now.items():

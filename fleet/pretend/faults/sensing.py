@@ -93,17 +93,3 @@ SPOILS: dict[str, Callable[[Fault, float], Spoil]] = {
     "heading_bias": _heading_bias,
     "baro_bias": _baro_bias,
 }
-
-
-class Senses:
-    """The faulty sensors of one aircraft."""
-
-    def __init__(self, faults: list[Fault], dt: float):
-        """Lay the sensor faults in a row; `dt`: time between two calls of `sense` [s]."""
-        self._faults = [(fault, SPOILS[fault.name](fault, dt)) for fault in faults]
-
-    def sense(self, t: float, e: Estimate) -> Estimate:
-        """Give what the autopilot believes."""
-        for fault, spoil in self._faults:
-            e = spoil(e, fault.share(t))
-        return e

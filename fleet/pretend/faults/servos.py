@@ -7,8 +7,6 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from math import exp
 
-from fleet.pretend.faults.fault import Fault
-
 SURFACES = ("aileron", "elevator", "rudder")
 _OLDEST_S = 2.0  # commands that are remembered
 
@@ -101,18 +99,3 @@ MOVES: dict[str, Callable[[Mapping[str, float], float], Move]] = {
 
 Commands = tuple[float, float, float, float]
 """delta_a, delta_e, delta_r, delta_t."""
-
-
-class Linkage:
-    """Everything between the commands of one aircraft and its surfaces."""
-
-    def __init__(self, faults: list[Fault], dt: float):
-        """Lay the servo faults in a row; `dt`: time between two calls of `move` [s]."""
-        self._faults = [(fault, SURFACES.index(fault.of), MOVES[fault.name](fault.values, dt)) for fault in faults]
-
-    def move(self, t: float, commands: Commands) -> Commands:
-        """Give where surfaces and motor are told to go."""
-        deltas = list(commands)
-        for fault, i, move in self._faults:
-            deltas[i] = move(deltas[i], fault.share(t))
-        return deltas[0], deltas[1], deltas[2], deltas[3]
