@@ -80,7 +80,7 @@ HIDDEN: dict[str, Hidden] = {
     "wind_shear": Hidden("air", _blown("mps_per_100m", *_same(2.5, 5.0)), _ALWAYS, CESSNA, told=None),
     "gust_discrete": Hidden("air", _blown("speed_mps", (5.0, 9.0), (3.0, 6.0)), ("pass",), told=None),
     "updraft": Hidden("air", _either("speed_mps", (2.5, 5.0), (1.5, 3.0)), ("pass",), told=None),
-    "turbulence": Hidden("air", _between("w20_mps", *_same(2.0, 3.5))),
+    "turbulence": Hidden("air", _between("w20_mps", *_same(6.0, 11.0))),
     "air_density": Hidden("air", _dense, _ALWAYS),
     "actuator_lag": Hidden("servo", _between("tau_s", (0.15, 0.4), (0.12, 0.3)), of=SURFACES, told=None),
     "actuator_delay": Hidden("servo", _between("delay_s", (0.12, 0.3), (0.08, 0.2)), of=SURFACES, told=None),

@@ -19,7 +19,7 @@ EXCITED = (1.0, 0.8, 0.4, 0.0, 0.0)  # the test pilot's strength on the nominal 
 _ONSET_S, _PASSES_S = (50.0, 110.0), (45.0, 140.0)
 _QUIET = {"propulsion/engine/propeller-sense": 0.0, "conceal/slipstream": 0.0}  # hidden only where it is the effect
 _MORE = {"c172p": {"KFF_RDDRMIX": 0.3}, "small": {}}  # its rudder would hardly move
-_W20_MPS = 0.45  # JSBSim makes 0.2 m/s rms of gusts of it at these heights: a calm morning
+_W20_MPS = 1.5  # light turbulence
 _STEEP = 0.35  # share of flights that climb and descend as far as it goes
 
 
