@@ -12,13 +12,19 @@ from twin_worker.diagnose.card import Card
 from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.residual import RHO_0, Case, Terms
+from twin_worker.diagnose.smooth import thinned
 
 _RIDGE = 3e-4  # pull of a coefficient towards zero, as a share of its term's length
 _ORDER, _WHITENINGS = 3, 1  # of the residuals' autoregression; rounds
 _ROUNDS = 2
+_FADED = 4.0  # residual rows that count as one: whitening is never whole
 _SHEAR = 1.0  # usual growth of wind with height [m/s per 100 m]
 _CORRELATED = 50.0  # residual rows that count as one
 _SIDE = 0.5  # weight of sideslip in the wind fit [-]
+_CALM, _STILL = (
+    np.array([0.0, 0.0, 1.0]),
+    np.array([0.5, 0.5, 100.0]),
+)  # no wind, true airspeed; and how far to hold to it
 _LAGS = (0.0, 0.03, 0.06, 0.1, 0.14, 0.18, 0.22, 0.28, 0.35)  # [s]
 _DELAYS, _ENGINES = (0.0, 0.02, 0.04, 0.06), (0.1, 0.25, 0.5)  # [s]
 
@@ -38,6 +44,7 @@ def fit(flights: Sequence[Flight], card: Card, timing: Timing, vane: bool) -> tu
     speed = float(np.median(np.concatenate([np.hypot(f.readings["v_n"], f.readings["v_e"])[f.ok] for f in flights])))
     base = Baseline(card, {}, speed, timing=timing, vane=vane, flights=tuple(f.name for f in flights))
     winds = [np.zeros(4) for _ in flights]
+    base = replace(base, airspeed=_scale([Case(flight, base) for flight in flights]))
     cases = [Case(flight, base) for flight in flights]
     for _ in range(_ROUNDS):
         winds = [fit_wind(case, w) for case, w in zip(cases, winds, strict=True)]
@@ -104,6 +111,8 @@ class _Rows:
             good[:_ORDER] = False
             whole.append(good)
         self.A, self.y = np.concatenate(A), np.concatenate(y)
+        known = cases[0].base.card.known
+        self.usual = np.array(eq.USUAL[name] if known and name in eq.USUAL else [np.inf] * self.A.shape[1])
         self.ok, self.whole = np.concatenate(ok), np.concatenate(whole)
 
     def whitener(self, x: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -121,11 +130,11 @@ def _solve(rows: _Rows, whitenings: int = _WHITENINGS) -> tuple[np.ndarray, floa
     shrinks the derivatives: both sides are filtered by the residuals' own autoregression.
     Source: Clarke 1967 (generalised least squares); Klein & Morelli 2006, section 5.2.
     """
-    x = _ridge(rows.A[rows.ok], rows.y[rows.ok])
+    x = _ridge(rows.A[rows.ok], rows.y[rows.ok], rows.usual, _CORRELATED)
     r2 = _r2(rows.A[rows.ok] @ x, rows.y[rows.ok])
     for _ in range(whitenings):
         white = rows.whitener(x)
-        x = _ridge(white(rows.A)[rows.whole], white(rows.y)[rows.whole])
+        x = _ridge(white(rows.A)[rows.whole], white(rows.y)[rows.whole], rows.usual, _FADED)
     return x, r2
 
 
@@ -139,11 +148,20 @@ def _r2(fitted: np.ndarray, y: np.ndarray) -> float:
     return float(1.0 - ((y - fitted) ** 2).sum() / max(((y - y.mean()) ** 2).sum(), 1e-12))
 
 
-def _ridge(A: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _ridge(A: np.ndarray, y: np.ndarray, usual: np.ndarray, as_one: float) -> np.ndarray:
+    """Solve by least squares, held to zero a little, and to what is usual as far as the residuals leave it open.
+
+    `as_one` residual rows count as one.
+    """
     length = np.linalg.norm(A, axis=0) + 1e-12
     k = A.shape[1]
-    stacked = np.vstack([A / length, _RIDGE * np.eye(k)])
-    return np.linalg.lstsq(stacked, np.concatenate([y, np.zeros(k)]), rcond=None)[0] / length
+    pull = np.full(k, _RIDGE)
+    for _ in range(2):
+        rows, told = np.vstack([A / length, np.diag(pull)]), np.concatenate([y, np.zeros(k)])
+        x = np.linalg.lstsq(rows, told, rcond=None)[0] / length
+        noise = np.sqrt(as_one * np.mean((y - A @ x) ** 2))
+        pull = np.maximum(_RIDGE, noise / (usual * length))
+    return x
 
 
 def _airspeed(cases: list[Case], made: list[Terms]) -> float:
@@ -155,6 +173,35 @@ def _airspeed(cases: list[Case], made: list[Terms]) -> float:
         [np.stack([m.flow.Va * np.sqrt(m.flow.rho / RHO_0), m.measured["airspeed"]])[:, c.ok] for c, m in rows], axis=1
     )
     return float((x @ y) / (x @ x))
+
+
+def _scale(cases: list[Case]) -> float:
+    """Give reported over indicated airspeed before anything else is known: on circles wind and scale come apart.
+
+    Started from a scale of one, the winds would take it up, and hand it on to the sideslip.
+    """
+    found = []
+    for case in cases:
+        if "Va" not in case.flight.readings:
+            return 1.0
+        m, r, ok = case.terms(()), case.flight.readings, case.ok
+        told = m.measured["airspeed"][ok] / np.sqrt(m.flow.rho[ok] / RHO_0)
+        v = np.stack([thinned(r[name])[ok] for name in ("v_n", "v_e", "v_d")])
+        x = np.array([0.0, 0.0, 1.0])
+        for _ in range(8):
+            air = v - np.array([x[0], x[1], 0.0])[:, None]
+            speed = np.linalg.norm(air, axis=0)
+            J = np.column_stack([-x[2] * air[0] / speed, -x[2] * air[1] / speed, speed])
+            x = (
+                x
+                + np.linalg.lstsq(
+                    np.vstack([J, np.diag(_STILL)]),
+                    np.concatenate([told - x[2] * speed, _STILL * (_CALM - x)]),
+                    rcond=None,
+                )[0]
+            )
+        found.append(x[2])
+    return float(np.median(found))
 
 
 def fit_wind(case: Case, w: np.ndarray) -> np.ndarray:
