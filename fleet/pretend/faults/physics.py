@@ -4,7 +4,7 @@ Knobs named conceal/* are those of `altered`.
 """
 
 from collections.abc import Callable, Mapping
-from math import cos, radians, sin, sqrt
+from math import cbrt, cos, radians, sin
 
 import numpy as np
 
@@ -22,11 +22,11 @@ Change = Callable[[Aircraft, Mapping[str, float]], Increments]
 
 
 def _air_density(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
-    """Change density half by pressure, half by warmth."""
-    half = sqrt(values["density_ratio"])
+    """Change density one third by pressure, two thirds by warmth, as weather does."""
+    third = cbrt(values["density_ratio"])
     return {
-        "atmosphere/P-sl-psf": aircraft["atmosphere/P-sl-psf"] * (half - 1),
-        "atmosphere/delta-T": aircraft["atmosphere/T-R"] * (1 / half - 1),
+        "atmosphere/P-sl-psf": aircraft["atmosphere/P-sl-psf"] * (third - 1),
+        "atmosphere/delta-T": aircraft["atmosphere/T-R"] * (1 / third**2 - 1),
     }
 
 
