@@ -9,7 +9,6 @@ from fleet.cli import guarded
 from fleet.pretend.conceal.exam import exam
 from fleet.prove.seal import seal
 
-
 _EVERY = 10
 
 

@@ -11,7 +11,7 @@ from twin_worker.diagnose.decide import best
 from twin_worker.diagnose.fit import fit, fit_timing, fit_wind, wind
 from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.guess import Guess
-from twin_worker.diagnose.nuisance import WIDEST, nuisances
+from twin_worker.diagnose.nuisance import WIDEST, nuisances, wandering, wanders
 from twin_worker.diagnose.residual import Case
 from twin_worker.diagnose.sight import Sight, is_weather
 
@@ -128,15 +128,16 @@ def _with_noise(base: Baseline, cases: list[Case]) -> Baseline:
     for k, n in enumerate(several):
         if n.effect.name == "wind_steady":
             spread[k] = max(spread[k], np.sqrt(np.mean([w[n.index] ** 2 for w in winds])))
-    named = {n.name: float(s) for n, s in zip(several, spread, strict=True)}
+    names = [*(n.name for n in several), *(one.name for one in wanders(several))]
+    named = dict(zip(names, spread.tolist(), strict=True))
     return replace(base, noise=Noise(noise.ar, noise.sigma * _SAFE), spread=named)
 
 
 def _slopes(case: Case, granted: tuple[Guess, ...], rows: np.ndarray) -> np.ndarray:
     """Give how residuals change with each nuisance, (n, c, nuisances)."""
-    return np.stack(
-        [(case.residuals((*granted, n.guess(n.step))) - rows) / n.step for n in nuisances(case.base.vane)], axis=2
-    )
+    several = nuisances(case.base.vane)
+    own = np.stack([(case.residuals((*granted, n.guess(n.step))) - rows) / n.step for n in several], axis=2)
+    return np.concatenate([own, wandering(own, wanders(several), case.t)], axis=2)
 
 
 def _spreads(
@@ -146,7 +147,8 @@ def _spreads(
 
     A nuisance that a flight says nothing about leaves its spread where it was.  Source: Dempster, Laird & Rubin 1977.
     """
-    floors = np.array([n.floor for n in nuisances(cases[0].base.vane)])
+    several = nuisances(cases[0].base.vane)
+    floors = np.array([*(n.floor for n in several), *(one.floor for one in wanders(several))])
     parts = []
     for case, x, J in zip(cases, rows, slopes, strict=True):
         white = np.stack([noise.whiten(J[:, :, k]) for k in range(J.shape[2])], axis=2)[case.ok]

@@ -4,7 +4,10 @@ Each has a spread: of the sensor's specification, or learnt from nominal flights
 absorbed; past it the difference is handed to the hypotheses.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from fleet.effects import Effect, Parameter, Stage, catalogue
 from twin_worker.diagnose.guess import ALWAYS, Guess
@@ -13,6 +16,15 @@ _SHARE = 0.03  # least scatter of a derivative without the vane [-]
 WIDEST = 4.0  # a learnt spread over its floor
 RELEASED = 2.5  # spreads past which a difference is no nuisance any more
 WEATHER_MPS = 1.0  # nominal flights that differ by more had weather: a mean wind is then never a finding
+
+WAVES = 3  # slow courses a wandering nuisance may take
+_WANDERS = {  # what sensors and weather do not keep to during a flight: effect -> floor over that of its mean
+    "accel_bias": 0.5,
+    "gyro_bias": 0.5,
+    "heading_bias": 0.5,
+    "imu_misalignment": 0.5,
+    "wind_steady": 0.3,
+}
 
 _SHARES = ("L:delta_a", "L:p", "L:beta", "M:delta_e", "M:c_z", "M:q", "N:delta_r", "N:r", "N:beta")
 _OFFSETS = ("C_L", "C_D", "C_l", "C_m", "C_n", "thrust", "rho", "side")
@@ -71,6 +83,40 @@ class Nuisance:
     def weather(self) -> bool:
         """Tell whether this is weather, of which any amount may be nominal."""
         return self.effect.name in ("wind_steady", "wind_shear")
+
+
+@dataclass(frozen=True)
+class Wander:
+    """One nuisance's slow course: so many half waves of a cosine over the flight.
+
+    Attributes:
+        name: for the spreads
+        of: index of the nuisance that wanders
+        wave: number of half waves
+        floor: least spread
+    """
+
+    name: str
+    of: int
+    wave: int
+    floor: float
+
+
+def wanders(known: Sequence[Nuisance]) -> tuple[Wander, ...]:
+    """List the slow courses of those that wander."""
+    return tuple(
+        Wander(f"{n.name}~{wave}", k, wave, _WANDERS[n.effect.name] * n.floor)
+        for k, n in enumerate(known)
+        if n.effect.name in _WANDERS
+        for wave in range(1, WAVES + 1)
+    )
+
+
+def wandering(columns: np.ndarray, several: Sequence[Wander], t: np.ndarray) -> np.ndarray:
+    """Give the slopes of slow courses, (n, c, wanders), by those of what wanders, (n, c, nuisances), at t (n,)."""
+    share = (t - t[0]) / max(t[-1] - t[0], 1e-9)
+    waves = [np.sqrt(2.0) * np.cos(np.pi * one.wave * share) for one in several]
+    return np.stack([columns[:, :, one.of] * wave[:, None] for one, wave in zip(several, waves, strict=True)], axis=2)
 
 
 def nuisances(vane: bool) -> tuple[Nuisance, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from twin_worker.diagnose.baseline import CHANNELS, Baseline
 from twin_worker.diagnose.guess import Guess
-from twin_worker.diagnose.nuisance import RELEASED, WEATHER_MPS, Nuisance, nuisances
+from twin_worker.diagnose.nuisance import RELEASED, WEATHER_MPS, Nuisance, nuisances, wandering, wanders
 from twin_worker.diagnose.residual import Case
 
 CLIP = 6.0  # whitened residuals beyond count as much [-]; or
@@ -37,6 +37,7 @@ class Sight:
         self.noise = self._scaled()
         self.weather = is_weather(self.base)
         self.nuisances: tuple[Nuisance, ...] = nuisances(self.base.vane)
+        self.wanders = wanders(self.nuisances)
         self.clip = np.full(len(CHANNELS), CLIP)
         self.granted = granted
         if self.ok.any():
@@ -89,9 +90,9 @@ class Sight:
         self.raw = self.whitened(())
         self.e = np.clip(self.raw, -self.clip, self.clip)
         steps = [self.whitened((n.guess(n.step),)) for n in self.nuisances]
-        columns = [(e - self.raw) / n.step for e, n in zip(steps, self.nuisances, strict=True)]
-        columns += [self._varied(k) - self.raw for k in range(len(self.base.others))]
-        self.Jn = np.stack(columns, axis=2)
+        own = np.stack([(e - self.raw) / n.step for e, n in zip(steps, self.nuisances, strict=True)], axis=2)
+        others = [self._varied(k)[:, :, None] - self.raw[:, :, None] for k in range(len(self.base.others))]
+        self.Jn = np.concatenate([own, wandering(own, self.wanders, self.case.t), *others], axis=2)
         self._profile()
 
     def _varied(self, k: int) -> np.ndarray:
@@ -101,8 +102,10 @@ class Sight:
     def _profile(self) -> None:
         """Find the nuisances, and hand those that leave their spread to the hypotheses."""
         more = np.ones(len(self.base.others))
-        self.precision = np.array([*(1.0 / self._spread(n) ** 2 for n in self.nuisances), *more])
-        free = np.array([*(n.scatter or (self.weather and n.weather) for n in self.nuisances), *(more < 0)])
+        slow = np.array([self.base.spread.get(one.name, one.floor) for one in self.wanders])
+        self.precision = np.array([*(1.0 / self._spread(n) ** 2 for n in self.nuisances), *slow**-2.0, *more])
+        free = np.array([n.scatter or (self.weather and n.weather) for n in self.nuisances])
+        free = np.concatenate([free, np.zeros(len(slow) + len(more), bool)])
         flat = self.Jn.reshape(-1, self.Jn.shape[2])
         G, self.bn = flat.T @ flat, -flat.T @ self.e.ravel()
         for _ in range(6):

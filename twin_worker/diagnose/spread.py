@@ -11,6 +11,7 @@ from twin_worker.diagnose.sight import Sight
 
 _BLOCK = 50  # rows of a block of the sandwich, 10 s
 _PARTS = 4  # of the flight, each left out in turn
+_WORKS = 0.01  # of an effect's course, from which it is at work
 _CLOCK_S = 0.01  # clocks of messages agree no better [s]
 
 
@@ -75,7 +76,7 @@ def _jackknife(sight: Sight, granted: tuple[Guess, ...], guess: Guess) -> np.nda
     """Give the covariance that fits without each quarter of the time at work show, (k, k)."""
     sight.grant(granted)
     t = sight.case.t
-    at_work = t[(guess.when.gate(t) > 0) & sight.ok]
+    at_work = t[(guess.when.gate(t) > _WORKS) & sight.ok]
     if len(at_work) < 4 * _BLOCK:
         return np.zeros((len(guess.par),) * 2)
     edges = np.quantile(at_work, np.linspace(0, 1, _PARTS + 1))
