@@ -25,7 +25,7 @@ Series = dict[str, np.ndarray]
 
 def density(h: Any) -> Any:
     """Give the density of the standard atmosphere at height h [m], [kg/m3]."""
-    return RHO_0 * (1.0 - 2.25577e-5 * h) ** 4.2559
+    return RHO_0 * np.clip(1.0 - 2.25577e-5 * h, 0.1, 2.0) ** 4.2559  # a free flight may stray beyond the air
 
 
 @dataclass
