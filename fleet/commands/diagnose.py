@@ -7,9 +7,12 @@ from pathlib import Path
 from fleet.children import run_until
 from fleet.cli import stop_on_signal
 
+_LONGEST_S = 1e6
+
 EXAMPLES = """
   fleet diagnose flight.tlog --model skywalker.json
   fleet diagnose friday/*.tlog.xz --model skywalker.json --json friday.json --report friday
+  fleet diagnose flight.tlog --against-own-past 120     no other flight: its first two minutes are trusted
   fleet diagnose real.tlog --against simulated.tlog --airframe skywalker     your own simulator is what gets corrected
 """
 
@@ -21,7 +24,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--against", type=Path, nargs="+", metavar="SIMULATED", help="or recordings of a simulator flying such missions"
     )
-    parser.add_argument("--airframe", type=Path, metavar="CARD", help="with --against: the aircraft, as for calibrate")
+    parser.add_argument(
+        "--against-own-past",
+        type=float,
+        metavar="SECONDS",
+        help="or what each flight did itself before SECONDS on its clock; no corrected models are written then",
+    )
+    parser.add_argument("--airframe", type=Path, metavar="CARD", help="without --model: the aircraft, as for calibrate")
     parser.add_argument("--json", type=Path, metavar="OUT", help="write verdicts to OUT, predictions beside it")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that share the recordings (1)")
     parser.add_argument(
@@ -37,8 +46,12 @@ def check(args: argparse.Namespace) -> None:
     """
     if not 1 <= args.jobs <= 64:
         raise ValueError(f"--jobs: found {args.jobs}, expected 1..64; change it")
-    if bool(args.model) == bool(args.against):
-        raise ValueError("expected either --model or --against; name one thing to compare the flights with")
+    if sum(map(bool, (args.model, args.against, args.against_own_past))) != 1:
+        raise ValueError(
+            "expected either --model or --against or --against-own-past; name one thing to compare the flights with"
+        )
+    if args.against_own_past is not None and not 0 < args.against_own_past < _LONGEST_S:
+        raise ValueError(f"--against-own-past: found {args.against_own_past:g}, expected seconds above 0; change it")
     for option, path in (("--json", args.json), ("--report", args.report)):
         if path and not path.absolute().parent.is_dir():
             raise ValueError(f"{option}: found no folder {str(path.parent)!r}, expected one; make it first")
@@ -48,8 +61,8 @@ def run(args: argparse.Namespace) -> int:
     """Start the diagnosis; its exit code is ours."""
     check(args)
     stop = stop_on_signal()
-    given = {name: getattr(args, name) for name in ("model", "airframe", "json", "report", "jobs")}
-    options = [f"--{name}={value}" for name, value in given.items() if value]
+    given = {name: getattr(args, name) for name in ("model", "airframe", "json", "report", "jobs", "against_own_past")}
+    options = [f"--{name.replace('_', '-')}={value}" for name, value in given.items() if value]
     simulated = ["--against", *map(str, args.against)] if args.against else []
     code = run_until(stop, "twin_worker.diagnose", *options, *simulated, "--", *map(str, args.file))
     if stop.is_set():

@@ -9,16 +9,17 @@ from fleet.commands.diagnose import EXAMPLES, arguments, check
 from twin_worker.diagnose import keep, written
 from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.learn import card_of, learn, say
+from twin_worker.diagnose.past import OwnPast
 from twin_worker.diagnose.report import Outcome, Report
-from twin_worker.diagnose.share import shared
+from twin_worker.diagnose.share import Against, shared
 
 
 def _run(args: argparse.Namespace) -> int:
     check(args)
-    base = keep.load(args.model)[0] if args.model else learn(args.against, card_of(args.airframe))
+    against = _against(args)
     reports: list[Report] = []
     refused = 0
-    for found, why in shared(args.file, base, args.jobs, say):
+    for found, why in shared(args.file, against, args.jobs, say):
         for report in found:
             print(f"{report.flight}: {report.sentence}", flush=True)
         reports += found
@@ -28,19 +29,27 @@ def _run(args: argparse.Namespace) -> int:
     if args.json:
         written.write(reports, args.json)
     if args.report:
-        _page(reports, base, args.report)
+        _page(reports, against, args.report)
     return 2 if refused and not reports else 1 if refused else 0
 
 
-def _page(reports: list[Report], base: Baseline, folder: Path) -> None:
-    """Write figures, page and the simulations corrected by what was named."""
+def _against(args: argparse.Namespace) -> Against:
+    """Give what the flights are compared with."""
+    if args.model:
+        return keep.load(args.model)[0]
+    card = card_of(args.airframe)
+    return learn(args.against, card) if args.against else OwnPast(args.against_own_past, card)
+
+
+def _page(reports: list[Report], against: Against, folder: Path) -> None:
+    """Write figures and page, and the simulation corrected by what was named where there is one for all flights."""
     from twin_worker.diagnose.figures import stems
     from twin_worker.diagnose.page import write
 
     folder.mkdir(exist_ok=True)
     for report, stem in zip(reports, stems([report.flight for report in reports]), strict=True):
-        if report.outcome is Outcome.NAMED:
-            keep.save(folder / f"{stem}.model.json", base, report.findings)
+        if report.outcome is Outcome.NAMED and isinstance(against, Baseline):
+            keep.save(folder / f"{stem}.model.json", against, report.findings)
     say(f"wrote {write(reports, folder)}")
 
 

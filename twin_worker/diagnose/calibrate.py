@@ -51,13 +51,27 @@ def calibrate(flights: Sequence[Flight], card: Card, say: Say = lambda word: Non
     base = replace(base, others=others)
     _believable(base)
     _alike(cases)
-    base = _with_noise(base, cases)
-    cases = [replaced(case, base) for case in cases]
+    return settled(base, cases, [fit_wind(case, np.zeros(4)) for case in cases], say)
+
+
+def settled(
+    base: Baseline, cases: Sequence[Case], winds: Sequence[np.ndarray], say: Say, level: bool = False
+) -> Baseline:
+    """Give the baseline with noise, spreads, usual residuals and chance learnt from flights left out.
+
+    Args:
+        base: fitted on all
+        cases: each flight as the others foretell it
+        winds: each flight's weather, (4,)
+        say: takes words of progress
+        level: each flight's mean residual is no noise
+    """
+    base = _with_noise(base, cases, winds, level)
     say("what nominal flights reach by chance")
     chance: dict[str, float] = {}
     usual = []
-    for case in cases:
-        sight = Sight(case, own_weather(case))
+    for case, w in zip(cases, winds, strict=True):
+        sight = Sight(replaced(case, base), wind(w) if is_weather(base) else ())
         usual.append(sight.left())
         for found in best(sight, ()):
             chance[found.kind] = max(chance.get(found.kind, 0.0), found.gain)
@@ -114,11 +128,12 @@ def own_weather(case: Case) -> tuple[Guess, ...]:
     return wind(fit_wind(case, np.zeros(4))) if is_weather(case.base) else ()
 
 
-def _with_noise(base: Baseline, cases: list[Case]) -> Baseline:
+def _with_noise(base: Baseline, cases: Sequence[Case], winds: Sequence[np.ndarray], level: bool) -> Baseline:
     """Learn noise, and the spread of every nuisance, from flights left out."""
-    winds = [fit_wind(case, np.zeros(4)) for case in cases]
     granted = [wind(w) for w in winds]
     rows = [case.residuals(g) for case, g in zip(cases, granted, strict=True)]
+    if level:
+        rows = [x - x[case.ok].mean(axis=0) for x, case in zip(rows, cases, strict=True)]
     several = nuisances(base.vane)
     slopes = [_slopes(case, g, x) for case, g, x in zip(cases, granted, rows, strict=True)]
     noise = _noise(rows, cases)
@@ -141,7 +156,7 @@ def _slopes(case: Case, granted: tuple[Guess, ...], rows: np.ndarray) -> np.ndar
 
 
 def _spreads(
-    noise: Noise, cases: list[Case], rows: list[np.ndarray], slopes: list[np.ndarray]
+    noise: Noise, cases: Sequence[Case], rows: list[np.ndarray], slopes: list[np.ndarray]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Learn the nuisances' standard deviations by expectation and maximisation; give them and each flight's values.
 
@@ -163,7 +178,7 @@ def _spreads(
     return spread, means
 
 
-def _noise(rows: list[np.ndarray], cases: list[Case]) -> Noise:
+def _noise(rows: list[np.ndarray], cases: Sequence[Case]) -> Noise:
     """Fit each channel's autoregression of order two and its innovations."""
     n = len(CHANNELS)
     ar, sigma = np.zeros((n, 2)), np.ones(n)

@@ -14,12 +14,12 @@ from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.residual import RHO_0, Case, Terms
 from twin_worker.diagnose.smooth import thinned
 
-_RIDGE = 3e-4  # pull of a coefficient towards zero, as a share of its term's length
+RIDGE = 3e-4  # pull of a coefficient towards zero, as a share of its term's length
 _ORDER, _WHITENINGS = 3, 1  # of the residuals' autoregression; rounds
 _ROUNDS = 2
 _FADED = 4.0  # residual rows that count as one: whitening is never whole
 _SHEAR = 1.0  # usual growth of wind with height [m/s per 100 m]
-_CORRELATED = 50.0  # residual rows that count as one
+CORRELATED = 50.0  # residual rows that count as one
 _SIDE = 0.5  # weight of sideslip in the wind fit [-]
 _CALM, _STILL = (
     np.array([0.0, 0.0, 1.0]),
@@ -35,8 +35,10 @@ def wind(w: np.ndarray) -> tuple[Guess, ...]:
     return Guess(known["wind_steady"], "", tuple(w[:2].tolist())), Guess(known["wind_shear"], "", tuple(w[2:].tolist()))
 
 
-def fit(flights: Sequence[Flight], card: Card, timing: Timing, vane: bool) -> tuple[Baseline, list[np.ndarray]]:
-    """Fit every equation, and the weather of each flight, (4,).
+def fit(
+    flights: Sequence[Flight], card: Card, timing: Timing, vane: bool, ridge: float = RIDGE
+) -> tuple[Baseline, list[np.ndarray]]:
+    """Fit every equation, and the weather of each flight, (4,); little data wants a stronger ridge.
 
     Raises:
         ValueError: when the flights do not excite an equation at all.
@@ -50,11 +52,10 @@ def fit(flights: Sequence[Flight], card: Card, timing: Timing, vane: bool) -> tu
         winds = [fit_wind(case, w) for case, w in zip(cases, winds, strict=True)]
         made = [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)]
         base = replace(base, airspeed=_airspeed(cases, made))
-        base = replace(
-            base, coef={"alpha": _solve(_Rows(cases, made, "alpha"), 0)[0], "beta": _side(cases, made, vane)}
-        )
+        alpha = _solve(Rows(cases, made, "alpha", ridge), 0)[0]
+        base = replace(base, coef={"alpha": alpha, "beta": _side(Rows(cases, made, "beta", ridge), made, vane)})
         cases = _with(cases, base)
-        base = _moments(cases, [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)], base)
+        base = _moments(cases, [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)], base, ridge)
         cases = _with(cases, base)
     return base, winds
 
@@ -63,27 +64,26 @@ def _with(cases: list[Case], base: Baseline) -> list[Case]:
     return [Case(case.flight, base, like=case) for case in cases]
 
 
-def _moments(cases: list[Case], made: list[Terms], base: Baseline) -> Baseline:
+def _moments(cases: list[Case], made: list[Terms], base: Baseline, ridge: float) -> Baseline:
     """Fit forces and moments, the flow angles given."""
     coef, r2 = dict(base.coef), {}
-    both, r2["X"] = _solve(_axial(cases, made), 0)
+    both, r2["X"] = _solve(axial(cases, made, ridge), 0)
     coef["X"], coef["T"] = both[: len(eq.X)], both[len(eq.X) :]
-    coef["M"], r2["M"] = _solve(_pitch(cases, made, coef))
+    coef["M"], r2["M"] = _solve(pitch(cases, made, coef, ridge))
     for name in ("L", "N"):
-        coef[name], r2[name] = _solve(_Rows(cases, made, name))
+        coef[name], r2[name] = _solve(Rows(cases, made, name, ridge))
     for name in ("alpha", "beta"):
-        rows = _Rows(cases, made, name)
+        rows = Rows(cases, made, name)
         r2[name] = _r2(rows.A[rows.ok] @ coef[name], rows.y[rows.ok])
     return replace(base, coef=coef, r2=r2)
 
 
-def _side(cases: list[Case], made: list[Terms], vane: bool) -> np.ndarray:
+def _side(rows: "Rows", made: list[Terms], vane: bool) -> np.ndarray:
     """Fit sideslip: by the accelerometer, side force on measured sideslip, turned round.
 
     Sideslip over the ground lacks the gusts that the side force feels: regressed on the force it would be shrunk. A
     side force taken from the velocity is noisy itself: there sideslip is regressed on it.
     """
-    rows = _Rows(cases, made, "beta")
     if not vane:
         return _solve(rows, 0)[0]
     force = rows.A[:, 1].copy()
@@ -93,12 +93,18 @@ def _side(cases: list[Case], made: list[Terms], vane: bool) -> np.ndarray:
     return np.array([-c[0], 1.0, *(-c[2:])]) / c[1]
 
 
-class _Rows:
+class Rows:
     """An equation's terms, dimensional, (n, k), and measured side, (n,), over all flights; which rows to trust."""
 
     def __init__(
-        self, cases: list[Case], made: list[Terms], name: str, more: Callable[[Terms], np.ndarray] | None = None
+        self,
+        cases: list[Case],
+        made: list[Terms],
+        name: str,
+        ridge: float = RIDGE,
+        more: Callable[[Terms], np.ndarray] | None = None,
     ) -> None:
+        self.ridge = ridge
         A, y, ok, whole = [], [], [], []
         for case, m in zip(cases, made, strict=True):
             rows = m.terms[name] * m.scale.get(name, 1.0)
@@ -115,6 +121,10 @@ class _Rows:
         self.usual = np.array(eq.USUAL[name] if known and name in eq.USUAL else [np.inf] * self.A.shape[1])
         self.ok, self.whole = np.concatenate(ok), np.concatenate(whole)
 
+    def told(self, x: np.ndarray) -> np.ndarray:
+        """Give measured less simulated on trusted rows, (m,)."""
+        return (self.y - self.A @ x)[self.ok]
+
     def whitener(self, x: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """Give the filter that whitens the residuals of these coefficients."""
         e = self.y - self.A @ x
@@ -123,22 +133,22 @@ class _Rows:
         return lambda z: z - sum(a * np.roll(z, k + 1, axis=0) for k, a in enumerate(ar))
 
 
-def _solve(rows: _Rows, whitenings: int = _WHITENINGS) -> tuple[np.ndarray, float]:
+def _solve(rows: Rows, whitenings: int = _WHITENINGS) -> tuple[np.ndarray, float]:
     """Solve by generalised least squares; give coefficients and the share of variance explained.
 
     The residuals of a flight in gusts, under an autopilot that answers them, are coloured, and plain least squares
     shrinks the derivatives: both sides are filtered by the residuals' own autoregression.
     Source: Clarke 1967 (generalised least squares); Klein & Morelli 2006, section 5.2.
     """
-    x = _ridge(rows.A[rows.ok], rows.y[rows.ok], rows.usual, _CORRELATED)
+    x = _ridge(rows.A[rows.ok], rows.y[rows.ok], rows, CORRELATED)
     r2 = _r2(rows.A[rows.ok] @ x, rows.y[rows.ok])
     for _ in range(whitenings):
         white = rows.whitener(x)
-        x = _ridge(white(rows.A)[rows.whole], white(rows.y)[rows.whole], rows.usual, _FADED)
+        x = _ridge(white(rows.A)[rows.whole], white(rows.y)[rows.whole], rows, _FADED)
     return x, r2
 
 
-def _surprise(rows: _Rows) -> float:
+def _surprise(rows: Rows) -> float:
     """Give the logarithm of the innovations' variance after the fit."""
     x, _ = _solve(rows)
     return float(np.log(np.var(rows.whitener(x)(rows.y - rows.A @ x)[rows.whole])))
@@ -148,19 +158,19 @@ def _r2(fitted: np.ndarray, y: np.ndarray) -> float:
     return float(1.0 - ((y - fitted) ** 2).sum() / max(((y - y.mean()) ** 2).sum(), 1e-12))
 
 
-def _ridge(A: np.ndarray, y: np.ndarray, usual: np.ndarray, as_one: float) -> np.ndarray:
+def _ridge(A: np.ndarray, y: np.ndarray, of: Rows, as_one: float) -> np.ndarray:
     """Solve by least squares, held to zero a little, and to what is usual as far as the residuals leave it open.
 
     `as_one` residual rows count as one.
     """
     length = np.linalg.norm(A, axis=0) + 1e-12
     k = A.shape[1]
-    pull = np.full(k, _RIDGE)
+    pull = np.full(k, of.ridge)
     for _ in range(2):
         rows, told = np.vstack([A / length, np.diag(pull)]), np.concatenate([y, np.zeros(k)])
         x = np.linalg.lstsq(rows, told, rcond=None)[0] / length
         noise = np.sqrt(as_one * np.mean((y - A @ x) ** 2))
-        pull = np.maximum(_RIDGE, noise / (usual * length))
+        pull = np.maximum(of.ridge, noise / (of.usual * length))
     return x
 
 
@@ -222,7 +232,7 @@ def fit_wind(case: Case, w: np.ndarray) -> np.ndarray:
         r = miss(w)
         J = np.stack([(miss(w + 0.3 * e) - r) / 0.3 for e in np.eye(4)], axis=1)
         weight = 1.0 / (1.0 + r * r)
-        pull = np.diag([1e-6, 1e-6, *(2 * [(weight * r * r).mean() * _CORRELATED / _SHEAR**2])])
+        pull = np.diag([1e-6, 1e-6, *(2 * [(weight * r * r).mean() * CORRELATED / _SHEAR**2])])
         change = -np.linalg.solve((J.T * weight) @ J + pull, (J.T * weight) @ r + pull @ w)
         w = w + np.clip(change, -4.0, 4.0)
         if np.abs(change).max() < 0.01:
@@ -244,10 +254,10 @@ def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
         """Give what pitch and yaw leave unexplained, and axial force."""
         timed = _with(cases, replace(base, timing=timing))
         made = [case.terms(wind(w)) for case, w in zip(timed, winds, strict=True)]
-        axial = _axial(timed, made)
-        coef = {"T": _solve(axial, 0)[0][len(eq.X) :]}
-        yaw = _Rows(timed, made, "N")
-        return {"servo": _surprise(_pitch(timed, made, coef)) + _surprise(yaw), "engine": _surprise(axial)}
+        along = axial(timed, made)
+        coef = {"T": _solve(along, 0)[0][len(eq.X) :]}
+        yaw = Rows(timed, made, "N")
+        return {"servo": _surprise(pitch(timed, made, coef)) + _surprise(yaw), "engine": _surprise(along)}
 
     # a longer lag looks much like a longer delay: one after the other stops beside the best pair
     pairs = [replace(best, servo=servo, delay=delay) for servo in _LAGS for delay in _DELAYS]
@@ -256,9 +266,11 @@ def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
     return best
 
 
-def _pitch(cases: list[Case], made: list[Terms], coef: dict[str, np.ndarray]) -> _Rows:
-    return _Rows(cases, made, "M", more=lambda m: (coef["T"] @ m.terms["T"])[None])
+def pitch(cases: list[Case], made: list[Terms], coef: dict[str, np.ndarray], ridge: float = RIDGE) -> Rows:
+    """Give the rows of the pitching moment, thrust's own among its terms."""
+    return Rows(cases, made, "M", ridge, more=lambda m: (coef["T"] @ m.terms["T"])[None])
 
 
-def _axial(cases: list[Case], made: list[Terms]) -> _Rows:
-    return _Rows(cases, made, "X", more=lambda m: m.terms["T"])
+def axial(cases: list[Case], made: list[Terms], ridge: float = RIDGE) -> Rows:
+    """Give the rows of axial force, drag's terms before those of thrust."""
+    return Rows(cases, made, "X", ridge, more=lambda m: m.terms["T"])

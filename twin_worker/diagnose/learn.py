@@ -14,6 +14,7 @@ from twin_worker.diagnose.card import UNKNOWN, Card, read
 from twin_worker.diagnose.diagnose import uncovered
 from twin_worker.diagnose.flight import Flight, read_flights
 from twin_worker.diagnose.keep import save
+from twin_worker.diagnose.past import before, calibrate_past
 
 
 def say(word: str) -> None:
@@ -43,9 +44,15 @@ def flights_of(files: Sequence[Path], card: Card) -> list[Flight]:
     return found
 
 
-def learn(files: Sequence[Path], card: Card) -> Baseline:
-    """Calibrate on recordings."""
-    base = calibrate(flights_of(files, card), card, say)
+def learn(files: Sequence[Path], card: Card, until: float | None = None) -> Baseline:
+    """Calibrate on recordings, or on what each did before `until` [s, on its own clock]; one flight on its own past."""
+    flights = flights_of(files, card)
+    if until is None:
+        base = calibrate(flights, card, say)
+    elif len(flights) == 1:
+        base = calibrate_past(flights[0], until, card, say)
+    else:
+        base = calibrate([before(flight, until) for flight in flights], card, say)
     for sentence in uncovered(base):
         say(sentence)
     return base
@@ -54,7 +61,7 @@ def learn(files: Sequence[Path], card: Card) -> Baseline:
 def _run(args: argparse.Namespace) -> int:
     if not args.out.absolute().parent.is_dir():
         raise ValueError(f"--out: found no folder {str(args.out.parent)!r}, expected one; make it first")
-    base = learn(args.file, card_of(args.airframe))
+    base = learn(args.file, card_of(args.airframe), args.until)
     save(args.out, base)
     explained = ", ".join(f"{name} {x:.0%}" for name, x in base.r2.items())
     print(f"{args.out.name}: calibrated on {len(base.flights)} flights; explained: {explained}")

@@ -3,53 +3,57 @@
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.diagnose import diagnose
 from twin_worker.diagnose.flight import Flight, read_flights
+from twin_worker.diagnose.past import OwnPast
 from twin_worker.diagnose.report import Report
 
 Say = Callable[[str], None]
+Against = Baseline | OwnPast
 Told = tuple[list[Report], str]  # of one task: its flights' reports, and why it was refused, or empty
 
 
-def shared(tasks: Sequence[Path | Flight], base: Baseline, jobs: int, say: Say) -> Iterator[Told]:
+def shared(tasks: Sequence[Path | Flight], against: Against, jobs: int, say: Say) -> Iterator[Told]:
     """Diagnose every recording or flight, in order; one that is refused loses no other.
 
     Args:
         tasks: recordings, or flights
-        base: the calibrated simulation
+        against: the calibrated simulation, or how much of each flight's own past to calibrate one on
         jobs: processes
         say: takes words of progress, where there is one process
     """
     if jobs == 1:
-        yield from (_told(task, base, say) for task in tasks)
+        yield from (_told(task, against, say) for task in tasks)
         return
-    with multiprocessing.get_context("spawn").Pool(jobs, _begin, (base,)) as pool:
+    with multiprocessing.get_context("spawn").Pool(jobs, _begin, (against,)) as pool:
         yield from pool.imap(_task, tasks)
 
 
-_base: Baseline
+_against: Against
 
 
-def _begin(base: Baseline) -> None:
+def _begin(against: Against) -> None:
     """Begin a process of the pool: Ctrl-C is the parent's business."""
-    global _base
-    _base = base
+    global _against
+    _against = against
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _task(task: Path | Flight) -> Told:
-    return _told(task, _base, lambda word: None)
+    return _told(task, _against, lambda word: None)
 
 
-def _told(task: Path | Flight, base: Baseline, say: Say) -> Told:
+def _told(task: Path | Flight, against: Against, say: Say) -> Told:
     reports: list[Report] = []
     try:
-        for flight in [task] if isinstance(task, Flight) else read_flights(task, base.card):
+        for flight in [task] if isinstance(task, Flight) else read_flights(task, against.card):
             say(f"{flight.name}: {flight.seconds:.0f} s of flight")
-            reports.append(diagnose(flight, base, say))
+            judge = against.diagnose if isinstance(against, OwnPast) else partial(diagnose, base=against)
+            reports.append(judge(flight, say=say))
     except (ValueError, OSError) as error:
         return reports, str(error)
     return reports, ""

@@ -1,0 +1,100 @@
+"""Flights judged by their own past: changes found, nominal flights left in peace, what a past cannot tell said."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin_worker.diagnose import __main__ as diagnosis
+from twin_worker.diagnose import keep, learn
+from twin_worker.diagnose.card import read
+from twin_worker.diagnose.flight import Flight, read_flights
+from twin_worker.diagnose.past import OwnPast, before, calibrate_past, since, split
+from twin_worker.diagnose.report import Outcome, Report
+from twin_worker.diagnose.share import shared
+
+pytestmark = pytest.mark.recordings
+CARD = read(Path("skywalker"))
+UNTIL_S = 130.0
+ZERO_S = 2.045  # boot time of each flight's first attitude [s]
+CHANGED = {  # flight -> effect and what it is not told from, boot time of the change [s]
+    "s04_wind_step": ({"wind_steady"}, 266.2),
+    "s05_engine_75": ({"thrust_loss", "drag_increase"}, 246.08),
+    "s07_servo_slow": ({"actuator_lag"}, 236.14),
+    "s08_airspeed_ratio": ({"airspeed_scale", "airspeed_bias"}, 216.12),
+}
+NOMINAL = ("s03_nominal_modes", "s10_multi3_nominal")
+
+
+@pytest.fixture(scope="module")
+def sitl(recordings: Path) -> Path:
+    return recordings / "sitl"
+
+
+@pytest.fixture(scope="module")
+def reports(sitl: Path) -> dict[str, Report]:
+    files = [sitl / f"{name}.tlog.xz" for name in (*CHANGED, *NOMINAL)]
+    return {one.flight: one for found, _ in shared(files, OwnPast(UNTIL_S, CARD), 2, print) for one in found}
+
+
+@pytest.fixture(scope="module")
+def flight(sitl: Path) -> Flight:
+    return read_flights(sitl / "s07_servo_slow.tlog.xz", CARD)[0]
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_a_change_is_named_and_dated_by_the_flights_own_past(name: str, reports: dict[str, Report]) -> None:
+    effects, boot = CHANGED[name]
+    report = reports[name]
+    assert report.outcome is Outcome.NAMED and len(report.findings) == 1, report.sentence
+    found = report.findings[0]
+    assert {found.guess.effect.name, *found.rivals} <= effects, report.sentence
+    assert abs(found.segments[0][0] - (boot - ZERO_S)) <= 1.5, report.sentence
+    assert any("of its own past: what was there from the start is no finding" in word for word in report.lacks)
+
+
+def test_nominal_flights_are_left_in_peace(reports: dict[str, Report]) -> None:
+    nominal = [report for name, report in reports.items() if name.startswith(NOMINAL)]
+    assert len(nominal) == 4
+    for report in nominal:
+        assert report.outcome is Outcome.NONE, report.sentence
+
+
+def test_axes_the_past_does_not_foretell_are_said(reports: dict[str, Report]) -> None:
+    assert any("yaw not covered" in word for word in reports["s03_nominal_modes"].lacks)
+
+
+def test_pieces_share_no_instant_and_leave_none_out(flight: Flight) -> None:
+    past = before(flight, UNTIL_S)
+    count = np.sum([piece.ok for piece in split(past)], axis=0)
+    assert (count[past.ok] == 1).all() and not count[~past.ok].any()
+    assert past.t[-1] < UNTIL_S <= since(flight, UNTIL_S).t[0]
+    assert len(past.t) + len(since(flight, UNTIL_S).t) == len(flight.t)
+
+
+def test_the_part_to_diagnose_keeps_the_flights_clock(flight: Flight) -> None:
+    later = since(flight, 100.0)
+    assert later.t[0] >= 100.0 and later.zero == flight.zero and len(later.readings["phi"]) == len(later.t)
+    assert later.commands.shape == (len(later.t), 4) and later.place.shape == (len(later.t), 2)
+
+
+def test_a_past_too_short_is_refused(flight: Flight) -> None:
+    with pytest.raises(ValueError, match=r"found 25 s of trusted flight before 65 s, expected 40 s at least"):
+        calibrate_past(flight, 65.0, CARD)
+    with pytest.raises(ValueError, match=r"found 0 s of trusted flight after 589 s.*trust a shorter past"):
+        OwnPast(589.0, CARD).diagnose(flight)
+
+
+def test_a_model_of_the_own_past_is_written_and_loaded(sitl: Path, tmp_path: Path) -> None:
+    out = tmp_path / "own.json"
+    file = str(sitl / "s02_nominal_light_wind.tlog.xz")
+    assert learn.main([file, "--until", "110", "--airframe", "skywalker", "--out", str(out)]) == 0
+    base, _ = keep.load(out)
+    assert base.others and base.chance["drag_increase|always"] > 1e8 > base.chance["drag_increase|step"] >= 400.0
+
+
+def test_it_is_one_thing_that_flights_are_compared_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert diagnosis.main(["a.tlog", "--model", "m.json", "--against-own-past", "90"]) == 2
+    assert "either --model or --against or --against-own-past" in capsys.readouterr().err
+    assert diagnosis.main(["a.tlog", "--against-own-past", "-3"]) == 2
+    assert "--against-own-past: found -3" in capsys.readouterr().err

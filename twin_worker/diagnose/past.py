@@ -1,0 +1,222 @@
+"""Calibrate on a flight's own trusted past, so that what follows can be diagnosed without any other flight.
+
+A short past excites few axes. What it leaves open stays open: every direction in which the coefficients are doubtful,
+and which the rest of the flight makes use of, is a nuisance; an equation that does not foretell the pieces left out is
+not covered; what was there from the start is part of the baseline, and never a finding.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleet.effects import Onset, catalogue
+from twin_worker.diagnose import equations as eq
+from twin_worker.diagnose.baseline import CHANNELS, Baseline, Noise
+from twin_worker.diagnose.calibrate import settled
+from twin_worker.diagnose.card import Card
+from twin_worker.diagnose.diagnose import diagnose
+from twin_worker.diagnose.fit import CORRELATED, Rows, axial, fit, fit_timing, pitch, wind
+from twin_worker.diagnose.flight import Flight
+from twin_worker.diagnose.report import Report
+from twin_worker.diagnose.residual import Case, Terms
+
+PIECES = 4  # of the past, each foretold by the others
+LEAST_S = 40.0  # of trusted past
+LEAST_AFTER_S = 10.0  # of trusted flight to diagnose
+BEFORE_S = 30.0  # of the past stay in what is diagnosed, so that an onset has something before it
+NEVER = 1e9  # gain that nothing reaches
+_RIDGE = 0.02  # little data determine few numbers
+_FADED = 4.0  # rows that count as one where the coefficients' doubt is reckoned: whitening is never whole
+_SHOWS = 0.1  # of an equation's own scatter, from which a doubtful direction is kept
+_LEAST_GAIN = 400.0  # of any effect
+_WIND = 2.5  # a mean wind is weather, and known no better [m/s]
+_AIRSPEED = 0.3  # least scatter of airspeed [m/s]
+_PRIOR = (0.1, 10.0, 10.0, 1.0, 1.0)  # of airspeed's scale, of wind [m/s], of its growth with height [m/s per 100 m]
+_DEAF = 1e6  # noise of a channel that says nothing
+_CHANNEL = {"X": "force_x", "beta": "side", "alpha": "lift", "L": "roll", "M": "pitch", "N": "yaw"}
+
+Say = Callable[[str], None]
+
+
+def calibrate_past(flight: Flight, until: float, card: Card, say: Say = lambda word: None) -> Baseline:
+    """Calibrate on what a flight did before `until` [s, on its own clock].
+
+    Raises:
+        ValueError: when that holds too little flight; the sentence says how much.
+    """
+    past = before(flight, until)
+    if past.seconds < LEAST_S:
+        raise ValueError(
+            f"{flight.name}: found {past.seconds:.0f} s of trusted flight before {until:.0f} s, expected "
+            f"{LEAST_S:.0f} s at least; trust a longer past, or calibrate on other flights"
+        )
+    say(f"{flight.name}: its own past, {past.seconds:.0f} s of trusted flight")
+    timing = fit_timing([past], card, past.vane)
+    card = replace(card, body=replace(card.body, lag=timing.servo + timing.delay))
+    base, (weather,) = fit([past], card, timing, past.vane, _RIDGE)
+    pieces = split(past)
+    cases, winds = [], []
+    for piece in pieces:
+        rest = replace(past, ok=past.ok & ~piece.ok)
+        without, (w,) = fit([rest], card, timing, past.vane, _RIDGE)
+        cases.append(Case(piece, without))
+        winds.append(w)
+    base = replace(base, others=_doubts(flight, past, base, weather), r2=_foretold(cases, winds))
+    base = settled(base, cases, winds, say, level=True)
+    later = since(flight, until).seconds
+    return replace(
+        base,
+        noise=_muted(base),
+        spread=base.spread | _weather(Case(past, base), weather),
+        chance=_chance(base, max(later, past.seconds) * len(pieces) / past.seconds),
+    )
+
+
+def before(flight: Flight, until: float) -> Flight:
+    """Give the part of a flight before `until` [s, on its own clock]."""
+    return _part(flight, slice(0, int(np.searchsorted(flight.t, until))))
+
+
+def since(flight: Flight, start: float) -> Flight:
+    """Give the part of a flight from `start` on [s, on its own clock]."""
+    return _part(flight, slice(int(np.searchsorted(flight.t, start)), None))
+
+
+def _part(flight: Flight, rows: slice) -> Flight:
+    readings = {name: x[rows] for name, x in flight.readings.items()}
+    t, commands, place, ok = (x[rows] for x in (flight.t, flight.commands, flight.place, flight.ok))
+    return replace(flight, t=t, readings=readings, commands=commands, place=place, ok=ok)
+
+
+@dataclass(frozen=True)
+class OwnPast:
+    """What to judge a flight by: what it did itself before `until` [s, on its own clock], as this aircraft."""
+
+    until: float
+    card: Card
+
+    def diagnose(self, flight: Flight, say: Say = lambda word: None) -> Report:
+        """Diagnose what the flight did after that by what it did before.
+
+        Raises:
+            ValueError: when there is too little before or after; the sentence says how much.
+        """
+        after = since(flight, self.until).seconds
+        if after < LEAST_AFTER_S:
+            raise ValueError(
+                f"{flight.name}: found {after:.0f} s of trusted flight after {self.until:.0f} s, expected "
+                f"{LEAST_AFTER_S:.0f} s at least to diagnose; trust a shorter past"
+            )
+        base = calibrate_past(flight, self.until, self.card, say)
+        told = (
+            f"calibrated on {flight.seconds - after:.0f} s of its own past: what was there from the start is no "
+            "finding, a mean wind is weather, and the barometer is not judged"
+        )
+        later = since(flight, self.until - BEFORE_S)
+        return diagnose(replace(later, lacks=(*flight.lacks, told)), base, say)
+
+
+def split(past: Flight, pieces: int = PIECES) -> list[Flight]:
+    """Give pieces of equal trusted length, each trusted where the others are not."""
+    edges = np.quantile(past.t[past.ok], np.linspace(0.0, 1.0, pieces + 1)[1:-1])
+    which = np.searchsorted(edges, past.t, side="right")
+    return [replace(past, ok=past.ok & (which == k)) for k in range(pieces)]
+
+
+def _rows(cases: list[Case], made: list[Terms]) -> dict[str, Rows]:
+    """Give the rows of every equation that is fitted on its own."""
+    coef = cases[0].base.coef
+    out = {name: Rows(cases, made, name) for name in ("alpha", "beta", "L", "N")}
+    return out | {"X": axial(cases, made), "M": pitch(cases, made, coef)}
+
+
+def _joined(coef: dict[str, np.ndarray], name: str) -> np.ndarray:
+    return np.concatenate([coef["X"], coef["T"]]) if name == "X" else coef[name]
+
+
+def _foretold(cases: list[Case], winds: list[np.ndarray]) -> dict[str, float]:
+    """Give the share of variance of every equation that the other pieces foretell."""
+    missed: dict[str, list[np.ndarray]] = {}
+    told: dict[str, list[np.ndarray]] = {}
+    for case, w in zip(cases, winds, strict=True):
+        for name, rows in _rows([case], [case.terms(wind(w))]).items():
+            for kept, x in ((missed, rows.told(_joined(case.base.coef, name))), (told, rows.y[rows.ok])):
+                kept.setdefault(name, []).append(x - x.mean())  # trim may differ
+    sums = {name: [float((np.concatenate(kept[name]) ** 2).sum()) for kept in (missed, told)] for name in missed}
+    return {name: 1.0 - left / max(whole, 1e-12) for name, (left, whole) in sums.items()}
+
+
+def _doubts(flight: Flight, past: Flight, base: Baseline, weather: np.ndarray) -> tuple[dict[str, np.ndarray], ...]:
+    """Give the directions in which coefficients may be wrong by one standard deviation, those the flight makes use of.
+
+    The posterior of each equation's coefficients under a prior as wide as each term alone explaining everything,
+    turned to the axes along which it is felt most on the whole flight.
+    Source: Klein & Morelli 2006, section 5.1 (Bayesian estimation); Golub & Van Loan 2013, section 8.7.
+    """
+    here, whole = Case(past, base), Case(flight, base)
+    known, used = (_rows([case], [case.terms(wind(weather))]) for case in (here, whole))
+    out = []
+    for name, rows in known.items():
+        x = _joined(base.coef, name)
+        white = rows.whitener(x)
+        A, e = white(rows.A)[rows.whole], white(rows.y - rows.A @ x)[rows.whole]
+        widest = np.sqrt((rows.y[rows.ok] ** 2).mean() / ((rows.A[rows.ok] ** 2).mean(axis=0) + 1e-12))
+        precision = A.T @ A / (_FADED * e.var()) + np.diag(widest**-2.0)
+        root = np.linalg.cholesky(np.linalg.inv(precision))
+        B = used[name].A[used[name].ok] @ root
+        felt, turned = np.linalg.eigh(B.T @ B / len(B))
+        kept = np.sqrt(np.maximum(felt, 0.0)) > _SHOWS * rows.told(x).std()
+        out += [_direction(base, name, d) for d in (root @ turned[:, kept]).T]
+    return tuple(out)
+
+
+def _direction(base: Baseline, name: str, d: np.ndarray) -> dict[str, np.ndarray]:
+    out = {equation: np.zeros_like(x) for equation, x in base.coef.items()}
+    if name == "X":
+        return out | {"X": d[: len(eq.X)], "T": d[len(eq.X) :]}
+    return out | {name: d}
+
+
+def _muted(base: Baseline) -> Noise:
+    """Give the noise, channels that the past foretells worse than not at all made deaf.
+
+    A barometer drifts over minutes: pieces of the past are too short to tell by how much.
+    """
+    deaf = [CHANNELS.index(name) for name in ("baro", *(_CHANNEL[of] for of, share in base.r2.items() if share < 0.0))]
+    sigma = base.noise.sigma.copy()
+    sigma[deaf] = _DEAF
+    return Noise(base.noise.ar, sigma)
+
+
+def _weather(case: Case, weather: np.ndarray) -> dict[str, float]:
+    """Give spreads that leave open what the past cannot tell: wind, and airspeed's scale without turns to and fro.
+
+    Airspeed on the headings and at the heights flown tells scale, wind and its growth with height together.
+    """
+    s, flow = case.sensed(()), case.terms(wind(weather)).flow
+    along = np.array([s["v_n"], s["v_e"]]) / np.maximum(np.hypot(s["v_n"], s["v_e"]), 1.0)
+    H = np.stack([flow.Va, *along, *(along * flow.height / 100.0)], axis=1)[case.ok]
+    e = case.residuals(wind(weather))[case.ok, CHANNELS.index("airspeed")]
+    precision = H.T @ H / (CORRELATED * max(e.var(), _AIRSPEED**2)) + np.diag(np.array(_PRIOR) ** -2.0)
+    scale = float(np.sqrt(np.linalg.inv(precision)[0, 0]))
+    out = {"airspeed_scale:log_scale": max(scale, case.base.spread["airspeed_scale:log_scale"])}
+    for axis in ("w_n", "w_e"):
+        out[f"wind_steady:{axis}"] = max(_WIND, case.base.spread[f"wind_steady:{axis}"])
+    return out
+
+
+def _chance(base: Baseline, longer: float) -> dict[str, float]:
+    """Give what the rest of the flight may reach by chance, pieces being so many times shorter.
+
+    What acts all along acted in the past: it is part of the baseline.
+    """
+    out = {kind: max(_LEAST_GAIN, longer * gain) for kind, gain in base.chance.items()}
+    for effect in catalogue().values():
+        for of in effect.of or ("",):
+            label = f"{effect.name}:{of}" if of else effect.name
+            for onset in effect.onsets:
+                out.setdefault(f"{label}|{onset}", _LEAST_GAIN)
+                if onset is Onset.ALWAYS:
+                    out[f"{label}|{onset}"] = NEVER
+    return out
