@@ -13,6 +13,7 @@ EXAMPLES = """
   fleet diagnose flight.tlog --model skywalker.json
   fleet diagnose friday/*.tlog.xz --model skywalker.json --json friday.json --report friday
   fleet diagnose flight.tlog --against-own-past 120     no other flight: its first two minutes are trusted
+  fleet diagnose flight.tlog --model skywalker.json --conceal airspeed       what is found without being told
   fleet diagnose real.tlog --against simulated.tlog --airframe skywalker     your own simulator is what gets corrected
 """
 
@@ -31,6 +32,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="or what each flight did itself before SECONDS on its clock; no corrected models are written then",
     )
     parser.add_argument("--airframe", type=Path, metavar="CARD", help="without --model: the aircraft, as for calibrate")
+    parser.add_argument(
+        "--conceal",
+        default="",
+        metavar="A,B",
+        help="do not look at these in the flights to diagnose: airspeed, wind, battery, imu, pressure, gnss, "
+        "throttle, aileron, elevator, rudder",
+    )
     parser.add_argument("--json", type=Path, metavar="OUT", help="write verdicts to OUT, predictions beside it")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that share the recordings (1)")
     parser.add_argument(
@@ -61,7 +69,10 @@ def run(args: argparse.Namespace) -> int:
     """Start the diagnosis; its exit code is ours."""
     check(args)
     stop = stop_on_signal()
-    given = {name: getattr(args, name) for name in ("model", "airframe", "json", "report", "jobs", "against_own_past")}
+    given = {
+        name: getattr(args, name)
+        for name in ("model", "airframe", "json", "report", "jobs", "against_own_past", "conceal")
+    }
     options = [f"--{name.replace('_', '-')}={value}" for name, value in given.items() if value]
     simulated = ["--against", *map(str, args.against)] if args.against else []
     code = run_until(stop, "twin_worker.diagnose", *options, *simulated, "--", *map(str, args.file))

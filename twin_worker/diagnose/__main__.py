@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fleet.cli import guarded, parser_for
 from fleet.commands.diagnose import EXAMPLES, arguments, check
-from twin_worker.diagnose import keep, written
+from twin_worker.diagnose import hidden, keep, written
 from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.learn import card_of, learn, say
 from twin_worker.diagnose.past import OwnPast
@@ -16,10 +16,12 @@ from twin_worker.diagnose.share import Against, shared
 
 def _run(args: argparse.Namespace) -> int:
     check(args)
+    args.conceal = tuple(filter(None, args.conceal.split(",")))
+    hidden.check(args.conceal)
     against = _against(args)
     reports: list[Report] = []
     refused = 0
-    for found, why in shared(args.file, against, args.jobs, say):
+    for found, why in shared(args.file, against, args.jobs, say, args.conceal):
         for report in found:
             print(f"{report.flight}: {report.sentence}", flush=True)
         reports += found

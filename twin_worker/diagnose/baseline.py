@@ -1,5 +1,6 @@
 """The calibrated simulation: coefficients of every equation, timing, noise, spread from flight to flight."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -81,3 +82,18 @@ class Baseline:
         """Give the baseline with its coefficients moved towards those of the k-th left out."""
         coef = {name: x + self.others[k][name] for name, x in self.coef.items()}
         return replace(self, coef=coef)
+
+
+SHOWN_BY = {"X": "force_x", "beta": "side", "alpha": "lift", "L": "roll", "M": "pitch", "N": "yaw"}
+"""Equation -> channel of its residual."""
+
+DEAF = 1e6  # noise of a channel that says nothing
+
+
+def silenced(base: Baseline, equations: Iterable[str]) -> Baseline:
+    """Give a baseline in which some equations are not judged, their residuals counting for nothing."""
+    sigma, r2 = base.noise.sigma.copy(), dict(base.r2)
+    for name in equations:
+        sigma[CHANNELS.index(SHOWN_BY[name])] = DEAF
+        r2[name] = min(r2.get(name, 0.0), 0.0)
+    return replace(base, noise=Noise(base.noise.ar, sigma), r2=r2)

@@ -14,7 +14,9 @@ from twin_worker.history import History
 
 VANE_HZ = 18.0  # from here on the accelerometer is the vane; slower samples alias gusts [Hz]
 _SEA_LEVEL, _LAPSE, _POWER = 101325.0, 2.25577e-5, 5.2559  # ISA: p = p0 (1 - lapse h)^power  [Pa, 1/m, -]
-_WIDEST = {"attitude": 0.25, "velocity": 0.45, "servo": 0.3, "air": 0.7}  # gaps that are filled [s]
+_WIDEST = {"attitude": 0.25, "velocity": 0.45, "servo": 0.3, "air": 0.7}  # gaps that are filled [s]; or
+_SLOW = 1.9  # so many usual ones where telemetry is slower than that
+_FASTER = 0.5  # gaps of gyros over those of attitude, from which rates are theirs
 _AROUND_GAP_S = 0.3
 _SETTLE_S = 5.0, 1.5  # left out at the start and at the end [s]
 _LEAST_S = 25.0  # of trusted flight
@@ -30,7 +32,8 @@ class Flight:
         name: of the recording
         t: since its first attitude, equally spaced, (n,) [s]
         zero: that first instant [s since 1970]
-        readings: by the names in `fleet.effects.READINGS`, (n,) each, psi unwrapped; and gnss, the satellites' height
+        readings: by the names in `fleet.effects.READINGS`, (n,) each, psi unwrapped; also gnss, the satellites'
+            height, and low, slow: wanted less flown, height [m] and airspeed [m/s]
         commands: delta_a delta_e delta_r delta_t as commanded, (n, 4) [-]
         place: north and east from the first position, (n, 2) [m]
         ground: height of home above mean sea level [m]
@@ -144,16 +147,21 @@ def _readings(
     if len(imu_t) > 50:
         out |= dict(zip(("a_x", "a_y", "a_z"), _on(t, (imu_t, imu[:, :3]), zero).T, strict=True))
         gyros = _on(t, (imu_t, imu[:, 3:]), zero)
-        if vane:
+        if vane or usual < _FASTER * float(np.median(np.diff(at))):
             out |= dict(zip(("p", "q", "r"), gyros.T, strict=True))
     if not vane:
         rate = "no accelerometer" if not np.isfinite(usual) else f"the accelerometer at {1 / usual:.0f} Hz"
         lacks.append(f"{rate}: forces are taken from the velocity; gusts and small changes of lift are seen less well")
+    if (gap := float(np.median(np.diff(at)))) > _WIDEST["attitude"]:
+        lacks.append(f"attitude at {1 / gap:.1f} Hz: only what lasts several seconds is seen")
     air_t, air = rows["air"]
     if len(air_t) > 50 and np.ptp(air[:, 0]) > 0.5:
         out["Va"] = np.interp(t, air_t - zero, air[:, 0])
     else:
         lacks.append("no airspeed: wind, air density and the airspeed sensor cannot be told apart, nor wind from none")
+    wanted_t, wanted = history.rows("command")
+    if len(wanted_t) > 50:
+        out |= dict(zip(("low", "slow"), _on(t, (wanted_t, wanted[:, 3:5]), zero).T, strict=True))
     pressure_t, pressure = history.rows("pressure")
     if len(pressure_t) > 20:
         height = (1.0 - (np.clip(pressure[:, 0], 2e4, 1.2e5) / _SEA_LEVEL) ** (1 / _POWER)) / _LAPSE
@@ -187,7 +195,9 @@ def _trusted(
         at = rows[kind][0] - zero
         if len(at) < 50:
             continue
-        for k in np.flatnonzero(np.diff(at) > widest):
+        gaps = np.diff(at)
+        usual = float(np.median(gaps))
+        for k in np.flatnonzero(gaps > (widest if usual < widest else _SLOW * usual)):
             bad |= (t > at[k] - _AROUND_GAP_S) & (t < at[k + 1] + _AROUND_GAP_S)
     speed = np.hypot(readings["v_n"], readings["v_e"])
     bad |= speed < _LEAST_SPEED

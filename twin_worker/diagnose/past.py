@@ -5,21 +5,24 @@ and which the rest of the flight makes use of, is a nuisance; an equation that d
 not covered; what was there from the start is part of the baseline, and never a finding.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleet.effects import Onset, catalogue
 from twin_worker.diagnose import equations as eq
-from twin_worker.diagnose.baseline import CHANNELS, Baseline, Noise
+from twin_worker.diagnose import hidden
+from twin_worker.diagnose.baseline import CHANNELS, DEAF, Baseline, Noise, silenced
 from twin_worker.diagnose.calibrate import settled
 from twin_worker.diagnose.card import Card
 from twin_worker.diagnose.diagnose import diagnose
 from twin_worker.diagnose.fit import CORRELATED, Rows, axial, fit, fit_timing, pitch, wind
 from twin_worker.diagnose.flight import Flight
-from twin_worker.diagnose.report import Report
+from twin_worker.diagnose.held import Lost, lost
+from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.diagnose.residual import Case, Terms
+from twin_worker.diagnose.words import sentence
 
 PIECES = 4  # of the past, each foretold by the others
 LEAST_S = 40.0  # of trusted past
@@ -33,15 +36,22 @@ _LEAST_GAIN = 400.0  # of any effect
 _WIND = 2.5  # a mean wind is weather, and known no better [m/s]
 _AIRSPEED = 0.3  # least scatter of airspeed [m/s]
 _PRIOR = (0.1, 10.0, 10.0, 1.0, 1.0)  # of airspeed's scale, of wind [m/s], of its growth with height [m/s per 100 m]
-_DEAF = 1e6  # noise of a channel that says nothing
-_CHANNEL = {"X": "force_x", "beta": "side", "alpha": "lift", "L": "roll", "M": "pitch", "N": "yaw"}
+_WORSE = -0.5  # share of variance foretold, below which an equation says nothing
 
 Say = Callable[[str], None]
 
 
-def calibrate_past(flight: Flight, until: float, card: Card, say: Say = lambda word: None) -> Baseline:
+def calibrate_past(
+    flight: Flight, until: float, card: Card, say: Say = lambda word: None, shown: Flight | None = None
+) -> Baseline:
     """Calibrate on what a flight did before `until` [s, on its own clock].
 
+    Args:
+        flight: all that was recorded, of which only the past is used, the rest for what it makes use of
+        until: end of the trusted past
+        card: the aircraft, or `card.UNKNOWN`
+        say: takes words of progress
+        shown: the same with channels concealed as they will be later: noise and chance are learnt from it
     Raises:
         ValueError: when that holds too little flight; the sentence says how much.
     """
@@ -56,18 +66,19 @@ def calibrate_past(flight: Flight, until: float, card: Card, say: Say = lambda w
     card = replace(card, body=replace(card.body, lag=timing.servo + timing.delay))
     base, (weather,) = fit([past], card, timing, past.vane, _RIDGE)
     pieces = split(past)
-    cases, winds = [], []
-    for piece in pieces:
-        rest = replace(past, ok=past.ok & ~piece.ok)
-        without, (w,) = fit([rest], card, timing, past.vane, _RIDGE)
-        cases.append(Case(piece, without))
-        winds.append(w)
+    left = [fit([replace(past, ok=past.ok & ~piece.ok)], card, timing, past.vane, _RIDGE) for piece in pieces]
+    winds = [w for _, (w,) in left]
+    cases = [Case(piece, without) for piece, (without, _) in zip(pieces, left, strict=True)]
     base = replace(base, others=_doubts(flight, past, base, weather), r2=_foretold(cases, winds))
+    if shown is not None:
+        veiled = [replace(before(shown, until), ok=piece.ok) for piece in pieces]
+        cases = [Case(piece, case.base) for piece, case in zip(veiled, cases, strict=True)]
     base = settled(base, cases, winds, say, level=True)
     later = since(flight, until).seconds
+    base = silenced(base, [name for name, share in base.r2.items() if share < _WORSE])
     return replace(
         base,
-        noise=_muted(base),
+        noise=_without_baro(base.noise),
         spread=base.spread | _weather(Case(past, base), weather),
         chance=_chance(base, max(later, past.seconds) * len(pieces) / past.seconds),
     )
@@ -91,13 +102,18 @@ def _part(flight: Flight, rows: slice) -> Flight:
 
 @dataclass(frozen=True)
 class OwnPast:
-    """What to judge a flight by: what it did itself before `until` [s, on its own clock], as this aircraft."""
+    """What to judge flights by: what each did itself, as this aircraft.
+
+    Attributes:
+        until: end of the trusted past [s, on the flight's own clock]
+        card: the aircraft, or `card.UNKNOWN`
+    """
 
     until: float
     card: Card
 
-    def diagnose(self, flight: Flight, say: Say = lambda word: None) -> Report:
-        """Diagnose what the flight did after that by what it did before.
+    def diagnose(self, flight: Flight, say: Say = lambda word: None, conceal: Sequence[str] = ()) -> Report:
+        """Diagnose what the flight did after that by what it did before; channels are concealed after it only.
 
         Raises:
             ValueError: when there is too little before or after; the sentence says how much.
@@ -108,13 +124,22 @@ class OwnPast:
                 f"{flight.name}: found {after:.0f} s of trusted flight after {self.until:.0f} s, expected "
                 f"{LEAST_AFTER_S:.0f} s at least to diagnose; trust a shorter past"
             )
-        base = calibrate_past(flight, self.until, self.card, say)
+        shown = hidden.concealed(flight, conceal, before(flight, self.until))
+        base = calibrate_past(flight, self.until, self.card, say, shown if conceal else None)
         told = (
             f"calibrated on {flight.seconds - after:.0f} s of its own past: what was there from the start is no "
             "finding, a mean wind is weather, and the barometer is not judged"
         )
-        later = since(flight, self.until - BEFORE_S)
-        return diagnose(replace(later, lacks=(*flight.lacks, told)), base, say)
+        report = diagnose(replace(since(shown, self.until - BEFORE_S), lacks=(*shown.lacks, told)), base, say)
+        return _with_lost(report, lost(flight, self.until), float(flight.t[-1]))
+
+
+def _with_lost(report: Report, gone: Lost | None, end: float) -> Report:
+    """Give the report, unknown since what was held is lost where the simulation saw nothing."""
+    if gone is None or report.outcome not in (Outcome.NONE, Outcome.SUSPECTED):
+        return report
+    where = (gone.what, ((gone.since, end),))
+    return sentence(replace(report, outcome=Outcome.UNKNOWN, findings=(), where=where))
 
 
 def split(past: Flight, pieces: int = PIECES) -> list[Flight]:
@@ -178,15 +203,9 @@ def _direction(base: Baseline, name: str, d: np.ndarray) -> dict[str, np.ndarray
     return out | {name: d}
 
 
-def _muted(base: Baseline) -> Noise:
-    """Give the noise, channels that the past foretells worse than not at all made deaf.
-
-    A barometer drifts over minutes: pieces of the past are too short to tell by how much.
-    """
-    deaf = [CHANNELS.index(name) for name in ("baro", *(_CHANNEL[of] for of, share in base.r2.items() if share < 0.0))]
-    sigma = base.noise.sigma.copy()
-    sigma[deaf] = _DEAF
-    return Noise(base.noise.ar, sigma)
+def _without_baro(noise: Noise) -> Noise:
+    """Give the noise, the barometer's said to be anything: it drifts over minutes, pieces of the past are too short."""
+    return Noise(noise.ar, np.where(np.arange(len(CHANNELS)) == CHANNELS.index("baro"), DEAF, noise.sigma))
 
 
 def _weather(case: Case, weather: np.ndarray) -> dict[str, float]:

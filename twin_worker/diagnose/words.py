@@ -24,8 +24,9 @@ def _said(report: Report) -> str:
     channel, segments = report.where
     when = ", ".join(f"{a:.0f}-{b:.0f} s" for a, b in segments[:3]) or "throughout"
     term = " + ".join(f"{x:.3g} {name}" for name, x in report.terms.items())
+    free = f"; free-form fit: {term}" if term else ""
     also = f"; nearest, but not enough: {found}" if found else ""
-    return f"a mismatch no effect in the catalogue explains, in {channel} ({when}){also}; free-form fit: {term}"
+    return f"a mismatch no effect in the catalogue explains, in {channel} ({when}){also}{free}"
 
 
 def _finding(one: Finding) -> str:
