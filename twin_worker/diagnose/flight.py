@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet.contract import Params, Sample
+from fleet.contract import Params, Sample, Status
 from fleet.frames import Origin, to_ned
 from fleet.telemetry.recordings import replay_messages
 from twin_worker.diagnose.card import Card
@@ -20,6 +20,7 @@ _FASTER = 0.5  # gaps of gyros over those of attitude, from which rates are thei
 _AROUND_GAP_S = 0.3
 _SETTLE_S = 5.0, 1.5  # left out at the start and at the end [s]
 _LEAST_S = 25.0  # of trusted flight
+_ROTORS = ("multirotor", "helicopter")
 _CLEAR_M = 30.0  # above the ground after a take-off in the recording
 _LEAST_SPEED = 6.0  # [m/s]
 
@@ -67,17 +68,24 @@ def read_flights(path: Path, card: Card) -> list[Flight]:
         OSError: when it cannot be opened.
     """
     told: dict[int, tuple[History, dict[str, float]]] = {}
+    rotors: dict[int, str] = {}
     skipped: list[str] = []
     for message in replay_messages(path, skipped=skipped):
-        history, params = told.setdefault(message.uav, (History(keep_s=np.inf), {}))
+        uav = message.uav
+        history, params = told.setdefault(uav, (History(keep_s=np.inf), {}))
         if isinstance(message, Sample):
             history.add(message)
         elif isinstance(message, Params):
             params.update(message.values)
+        elif isinstance(message, Status) and message.vehicle in _ROTORS:
+            rotors[uav] = message.vehicle
     stem = path.name.split(".")[0]
     flights, refused = [], []
     for uav, (history, params) in sorted(told.items()):
         name = stem if len(told) == 1 else f"{stem}-uav{uav}"
+        if uav in rotors:
+            refused.append(f"{name}: found a {rotors[uav]}, expected wings; its simulation knows no rotors")
+            continue
         try:
             flights.append(lay(name, history, params, card))
         except ValueError as error:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fleet.effects import Onset, catalogue
+from fleet.effects import Onset, Stage, catalogue
 from twin_worker.diagnose import equations as eq
 from twin_worker.diagnose import hidden
 from twin_worker.diagnose.baseline import CHANNELS, DEAF, Baseline, Noise, silenced
@@ -22,6 +22,7 @@ from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.held import Lost, lost
 from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.diagnose.residual import Case, Terms
+from twin_worker.diagnose.sight import Sight
 from twin_worker.diagnose.words import sentence
 
 PIECES = 4  # of the past, each foretold by the others
@@ -34,6 +35,7 @@ _FADED = 4.0  # rows that count as one where the coefficients' doubt is reckoned
 _SHOWS = 0.1  # of an equation's own scatter, from which a doubtful direction is kept
 _LEAST_GAIN = 400.0  # of any effect
 _WIND = 2.5  # a mean wind is weather, and known no better [m/s]
+_ANY_BIAS = 50.0  # floors of a sensor's bias, in which any is found
 _AIRSPEED = 0.3  # least scatter of airspeed [m/s]
 _PRIOR = (0.1, 10.0, 10.0, 1.0, 1.0)  # of airspeed's scale, of wind [m/s], of its growth with height [m/s per 100 m]
 _WORSE = -0.5  # share of variance foretold, below which an equation says nothing
@@ -76,10 +78,11 @@ def calibrate_past(
     base = settled(base, cases, winds, say, level=True)
     later = since(flight, until).seconds
     base = silenced(base, [name for name, share in base.r2.items() if share < _WORSE])
+    here = Case(past, base)
     return replace(
         base,
         noise=_without_baro(base.noise),
-        spread=base.spread | _weather(Case(past, base), weather),
+        spread=base.spread | _biases(here, weather) | _weather(here, weather),
         chance=_chance(base, max(later, past.seconds) * len(pieces) / past.seconds),
     )
 
@@ -206,6 +209,19 @@ def _direction(base: Baseline, name: str, d: np.ndarray) -> dict[str, np.ndarray
 def _without_baro(noise: Noise) -> Noise:
     """Give the noise, the barometer's said to be anything: it drifts over minutes, pieces of the past are too short."""
     return Noise(noise.ar, np.where(np.arange(len(CHANNELS)) == CHANNELS.index("baro"), DEAF, noise.sigma))
+
+
+def _biases(case: Case, weather: np.ndarray) -> dict[str, float]:
+    """Give spreads as wide as the biases that sensors had in the past: they are no finding later."""
+    sight = Sight(case, wind(weather))
+    floors = np.array([n.floor for n in sight.nuisances])
+    sensors = np.array([n.effect.stage is Stage.SENSOR for n in sight.nuisances])
+    k = len(floors)
+    precision = sight.precision.copy()
+    precision[:k] = np.where(sensors, (_ANY_BIAS * floors) ** -2.0, precision[:k])
+    x = np.linalg.solve(sight.Ann - np.diag(sight.precision) + np.diag(precision), sight.bn)[:k]
+    told = zip(sight.nuisances, x, sensors, strict=True)
+    return {n.name: max(case.base.spread[n.name], 2.0 * abs(float(bias))) for n, bias, sensor in told if sensor}
 
 
 def _weather(case: Case, weather: np.ndarray) -> dict[str, float]:
