@@ -9,7 +9,8 @@ from twin_worker.diagnose import __main__ as diagnosis
 from twin_worker.diagnose import keep, learn
 from twin_worker.diagnose.card import read
 from twin_worker.diagnose.flight import Flight, read_flights
-from twin_worker.diagnose.past import OwnPast, before, calibrate_past, since, split
+from twin_worker.diagnose.own_past import OwnPast
+from twin_worker.diagnose.past import before, calibrate_past, since, split
 from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.diagnose.share import shared
 

@@ -17,7 +17,8 @@ from twin_worker.diagnose.card import UNKNOWN, read
 from twin_worker.diagnose.fit import fit_wind
 from twin_worker.diagnose.flight import Flight, read_flights
 from twin_worker.diagnose.held import ENERGY, lost
-from twin_worker.diagnose.past import OwnPast, before, calibrate_past, since
+from twin_worker.diagnose.own_past import OwnPast
+from twin_worker.diagnose.past import before, calibrate_past, since
 from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.diagnose.residual import Case
 from twin_worker.diagnose.share import shared

@@ -9,7 +9,7 @@ from fleet.commands.diagnose import EXAMPLES, arguments, check
 from twin_worker.diagnose import hidden, keep, written
 from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.learn import card_of, learn, say
-from twin_worker.diagnose.past import OwnPast
+from twin_worker.diagnose.own_past import OwnPast
 from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.diagnose.share import Against, shared
 

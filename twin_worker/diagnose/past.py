@@ -5,29 +5,23 @@ and which the rest of the flight makes use of, is a nuisance; an equation that d
 not covered; what was there from the start is part of the baseline, and never a finding.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from fleet.effects import Onset, Stage, catalogue
 from twin_worker.diagnose import equations as eq
-from twin_worker.diagnose import hidden
 from twin_worker.diagnose.baseline import CHANNELS, DEAF, Baseline, Noise, silenced
 from twin_worker.diagnose.calibrate import settled
 from twin_worker.diagnose.card import Card
-from twin_worker.diagnose.diagnose import diagnose
 from twin_worker.diagnose.fit import CORRELATED, Rows, axial, fit, fit_timing, pitch, wind
 from twin_worker.diagnose.flight import Flight
-from twin_worker.diagnose.held import Lost, lost
-from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.diagnose.residual import Case, Terms
 from twin_worker.diagnose.sight import Sight
-from twin_worker.diagnose.words import sentence
 
 PIECES = 4  # of the past, each foretold by the others
 LEAST_S = 40.0  # of trusted past
-LEAST_AFTER_S = 10.0  # of trusted flight to diagnose
 BEFORE_S = 30.0  # of the past stay in what is diagnosed, so that an onset has something before it
 NEVER = 1e9  # gain that nothing reaches
 _RIDGE = 0.02  # little data determine few numbers
@@ -101,48 +95,6 @@ def _part(flight: Flight, rows: slice) -> Flight:
     readings = {name: x[rows] for name, x in flight.readings.items()}
     t, commands, place, ok = (x[rows] for x in (flight.t, flight.commands, flight.place, flight.ok))
     return replace(flight, t=t, readings=readings, commands=commands, place=place, ok=ok)
-
-
-@dataclass(frozen=True)
-class OwnPast:
-    """What to judge flights by: what each did itself, as this aircraft.
-
-    Attributes:
-        until: end of the trusted past [s, on the flight's own clock]
-        card: the aircraft, or `card.UNKNOWN`
-    """
-
-    until: float
-    card: Card
-
-    def diagnose(self, flight: Flight, say: Say = lambda word: None, conceal: Sequence[str] = ()) -> Report:
-        """Diagnose what the flight did after that by what it did before; channels are concealed after it only.
-
-        Raises:
-            ValueError: when there is too little before or after; the sentence says how much.
-        """
-        after = since(flight, self.until).seconds
-        if after < LEAST_AFTER_S:
-            raise ValueError(
-                f"{flight.name}: found {after:.0f} s of trusted flight after {self.until:.0f} s, expected "
-                f"{LEAST_AFTER_S:.0f} s at least to diagnose; trust a shorter past"
-            )
-        shown = hidden.concealed(flight, conceal, before(flight, self.until))
-        base = calibrate_past(flight, self.until, self.card, say, shown if conceal else None)
-        told = (
-            f"calibrated on {flight.seconds - after:.0f} s of its own past: what was there from the start is no "
-            "finding, a mean wind is weather, and the barometer is not judged"
-        )
-        report = diagnose(replace(since(shown, self.until - BEFORE_S), lacks=(*shown.lacks, told)), base, say)
-        return _with_lost(report, lost(flight, self.until), float(flight.t[-1]))
-
-
-def _with_lost(report: Report, gone: Lost | None, end: float) -> Report:
-    """Give the report, unknown since what was held is lost where the simulation saw nothing."""
-    if gone is None or report.outcome not in (Outcome.NONE, Outcome.SUSPECTED):
-        return report
-    where = (gone.what, ((gone.since, end),))
-    return sentence(replace(report, outcome=Outcome.UNKNOWN, findings=(), where=where))
 
 
 def split(past: Flight, pieces: int = PIECES) -> list[Flight]:

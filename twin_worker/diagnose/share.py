@@ -9,7 +9,7 @@ from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.diagnose import diagnose
 from twin_worker.diagnose.flight import Flight, read_flights
 from twin_worker.diagnose.hidden import concealed, deaf
-from twin_worker.diagnose.past import OwnPast
+from twin_worker.diagnose.own_past import OwnPast
 from twin_worker.diagnose.report import Report
 
 Say = Callable[[str], None]

@@ -1,0 +1,65 @@
+"""Judge flights by their own past: what came later and was not there before."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from twin_worker.diagnose import hidden
+from twin_worker.diagnose.card import Card
+from twin_worker.diagnose.diagnose import diagnose
+from twin_worker.diagnose.flight import Flight
+from twin_worker.diagnose.held import Lost, lost
+from twin_worker.diagnose.past import BEFORE_S, before, calibrate_past, since
+from twin_worker.diagnose.report import Outcome, Report
+from twin_worker.diagnose.words import sentence
+
+LEAST_AFTER_S = 10.0  # of trusted flight to diagnose
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class OwnPast:
+    """What to judge flights by: what each did itself, as this aircraft.
+
+    Attributes:
+        until: end of the trusted past [s, on the flight's own clock]
+        card: the aircraft, or `card.UNKNOWN`
+    """
+
+    until: float
+    card: Card
+
+    def diagnose(self, flight: Flight, say: Say = lambda word: None, conceal: Sequence[str] = ()) -> Report:
+        """Diagnose what the flight did after that by what it did before; channels are concealed after it only.
+
+        Raises:
+            ValueError: when there is too little before or after; the sentence says how much.
+        """
+        after = since(flight, self.until).seconds
+        if after < LEAST_AFTER_S:
+            raise ValueError(
+                f"{flight.name}: found {after:.0f} s of trusted flight after {self.until:.0f} s, expected "
+                f"{LEAST_AFTER_S:.0f} s at least to diagnose; trust a shorter past"
+            )
+        shown = hidden.concealed(flight, conceal, before(flight, self.until))
+        base = calibrate_past(flight, self.until, self.card, say, shown if conceal else None)
+        told = (
+            f"calibrated on {flight.seconds - after:.0f} s of its own past: what was there from the start is no "
+            "finding, a mean wind is weather, and the barometer is not judged"
+        )
+        report = diagnose(replace(since(shown, self.until - BEFORE_S), lacks=(*shown.lacks, told)), base, say)
+        return _later(report, lost(flight, self.until), self.until)
+
+
+def _later(report: Report, gone: Lost | None, until: float) -> Report:
+    """Give the report without what is strange in the trusted past only, and with what was held until then and lost."""
+    channel, stretches = report.where
+    stretches = tuple(pair for pair in stretches if pair[1] > until)
+    if report.outcome is Outcome.NAMED or stretches:
+        return sentence(replace(report, where=(channel, stretches)))
+    if gone is not None:
+        where = (gone.what, ((gone.since, float(report.series.t[-1])),))
+        return sentence(replace(report, outcome=Outcome.UNKNOWN, findings=(), terms={}, where=where))
+    if report.outcome is Outcome.UNKNOWN:
+        return sentence(replace(report, outcome=Outcome.NONE, findings=(), terms={}, where=("", ())))
+    return report
