@@ -117,7 +117,7 @@ class Rows:
             good[:_ORDER] = False
             whole.append(good)
         self.A, self.y = np.concatenate(A), np.concatenate(y)
-        known = cases[0].base.card.known
+        known = cases[0].base.card.known and cases[0].base.vane
         self.usual = np.array(eq.USUAL[name] if known and name in eq.USUAL else [np.inf] * self.A.shape[1])
         self.ok, self.whole = np.concatenate(ok), np.concatenate(whole)
 
