@@ -14,11 +14,11 @@ from twin_worker.diagnose.sight import Sight
 
 MOST = 3  # effects named together
 _TRIED = 12  # guesses fitted properly at each step
-_LEAST, _LEAST_COARSE = 150.0, 400.0  # gain of a first effect, by the accelerometer and without
+_LEAST, _LEAST_COARSE = 300.0, 400.0  # gain of a first effect, by the accelerometer and without
 _CANCEL = 1.5  # an effect that gains this much more beside the others than all together only undoes one of them
 _SECOND = 300.0  # and of every further one
 _NEAR = 0.6  # of the best one's worth, from which an onset is worth a search
-_CHANCE = 1.2  # over what nominal flights reach by chance
+_CHANCE = 1.5  # over what nominal flights reach by chance
 _SHARE, _SHARE_COARSE = 0.02, 0.25  # of the first one's gain a further one must bring
 _FINE, _COARSE = 0.02, 0.15  # tie: by the accelerometer; by plain telemetry, whose baseline is wrong by about as much
 _GUSTS = 1.2, 1.5  # of the air channels' scatter over the usual: least, median
@@ -55,7 +55,7 @@ def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: Non
         say(f"effect {len(named) + 1}")
         found = best(sight, [one.found.guess for one in named])
         ranking = ranking or found
-        found = [one for one in found if one.gain > needed(sight, named, one)]
+        found = [one for one in found if one.gain > needed(sight, named, one) and not sound(sight, one.guess)]
         if not found:
             break
         more = [*named, choose(sight, found)]
@@ -140,6 +140,16 @@ def needed(sight: Sight, named: list[Named], found: Found) -> float:
     if not named:
         return max(least, chance)
     return max(_SECOND, least, chance, (_SHARE if sight.base.vane else _SHARE_COARSE) * named[0].found.gain)
+
+
+def sound(sight: Sight, guess: Guess) -> bool:
+    """Tell whether a guess is but a sensor's bias such as data sheets allow for."""
+    bounds = {
+        n.index: n.released * max(sight.base.spread.get(n.name, n.floor), n.floor)
+        for n in sight.nuisances
+        if n.sensor and (n.effect.name, n.of) == (guess.effect.name, guess.of)
+    }
+    return bool(bounds) and all(abs(x) < bounds[k] for k, x in enumerate(guess.par))
 
 
 def _again(sight: Sight, named: list[Named], weather: tuple[Guess, ...]) -> list[Named]:

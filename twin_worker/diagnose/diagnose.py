@@ -220,7 +220,7 @@ def _outcome(
 ) -> Outcome:
     """Decide; `told` is the share of the error of forces held out that went."""
     gusty = any(one.guess.effect.variance for one in findings)
-    gained = proof.gain >= HELD or told >= _TOLD
+    gained = proof.gain >= HELD or (told >= _TOLD and proof.gain > 0.0)
     sound = all(one.held >= _KEPT and _significant(one) and not _at_its_end(one) for one in findings)
     proven = gusty or (gained and sound)
     excess = [np.maximum(x[_TELLING] - 1.0, 0.0).sum() for x in (before, after)]

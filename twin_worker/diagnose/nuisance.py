@@ -15,14 +15,15 @@ from twin_worker.diagnose.guess import ALWAYS, Guess
 _SHARE = 0.03  # least scatter of a derivative without the vane [-]
 WIDEST = 4.0  # a learnt spread over its floor
 RELEASED = 2.5  # spreads past which a difference is no nuisance any more
+SOUND = 3.3  # and of a sensor's bias, which a data sheet allows for
 WEATHER_MPS = 1.0  # nominal flights that differ by more had weather: a mean wind is then never a finding
 
 WAVES = 3  # slow courses a wandering nuisance may take
 _WANDERS = {  # what sensors and weather do not keep to during a flight: effect -> floor over that of its mean
-    "accel_bias": 0.5,
-    "gyro_bias": 0.5,
+    "accel_bias": 0.4,
+    "gyro_bias": 0.3,
     "heading_bias": 0.5,
-    "imu_misalignment": 0.5,
+    "imu_misalignment": 0.4,
     "wind_steady": 0.3,
 }
 
@@ -73,6 +74,16 @@ class Nuisance:
         par = [0.0] * self.effect.size
         par[self.index] = x
         return Guess(self.effect, self.of, tuple(par), ALWAYS)
+
+    @property
+    def sensor(self) -> bool:
+        """Tell whether it is a sensor's bias."""
+        return self.effect.name in ("accel_bias", "gyro_bias", "heading_bias", "imu_misalignment")
+
+    @property
+    def released(self) -> float:
+        """Give the spreads past which it is no nuisance any more."""
+        return SOUND if self.sensor else RELEASED
 
     @property
     def scatter(self) -> bool:
@@ -131,12 +142,12 @@ def nuisances(vane: bool) -> tuple[Nuisance, ...]:
                 label = ":".join(filter(None, (name, one, parameter.name)))
                 out.append(Nuisance(label, effect, one, k, floor, 0.3 * parameter.step))
 
-    add("accel_bias", 0.02, known["accel_bias"].of)
-    add("gyro_bias", 0.0008, known["gyro_bias"].of)
+    add("accel_bias", 0.04, known["accel_bias"].of)
+    add("gyro_bias", 0.0015, known["gyro_bias"].of)
     add("heading_bias", 0.012)
     add("wind_steady", 0.35)
     add("wind_shear", 0.2)
-    add("imu_misalignment", 0.002)
+    add("imu_misalignment", 0.004)
     add("airspeed_scale", 0.003)
     floors = {
         "C_L": 0.004,

@@ -112,12 +112,17 @@ class Sight:
             self.Ann = G + np.diag(self.precision)
             self.xn = np.linalg.solve(self.Ann, self.bn)
             held = self.precision < 0.1 * _TIGHT
-            past = np.abs(self.xn) * np.sqrt(self.precision) * held * ~free
+            past = np.abs(self.xn) * np.sqrt(self.precision) * held * ~free / self._bounds(len(more))
             worst = int(np.argmax(past))
-            if past[worst] < RELEASED:
+            if past[worst] < 1.0:
                 break
             self.precision[worst] = _TIGHT
         self.gain_n = float(self.bn @ self.xn)
+
+    def _bounds(self, more: int) -> np.ndarray:
+        """Give how many spreads each nuisance may be off before it is handed over, (nuisances + wanders + more,)."""
+        own = [n.released for n in self.nuisances]
+        return np.array([*own, *(own[one.of] for one in self.wanders), *more * [RELEASED]])
 
     def _spread(self, n: Nuisance) -> float:
         spread = self.base.spread.get(n.name, n.floor)
