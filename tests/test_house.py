@@ -44,6 +44,7 @@ APART = (  # who, and what it must never import
     ("twin_worker", ("gateway", "viewer", "fleet.pretend")),
     ("viewer", ("gateway", "twin_worker", "fleet.pretend")),
     ("fleet.pretend", ("fleet.physics", "fleet.effects", "fleet.simulate", "fleet.hybrid")),  # never our own physics
+    ("fleet.pretend", ("importlib", "runpy", "subprocess")),  # nor by the back door
     ("fleet.effects", ("fleet.pretend",)),  # one code must never both conceal and find
     ("fleet.simulate", ("fleet.pretend",)),
     ("twin_worker.diagnose", ("fleet.pretend", "fleet.prove")),
@@ -254,7 +255,9 @@ PLANTED = (
     (direction, "fleet/frames.py", "from fleet import bus"),
     (direction, "fleet/telemetry/a.py", "from ..pretend import b"),
     (direction, "fleet/bus.py", "import twin_worker.twin"),
-    (direction, "fleet/pretend/conceal.py", "def f():\n    from fleet.effects import drag"),
+    (direction, "fleet/pretend/conceal/exam.py", "def f():\n    from fleet.effects import icing"),
+    (direction, "fleet/pretend/conceal/plan.py", "import importlib"),
+    (direction, "fleet/pretend/faults/physics.py", "from twin_worker.diagnose.card import read"),
     (direction, "twin_worker/diagnose/name.py", "from fleet.pretend.conceal import hide"),
     (alone, "gateway/a.py", "import zenoh"),
     (alone, "fleet/pretend/uav.py", "from jsbsim import FGFDMExec"),

@@ -1,7 +1,7 @@
 """Aircraft files with knobs: what may go wrong with the airframe becomes a JSBSim property.
 
 The files are read where they are installed, and changed in memory; no copy is kept. At its default every knob does
-nothing, and the aircraft flies as before.
+nothing, and the aircraft flies as before; only the Cessna's inertial unit is no longer at the pilot's eyes.
 
     conceal/C_D         drag coefficient added                      conceal/lift    factor of all lift
     conceal/C_n_beta, C_Y_beta, C_l_p, C_m_q    factors of those derivatives (c172p; the small one has its own, vary/*)
@@ -23,6 +23,7 @@ _FACTORS = {  # knob: functions it multiplies
     "conceal/C_l_p": ("aero/coefficient/Clp",),
     "conceal/C_m_q": ("aero/coefficient/Cmq", "aero/coefficient/Cmadot"),
 }
+_UNIT_IN = (41.9, -0.7, 37.3)
 _WASH = "aero/function/qbar-induced-psf"
 _TAIL = ("aero/coefficient/Cmde", "aero/coefficient/Cndr")
 _P_FACTOR = {"z": ("-1", "aero/alpha-rad"), "y": ("1", "aero/beta-rad")}  # thrust moves right: the nose goes left
@@ -40,6 +41,7 @@ def _file(name: str) -> str:
     root = ElementTree.parse(model_file(kind)).getroot()
     _knob_forces(root)
     if kind.shipped:
+        _measure_in_the_middle(root)
         _knob_derivatives(root)
         _knob_propeller(root)
     return ElementTree.tostring(root, encoding="unicode")
@@ -58,6 +60,13 @@ def _knob_forces(root: Element) -> None:
     mass = SubElement(balance, "pointmass", name="concealed")
     SubElement(mass, "weight", unit="LBS").text = "0"
     mass.append(_one(balance, "location[@name='CG']"))
+
+
+def _measure_in_the_middle(root: Element) -> None:
+    """Put the inertial unit where the loaded Cessna's centre of gravity is; JSBSim measures at the pilot's eyes."""
+    eyes = _one(root, "metrics/location[@name='EYEPOINT']")
+    for axis, inches in zip("xyz", _UNIT_IN, strict=True):
+        _one(eyes, axis).text = str(inches)
 
 
 def _knob_derivatives(root: Element) -> None:

@@ -186,13 +186,14 @@ class Aircraft:
         """Work out forces and moments anew while time stands still.
 
         Returns:
-            pdot qdot rdot [rad/s2] and specific force, FRD [m/s2], (6,)
+            pdot qdot rdot [rad/s2] and specific force at the centre of gravity, FRD [m/s2], (6,)
         """
         self._fdm.suspend_integration()
         self._fdm.run()
         self._fdm.resume_integration()
         turning = [self._fdm[f"accelerations/{name}dot-rad_sec2"] for name in "pqr"]
-        return np.array([*turning, *(self.truth().force)])
+        force = [self._fdm[f"forces/fb{axis}-total-lbs"] / self._fdm["inertia/mass-slugs"] * FT for axis in "xyz"]
+        return np.array([*turning, *force])
 
     def truth(self) -> Truth:
         """Read the state in SI, NED and FRD."""

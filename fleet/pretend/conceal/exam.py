@@ -39,7 +39,7 @@ def exam(
         ValueError: when there are too few flights to hide anything among.
         RuntimeError: when an effect would not act however often it was drawn.
     """
-    wanted = _jobs(seed, flights)
+    wanted = jobs_of(seed, flights)
     for airframe in AIRFRAMES:
         (out / airframe).mkdir(parents=True, exist_ok=True)
         (out / airframe / f"{airframe}.card.json").write_text(json.dumps(card(airframe), indent=1) + "\n")
@@ -50,7 +50,7 @@ def exam(
     return dict(sorted(labels.items()))
 
 
-def _jobs(seed: int, flights: int) -> list[Job]:
+def jobs_of(seed: int, flights: int) -> list[Job]:
     """Draw who hides what; in an order, and under names, that say nothing of it."""
     rng = np.random.default_rng((seed, 22))
     wanted: list[tuple[str, str, tuple[str, ...]]] = []
