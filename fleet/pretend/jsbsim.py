@@ -53,7 +53,7 @@ class Truth(NamedTuple):
 class Gusts(NamedTuple):
     """Turbulence of one flight."""
 
-    seed: int
+    seed: int  # draws it
     w20_fps: float  # wind at 20 ft, which the intensity below 1000 ft goes with
 
 
@@ -183,11 +183,7 @@ class Aircraft:
         self._fdm.run()
 
     def ponder(self) -> np.ndarray:
-        """Work out forces and moments anew while time stands still.
-
-        Returns:
-            pdot qdot rdot [rad/s2] and specific force at the centre of gravity, FRD [m/s2], (6,)
-        """
+        """Reckon pdot qdot rdot [rad/s2] and specific force, FRD [m/s2], anew while time stands still, (6,)."""
         self._fdm.suspend_integration()
         self._fdm.run()
         self._fdm.resume_integration()

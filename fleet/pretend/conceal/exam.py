@@ -2,7 +2,9 @@
 
 import json
 import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -82,10 +84,22 @@ def _flown(tasks: list[tuple[Job, int, Path]], jobs: int) -> Iterator[tuple[str,
     if jobs == 1:
         yield from map(_fly, tasks)
         return
-    with multiprocessing.get_context("spawn").Pool(jobs, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+    with multiprocessing.get_context("spawn").Pool(jobs, _begin, (os.getpid(),)) as pool:
         yield from pool.imap(_fly, tasks)
         pool.close()
         pool.join()
+
+
+def _begin(parent: int) -> None:
+    """Leave Ctrl-C to the parent, and end with it however it ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_outlive_nobody, args=(parent,), daemon=True).start()
+
+
+def _outlive_nobody(parent: int) -> None:
+    while os.getppid() == parent:
+        threading.Event().wait(1.0)
+    os._exit(1)
 
 
 def _fly(task: tuple[Job, int, Path]) -> tuple[str, Label]:
