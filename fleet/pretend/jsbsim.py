@@ -17,8 +17,7 @@ from fleet.pretend.weather import FT, wind_at_20ft
 
 DT = 0.01  # physics step [s]
 KG_TO_LB = 2.2046226218
-_SLUG_FT3 = 515.378819  # [kg/m3]
-_PSF = 47.880259  # [Pa]
+_SLUG_FT3, _PSF = 515.378819, 47.880259  # [kg/m3], [Pa]
 _READ = (
     *("position/lat-geod-rad", "position/long-gc-rad", "position/geod-alt-ft"),
     *("velocities/v-north-fps", "velocities/v-east-fps", "velocities/v-down-fps"),
