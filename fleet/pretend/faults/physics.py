@@ -10,7 +10,7 @@ import numpy as np
 
 from fleet.pretend.faults.fault import Fault
 from fleet.pretend.jsbsim import KG_TO_LB, Aircraft
-from fleet.pretend.weather import FT
+from fleet.pretend.weather import FT, REFERENCE_M
 
 _INCH = 0.0254  # [m]
 _W20 = "atmosphere/turbulence/milspec/windspeed_at_20ft_AGL-fps"
@@ -81,7 +81,7 @@ def _level(values: Mapping[str, float], speed: float) -> np.ndarray:
 
 WINDS: dict[str, Callable[[Mapping[str, float], float], np.ndarray]] = {
     "wind_steady": lambda values, height: _level(values, values["speed_mps"]),
-    "wind_shear": lambda values, height: _level(values, values["mps_per_100m"] * height / 100.0),
+    "wind_shear": lambda values, height: _level(values, values["mps_per_100m"] * (height - REFERENCE_M) / 100.0),
     "gust_discrete": lambda values, height: _level(values, values["speed_mps"]),
     "updraft": lambda values, height: np.array([0.0, 0.0, -values["speed_mps"]]),
 }
