@@ -46,6 +46,7 @@ def made(flight: str = "s07-lag", outcome: Outcome = Outcome.NAMED, seed: int = 
         stray_before=6.1,
         stray_after=2.2,
         where=("pitch", ((ONSET, 118.0), (130.0, LENGTH))) if outcome is Outcome.UNKNOWN else ("", ()),
+        odd={"pitch": 3.0},
         terms={"q·V": -0.42, "sin(0.9 t)": 1.3e-5} if outcome is Outcome.UNKNOWN else {},
         tried=() if outcome is Outcome.NONE else _tried(),
         lacks=("the accelerometer comes at 5 Hz: gusts and small changes of lift are seen less well",),

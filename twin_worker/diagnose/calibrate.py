@@ -12,6 +12,7 @@ from twin_worker.diagnose.fit import fit, fit_timing, fit_wind, wind
 from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.nuisance import WIDEST, nuisances, wandering, wanders
+from twin_worker.diagnose.odd import oddities
 from twin_worker.diagnose.residual import Case
 from twin_worker.diagnose.sight import Sight, is_weather
 
@@ -75,6 +76,8 @@ def settled(
         usual.append(sight.left())
         for found in best(sight, ()):
             chance[found.kind] = max(chance.get(found.kind, 0.0), found.gain)
+        for odd in oddities(sight):
+            chance[odd.kind] = max(chance.get(odd.kind, 0.0), odd.worth)
     return replace(base, chance=chance, usual=np.maximum(np.median(usual, axis=0), _LEAST_USUAL))
 
 

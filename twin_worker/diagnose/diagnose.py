@@ -16,6 +16,7 @@ from twin_worker.diagnose.decide import Named, decide, turbulent
 from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.freely import stray
 from twin_worker.diagnose.guess import ALWAYS, Guess
+from twin_worker.diagnose.odd import Odd, oddities
 from twin_worker.diagnose.prove import HELD, Proof
 from twin_worker.diagnose.refine import refine
 from twin_worker.diagnose.report import Finding, Outcome, Report, Series, Tried
@@ -33,6 +34,7 @@ _STRANGE = 3.0  # a channel's residual over its usual that is not let pass unexp
 _LEFT = 2.6  # and the same beside named effects
 _EXPLAINED = 0.6  # share of the excess that names must explain
 _DOUBT = 2.0  # standard deviations below which a number is none
+_BESIDE = 0.5  # of what names gained: a changed equation that gains more shows that they are wrong
 _OTHER = 1.7  # another aircraft flies faster or slower by this factor
 _GUESSED = 0.2  # doubt of a turbulence's intensity, as a share of it
 _GUSTY = 450.0  # gain of turbulence
@@ -73,11 +75,15 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     force = foretell.forces(case, weather, proof.fitted)
     errors = [foretell.rms(case, force.measured - x) for x in (force.base, force.model)]
     outcome = _outcome(findings, proof, 1.0 - errors[1] / errors[0], before, after)
+    odds = () if any(one.guess.effect.variance for one in findings) else oddities(sight)
+    strange = next((odd for odd in odds if _strange(odd, base, findings if outcome is Outcome.NAMED else ())), None)
+    if strange is not None:
+        outcome = Outcome.UNKNOWN
     series = _series(case, white_before, white_after, force)
     where: tuple[str, tuple[tuple[float, float], ...]] = ("", ())
     terms: dict[str, float] = {}
     if outcome is Outcome.UNKNOWN:
-        channel = _TELLING[int(np.argmax(after[_TELLING]))]
+        channel = CHANNELS.index(strange.channel) if strange else _TELLING[int(np.argmax(after[_TELLING]))]
         where = (CHANNELS[channel], stretches(case.t, white_after[:, channel], sight.ok))
         terms = free_form(case, weather, channel)
     report = Report(
@@ -94,6 +100,7 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
         stray_before=float(np.degrees(stray(case, weather))),
         stray_after=float(np.degrees(stray(case, (*weather, *proof.fitted)))),
         where=where,
+        odd={odd.channel: odd.worth / odd.limit(base) for odd in odds},
         terms=terms,
         tried=_ranking(ranked, named),
         lacks=(*flight.lacks, *uncovered(base)),
@@ -101,6 +108,12 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
         seconds=time.perf_counter() - begun,
     )
     return sentence(report)
+
+
+def _strange(odd: Odd, base: Baseline, named: tuple[Finding, ...]) -> bool:
+    """Tell whether a channel's equation changed in a way that names do not explain."""
+    gained = sum(one.gain for one in named)
+    return odd.worth > max(odd.limit(base), _BESIDE * gained)
 
 
 def _fits(flight: Flight, base: Baseline) -> None:

@@ -71,15 +71,12 @@ def _by_slope(sight: Sight, effect: Effect, of: str) -> list[Found]:
     if not (scale > 1e-9).all():
         return []
     J = J / scale
-    A = np.einsum("tci,tcj->tij", J, J)
-    b = -np.einsum("tci,tc->ti", J, sight.e)
-    C = np.einsum("tci,tcj->tij", J, sight.Jn)
     out = []
     for kind in effect.onsets:
         gates, whens = gates_of(sight.case.t, kind)
         if not len(gates):
             continue
-        gain, x = _solve(sight, *_gated(A, b, C, gates, kind))
+        gain, x = solved(sight, *normals(sight, J, gates, kind))
         best = int(np.argmax(gain))
         out.append(Found(float(gain[best]), nothing.at(x[best] / scale, whens[best])))
     return out
@@ -102,10 +99,11 @@ def gates_of(t: np.ndarray, kind: Onset) -> tuple[np.ndarray, list[When]]:
     return np.stack([when.gate(t) for when in whens]) if whens else np.empty((0, len(t))), whens
 
 
-def _gated(
-    A: np.ndarray, b: np.ndarray, C: np.ndarray, gates: np.ndarray, kind: Onset
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sum normal equations over each course, (m, k, k), (m, k), (m, k, nuisances)."""
+def normals(sight: Sight, J: np.ndarray, gates: np.ndarray, kind: Onset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sum the normal equations of slopes J, (n, c, k), over each course: (m, k, k), (m, k), (m, k, nuisances)."""
+    A = np.einsum("tci,tcj->tij", J, J)
+    b = -np.einsum("tci,tc->ti", J, sight.e)
+    C = np.einsum("tci,tcj->tij", J, sight.Jn)
     if kind is Onset.STEP:
         return tuple(np.cumsum(x[::-1], axis=0)[::-1][gates] for x in (A, b, C))  # type: ignore[return-value]
     flat = [x.reshape(len(x), -1) for x in (A, b, C)]
@@ -113,7 +111,7 @@ def _gated(
     return tuple(s.reshape(len(gates), *x.shape[1:]) for s, x in zip(sums, (A, b, C), strict=True))  # type: ignore[return-value]
 
 
-def _solve(sight: Sight, A: np.ndarray, b: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def solved(sight: Sight, A: np.ndarray, b: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Give gain (m,) and parameters (m, k) of each course, the nuisances free within their spread."""
     inverse = np.linalg.inv(sight.Ann)
     A = A - C @ inverse @ np.swapaxes(C, 1, 2)

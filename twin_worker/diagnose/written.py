@@ -45,6 +45,7 @@ def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
         "predictions": str(predictions) if predictions else None,
         "channels_before": _finite(report.ratio_before),
         "channels_after": _finite(report.ratio_after),
+        "odd": report.odd,
         "free_form": report.terms,
         "lacks": list(report.lacks),
         "seconds": round(report.seconds, 2),
