@@ -35,6 +35,7 @@ _LEFT = 2.6  # and the same beside named effects
 _EXPLAINED = 0.6  # share of the excess that names must explain
 _DOUBT = 2.0  # standard deviations below which a number is none
 _BESIDE = 0.5  # of what names gained: a changed equation that gains more shows that they are wrong
+_AGAINST = 3.0  # and so many times what chance reaches
 _OTHER = 1.7  # another aircraft flies faster or slower by this factor
 _GUESSED = 0.2  # doubt of a turbulence's intensity, as a share of it
 _GUSTY = 450.0  # gain of turbulence
@@ -113,7 +114,7 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
 def _strange(odd: Odd, base: Baseline, named: tuple[Finding, ...]) -> bool:
     """Tell whether a channel's equation changed in a way that names do not explain."""
     gained = sum(one.gain for one in named)
-    return odd.worth > max(odd.limit(base), _BESIDE * gained)
+    return odd.worth > max(odd.limit(base) * (_AGAINST if named else 1.0), _BESIDE * gained)
 
 
 def _fits(flight: Flight, base: Baseline) -> None:
