@@ -89,6 +89,7 @@ class Parameter:
         step: a change that shows but is small, for slopes
         low, high: what is physically possible
         aside: it comes along with the others and is no evidence: where a force acts is seldom known
+        least: what is smaller would be another effect
     """
 
     name: str
@@ -98,6 +99,7 @@ class Parameter:
     low: float
     high: float
     aside: bool = False
+    least: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ EFFECT = Effect(
     equation="delta = delta_c + share (position - delta_c), share 1 when stuck",
     source="Ducard 2009, Fault-tolerant Flight Control and Guidance Systems (actuator faults: lock in place)",
     parameters=(
-        Parameter("share", "-", "how far it is stuck: 0 free, 1 wholly", step=0.2, low=0.0, high=1.0),
+        Parameter("share", "-", "how far it is stuck: 0 free, 1 wholly", step=0.2, low=0.0, high=1.0, least=0.5),
         Parameter("position", "-", "where it is stuck", step=0.05, low=-1.0, high=1.0),
     ),
     act=act,

@@ -14,13 +14,17 @@ from twin_worker.diagnose.sight import Sight
 
 MOST = 3  # effects named together
 _TRIED = 12  # guesses fitted properly at each step
-_LEAST, _LEAST_COARSE = 300.0, 400.0  # gain of a first effect, by the accelerometer and without
-_CANCEL = 1.5  # an effect that gains this much more beside the others than all together only undoes one of them
-_SECOND = 300.0  # and of every further one
+_LEAST, _LEAST_COARSE = 220.0, 400.0  # gain of a first effect, by the accelerometer and without
+_CANCEL = 1.5  # an effect that gains this much more beside the others than all together undoes one of them
+_SECOND = 200.0  # and of every further one
 _NEAR = 0.6  # of the best one's worth, from which an onset is worth a search
 _CHANCE = 1.5  # over what nominal flights reach by chance
-_SHARE, _SHARE_COARSE = 0.004, 0.25  # of the first one's gain a further one must bring
-_FINE, _COARSE = 0.02, 0.15  # tie: by the accelerometer; by plain telemetry, whose baseline is wrong by about as much
+_SHARE, _SHARE_COARSE = 0.001, 0.25  # of the first one's gain a further one must bring
+_NEXT = 0.02  # tie of which the simpler is chosen
+_FINE, _COARSE = (
+    0.06,
+    0.15,
+)  # and of what is not told apart: by the accelerometer; by plain telemetry, whose baseline is wrong by about as much
 _GUSTS = 1.2, 1.5  # of the air channels' scatter over the usual: least, median
 _LEAST_TIE = 20.0
 
@@ -55,7 +59,7 @@ def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: Non
         say(f"effect {len(named) + 1}")
         found = best(sight, [one.found.guess for one in named])
         ranking = ranking or found
-        found = [one for one in found if one.gain > needed(sight, named, one) and not sound(sight, one.guess)]
+        found = [one for one in found if one.gain > needed(sight, named, one) and believable(sight, one.guess)]
         if not found:
             break
         more = [*named, choose(sight, found)]
@@ -82,7 +86,8 @@ class Joint:
     def better(self, more: list[Named], fewer: list[Named]) -> bool:
         """Tell whether one more is worth it: together they gain enough, and do not merely cancel each other."""
         gain = self.gain(more)
-        cancelling = max(one.found.gain for one in more) > _CANCEL * gain
+        without = min(self.gain([one for one in more if one is not left]) for left in more)
+        cancelling = gain - without > _CANCEL * gain
         return not cancelling and gain - self.gain(fewer) > needed(self._sight, fewer, more[-1].found)
 
 
@@ -122,7 +127,7 @@ def tie(sight: Sight, found: Found) -> float:
 def choose(sight: Sight, found: list[Found]) -> Named:
     """Choose the guess of fewest numbers among the best that tie; the others are its rivals."""
     first = found[0]
-    near = [one for one in found if rank(sight, one) > rank(sight, first) - max(_LEAST_TIE, _FINE * first.gain)]
+    near = [one for one in found if rank(sight, one) > rank(sight, first) - max(_LEAST_TIE, _NEXT * first.gain)]
     chosen = min(near, key=lambda one: (one.guess.size, -rank(sight, one)))
     rivals: dict[str, Found] = {}
     for one in found:
@@ -142,14 +147,15 @@ def needed(sight: Sight, named: list[Named], found: Found) -> float:
     return max(_SECOND, least, chance, (_SHARE if sight.base.vane else _SHARE_COARSE) * named[0].found.gain)
 
 
-def sound(sight: Sight, guess: Guess) -> bool:
-    """Tell whether a guess is but a sensor's bias such as data sheets allow for."""
+def believable(sight: Sight, guess: Guess) -> bool:
+    """Tell whether a guess is more than a sensor's bias such as data sheets allow for, and none of its numbers absurd."""
     bounds = {
         n.index: n.released * max(sight.base.spread.get(n.name, n.floor), n.floor)
         for n in sight.nuisances
         if n.sensor and (n.effect.name, n.of) == (guess.effect.name, guess.of)
     }
-    return bool(bounds) and all(abs(x) < bounds[k] for k, x in enumerate(guess.par))
+    sound = bool(bounds) and all(abs(x) < bounds[k] for k, x in enumerate(guess.par))
+    return not sound and all(abs(x) >= p.least for p, x in zip(guess.effect.parameters, guess.par, strict=True))
 
 
 def _again(sight: Sight, named: list[Named], weather: tuple[Guess, ...]) -> list[Named]:

@@ -77,7 +77,8 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     errors = [foretell.rms(case, force.measured - x) for x in (force.base, force.model)]
     outcome = _outcome(findings, proof, 1.0 - errors[1] / errors[0], before, after)
     odds = () if any(one.guess.effect.variance for one in findings) else oddities(sight)
-    strange = next((odd for odd in odds if _strange(odd, base, findings if outcome is Outcome.NAMED else ())), None)
+    believed = findings if outcome is Outcome.NAMED else ()
+    strange = next((odd for odd in odds if _strange(odd, base, believed, after[CHANNELS.index(odd.channel)])), None)
     if strange is not None:
         outcome = Outcome.UNKNOWN
     series = _series(case, white_before, white_after, force)
@@ -111,10 +112,12 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     return sentence(report)
 
 
-def _strange(odd: Odd, base: Baseline, named: tuple[Finding, ...]) -> bool:
-    """Tell whether a channel's equation changed in a way that names do not explain."""
+def _strange(odd: Odd, base: Baseline, named: tuple[Finding, ...], loud: float) -> bool:
+    """Tell whether a channel's equation changed in a way that names do not explain; `loud`: its residual over usual."""
+    if not named:
+        return odd.worth > odd.limit(base)
     gained = sum(one.gain for one in named)
-    return odd.worth > max(odd.limit(base) * (_AGAINST if named else 1.0), _BESIDE * gained)
+    return odd.worth > _AGAINST * odd.limit(base) and (odd.worth > _BESIDE * gained or loud > _LEFT)
 
 
 def _fits(flight: Flight, base: Baseline) -> None:

@@ -15,6 +15,7 @@ CLIP = 6.0  # whitened residuals beyond count as much [-]; or
 _WIDE = 3.0  # beyond so many times the scatter a channel has on this flight
 _TIGHT = 1e14  # precision of a nuisance that was handed to the hypotheses
 _QUIETEST = 0.45  # a flight may be quieter than the nominal ones by this much
+_SURGE = 1.3
 _LOUDEST = 3.0  # and, where weather is nominal, louder in the air's channels by this
 _AIR = [CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed")]
 _AIR += [CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z")]
@@ -64,6 +65,8 @@ class Sight:
         highest = np.ones(len(CHANNELS))
         if is_weather(self.base):
             highest[_AIR] = _LOUDEST
+            if self.base.vane:  # gusts hardly reach the axial force; surges of the engine do
+                highest[CHANNELS.index("force_x")] = _SURGE
         return replace(noise, sigma=noise.sigma * np.clip(scatter, _QUIETEST, highest))
 
     def whitened(self, guesses: Sequence[Guess]) -> np.ndarray:
