@@ -7,7 +7,7 @@
     parauav/{uav}/params                 Params       gateway  autopilot parameters
     parauav/{uav}/model                  Model        worker   identified model with its verdict
     parauav/{uav}/prediction             Prediction   worker   mean path, tube, horizon; also answers queries
-    parauav/{uav}/mismatch               Mismatch     worker   where, what physics, fit before and after
+    parauav/{uav}/mismatch               Mismatch     worker   where, what physics, fit before and after; queries too
     parauav/{uav}/alert                  Alert        worker   predicted conflict, fence, ground, …; answers queries
     parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; answers queries
     parauav/@gateway/{writer}            Account      gateway  counters of one gateway; answers queries
@@ -274,6 +274,9 @@ class Model(Message, frozen=True, kw_only=True):
     interpolated: Annotated[float, Meta(description="share of the window that was interpolated, 0..1")] = 0.0
     wind_n: Annotated[float, Meta(description="estimated wind, north, the direction it blows to [m/s]")] = 0.0
     wind_e: Annotated[float, Meta(description="estimated wind, east [m/s]")] = 0.0
+    extended: Annotated[
+        str, Meta(description="missing physics put into the model in force, since when; empty: as identified")
+    ] = ""
 
 
 class State(StrEnum):
@@ -409,19 +412,59 @@ class WhatIf(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     params: Annotated[dict[str, float], Meta(description="parameters, in the autopilot's names and units")] = {}
 
 
+class Found(StrEnum):
+    """What became of a diagnosis."""
+
+    NONE = "none"
+    SUSPECTED = "suspected"
+    NAMED = "named"
+    UNKNOWN = "unknown"
+
+
+class Cause(msgspec.Struct, frozen=True, kw_only=True):
+    """One effect that explains the flight, named or suspected."""
+
+    name: Annotated[str, Meta(description="effect, as `fleet effects` lists it; unknown: none of them")]
+    channel: Annotated[str, Meta(description="where it lives, e.g. actuator, thrust, air, airspeed, or a residual")] = (
+        ""
+    )
+    surface: Annotated[str, Meta(description="aileron, elevator, rudder, all surfaces; empty: no surface")] = ""
+    rivals: Annotated[tuple[str, ...], Meta(description="effects it cannot be told from by this flight")] = ()
+    segments: Annotated[
+        tuple[tuple[float, float], ...], Meta(description="when, from and to; the last to the newest [s since 1970]")
+    ] = ()
+    parameters: Annotated[dict[str, float], Meta(description="its numbers, unit in the name")] = {}
+    sigma: Annotated[dict[str, float], Meta(description="their standard deviations, same names and units")] = {}
+
+
 class Mismatch(Message, frozen=True, kw_only=True):
-    """Where flight and twin part ways, and what physics explains it."""
+    """Where flight and twin part ways, and what physics explains it; answers queries."""
 
     topic: ClassVar[str] = "mismatch"
 
-    name: Annotated[str, Meta(description="effect named, or unknown")]
-    rivals: tuple[str, ...] = ()
-    segments: Annotated[tuple[tuple[float, float], ...], Meta(description="located, [s since 1970]")] = ()
-    parameters: dict[str, float] = {}
-    sigma: dict[str, float] = {}
-    fit_before: Annotated[float, Meta(description="[%]")] = 0.0
-    fit_after: Annotated[float, Meta(description="[%]")] = 0.0
-    sentence: str = ""
+    outcome: Annotated[
+        Found, Meta(description="named: proven on data held out; suspected: not; unknown: no effect explains it")
+    ] = Found.NONE
+    causes: Annotated[tuple[Cause, ...], Meta(description="the most telling first; empty for none")] = ()
+    fit_before: Annotated[
+        float | None,
+        Meta(description="rms residual on data held out [standard deviations of nominal flight]; null: not proven"),
+    ] = None
+    fit_after: Annotated[
+        float | None, Meta(description="the same with the causes in the simulation [standard deviations]")
+    ] = None
+    force_before: Annotated[float | None, Meta(description="rms error of specific force, held out [m/s2]")] = None
+    force_after: Annotated[float | None, Meta(description="the same with the causes [m/s2]")] = None
+    stray_before: Annotated[float | None, Meta(description="rms attitude error of free flights of 5 s [deg]")] = None
+    stray_after: Annotated[float | None, Meta(description="the same with the causes [deg]")] = None
+    seen_t0: Annotated[float, Meta(description="first instant of the flight it was diagnosed on [s since 1970]")] = 0.0
+    adapted: Annotated[bool, Meta(description="true: predictions are flown with the causes in the model")] = False
+    sentence: Annotated[str, Meta(description="all of it in one sentence, and which model predicts")] = ""
+
+    @property
+    def onset(self) -> float | None:
+        """Give when the first cause began [s since 1970]; None where there is none."""
+        return self.causes[0].segments[0][0] if self.causes and self.causes[0].segments else None
 
 
 class AlertKind(StrEnum):
@@ -478,6 +521,7 @@ class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     t10_n: Annotated[int, Meta(description="past predictions behind `t10_s`")] = 0
     epoch: Annotated[int, Meta(description="claim epoch of the writer")] = 0
     alerts: Annotated[tuple[str, ...], Meta(description="sentences of the alerts in force")] = ()
+    mismatch: Annotated[str, Meta(description="what was found in words, e.g. named thrust_loss; empty: nothing")] = ""
 
 
 class FleetState(msgspec.Struct, frozen=True, kw_only=True):

@@ -18,12 +18,15 @@ from fleet.contract import (
     Alert,
     AlertKind,
     Array,
+    Cause,
     Controller,
     Event,
     FleetRow,
     FleetState,
+    Found,
     Item,
     Link,
+    Mismatch,
     Mission,
     Model,
     Outcome,
@@ -180,6 +183,31 @@ class PretendUav:
         text = "horizon 4 s is shorter than the 10 s to the next leg"
         return Alert(uav=6, t=t, kind=AlertKind.SHORT_HORIZON, sentence=text) if self.uav == 6 else None
 
+    def mismatch(self, t: float) -> Mismatch | None:
+        """Give a named effect since a minute ago, of one UAV, and of a hostile one all its words."""
+        if self.uav != 2 and not self.text:
+            return None
+        cause = Cause(
+            name=self.text or "control_effectiveness_loss",
+            channel=self.text or "actuator",
+            surface=self.text or "aileron",
+            segments=((t - 60.0, t),),
+            parameters={self.text or "loss": 0.5},
+            sigma={self.text or "loss": 0.03},
+        )
+        return Mismatch(
+            uav=self.uav,
+            t=t,
+            outcome=Found.NAMED,
+            causes=(cause,),
+            fit_before=1.94,
+            fit_after=1.07,
+            force_before=0.41,
+            force_after=0.22,
+            adapted=True,
+            sentence=self.text or "control_effectiveness_loss of the aileron after 120 s (loss 0.5 ± 0.03)",
+        )
+
     def row(self) -> FleetRow:
         return FleetRow(
             uav=self.uav, state=self.state, verdict=self.text, worker="000000000000abcd", epoch=1, t10_s=17.5, t10_n=9
@@ -202,6 +230,7 @@ class PretendFleet:
             Model: lambda uav: uav.model(self._t),
             Prediction: lambda uav: uav.prediction(self._t, 0.0),
             Alert: lambda uav: uav.alert(self._t),
+            Mismatch: lambda uav: uav.mismatch(self._t),
         }.items():
             bus.answer(kind, self._reply(make))
 
@@ -235,8 +264,9 @@ class PretendFleet:
         if first:
             for one in self.uavs:
                 self._bus.publish(one.mission(t))
-                if (alert := one.alert(t)) is not None:
-                    self._bus.publish(alert)
+                for found in (one.alert(t), one.mismatch(t)):
+                    if found is not None:
+                        self._bus.publish(found, STAMP)
         self._bus.publish(FleetState(t=t, rows=tuple(one.row() for one in self.uavs)), STAMP)
 
 

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from fleet.contract import State
+from viewer.mismatch import in_force, short
 from viewer.palette import GLYPH
 from viewer.vehicle import Vehicle
 from viewer.words import ago, severity
@@ -26,7 +27,7 @@ class Callouts:
     def draw(self, fleet: list[Vehicle], now: float, *, selected: int | None, size: float) -> None:
         """Name alerts and lost links; `now` is monotonic [s], `size` is the drawn span of an aircraft [10 m]."""
         flying = [v for v in fleet if v.uav != selected and not v.ended]
-        worst = [v for v in flying if v.alerts or v.state(now) is State.LINK_LOST]
+        worst = [v for v in flying if v.alerts or in_force(v.mismatch) or v.state(now) is State.LINK_LOST]
         worst = [v for v in sorted(worst, key=lambda v: severity(v, now)) if v.where(now) is not None][:LABELS]
         for label, vehicle in zip(self._labels, worst, strict=False):
             at = vehicle.where(now)
@@ -42,4 +43,6 @@ def caption(vehicle: Vehicle, now: float) -> str:
     if vehicle.state(now) is State.LINK_LOST:
         return f"{GLYPH[State.LINK_LOST]} {vehicle.name} link lost {ago(vehicle.age(now))}"
     kinds = ", ".join(dict.fromkeys(alert.kind.value.replace("_", " ") for alert in vehicle.alerts.values()))
+    if vehicle.mismatch is not None and in_force(vehicle.mismatch):
+        kinds = ", ".join(filter(None, (short(vehicle.mismatch), kinds)))
     return f"▲ {vehicle.name} {kinds}"

@@ -4,6 +4,7 @@ from html import escape
 from math import isfinite
 
 from fleet.contract import Controller, Outcome, State
+from viewer import mismatch
 from viewer.datatime import stamp, times
 from viewer.palette import Palette
 from viewer.vehicle import Vehicle
@@ -83,6 +84,7 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
         f'<div class="say" style="border-color:{palette.mismatch}">▲ {escape(a.sentence)}</div>'
         for a in vehicle.alerts.values()
     ]
+    cards.insert(0, mismatch.card(vehicle.mismatch, palette))
     said = why(vehicle, now)
     cards += [f'<div class="say">{escape(text)}</div>' for text in said]
     verdict = vehicle.model.verdict if vehicle.model is not None else None

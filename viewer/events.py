@@ -14,8 +14,10 @@ from fleet.contract import (
     About,
     Alert,
     AlertKind,
+    Found,
     Item,
     Link,
+    Mismatch,
     Mission,
     Model,
     Outcome,
@@ -31,6 +33,7 @@ MAX_EVENTS = 200  # kept of one UAV; the oldest go first
 MAX_RAISED = 64  # alerts of one UAV in force at once; more are a stranger's
 MAX_WORDS = 200  # letters kept of a sentence from outside
 QUIET_S = 2.5  # a gateway that has not spoken for so long leaves it to the worker to call the link lost [s]
+MAX_CAUSES = 8  # names of a mismatch believed
 MAX_STEPS = 20  # changes of the mission item believed of one sample
 LASTS_S = 12.0  # tries that fail for so long throw doubt on a model: about three verdicts [s]
 LATEST = 4e9  # times beyond are noise [s since 1970]
@@ -47,6 +50,7 @@ class Kind(StrEnum):
     DISARMED = "disarmed"
     WARNING = "warning"
     ALERT = "alert"
+    MISMATCH = "mismatch"
     EASED = "eased"
     LOST = "lost"
     BACK = "back"
@@ -85,6 +89,7 @@ class Known(NamedTuple):
     verdict: str | None = None  # last told of: none (no model), sound or doubted; None before any
     sound_t: float = -np.inf  # when a try last was sound [s since 1970]
     raised: frozenset[About] = frozenset()  # alerts in force, by `Alert.about`
+    found: tuple[str, ...] = ()  # outcome and names of the mismatch last told
     told_t: float = 0.0  # when the event was that predictions last told [s since 1970]
 
 
@@ -151,6 +156,18 @@ def _alert(known: Known, alert: Alert) -> Told:
         return known, []
     said = _own_words(alert.sentence, alert.uav) or name
     return known._replace(raised=known.raised | {alert.about}), [Event(alert.t, Kind.ALERT, said)]
+
+
+def _mismatch(known: Known, told: Mismatch) -> Told:
+    """Tell of a mismatch where its outcome or its names are news; a suspicion and none at all are no event."""
+    stands = told.outcome in (Found.NAMED, Found.UNKNOWN)
+    found = (told.outcome.value, *(one.name for one in told.causes[:MAX_CAUSES])) if stands else ()
+    if found == known.found:
+        return known, []
+    known = known._replace(found=found)
+    if not stands:
+        return known, [Event(told.t, Kind.EASED, "the mismatch is over")]
+    return known, [Event(told.t, Kind.MISMATCH, _own_words(told.sentence, told.uav) or "mismatch")]
 
 
 def _mission(known: Known, mission: Mission) -> Told:
@@ -248,6 +265,7 @@ def _clip(text: str) -> str:
 _TELLS: dict[type, Callable[[Known, Any], Told]] = {
     Status: _status,
     Alert: _alert,
+    Mismatch: _mismatch,
     Mission: _mission,
     Sample: _sample,
     Model: _model,

@@ -10,7 +10,19 @@ import numpy as np
 
 from fleet.bus import Bus, key
 from fleet.codec import Stamp
-from fleet.contract import Account, Alert, AlertKind, FleetState, Mission, Model, Prediction, Sample, State, Status
+from fleet.contract import (
+    Account,
+    Alert,
+    AlertKind,
+    FleetState,
+    Mismatch,
+    Mission,
+    Model,
+    Prediction,
+    Sample,
+    State,
+    Status,
+)
 from fleet.frames import Origin
 from viewer.events import MAX_RAISED
 from viewer.place import Place, TooFar
@@ -25,6 +37,7 @@ LATE = (
     Model,
     Prediction,
     Alert,
+    Mismatch,
     FleetState,
     Account,
 )  # asked for at the start, so that a late viewer is complete
@@ -49,6 +62,7 @@ class Feed:
             Model: self._model,
             Prediction: self._prediction,
             Alert: self._alert,
+            Mismatch: self._mismatch,
             FleetState: self._fleet,
         }
         self._hears = hears
@@ -202,6 +216,12 @@ class Feed:
         coasting = message.coast_s > COASTING_S
         if not coasting and (not vehicle.past or found.t - vehicle.past[-1].t >= 0.9):
             vehicle.past.append(found)
+
+    def _mismatch(self, found: Mismatch, stamp: Stamp | None, now: float) -> None:
+        vehicle = self._vehicle(found.uav)
+        if self._believe(vehicle, stamp.epoch if stamp else 0, now) and np.isfinite(found.t):
+            vehicle.mismatch = found
+            vehicle.note(found, now)
 
     def _account(self, account: Account, _: Stamp | None, now: float) -> None:
         """Learn who is played from a recording, and that the player still speaks; one who flies now is live again."""

@@ -88,7 +88,7 @@ class Panels:
             self._table.content = table(
                 kept, self._palette, now, total=len(fleet), pick=self._handler(), selected=selected
             )
-        self._alerts.content = alerts(feed, self._palette)
+        self._alerts.content = alerts(fleet, feed, self._palette)
         nobody = '<div class="uav soft">Nobody is selected: click a row or an aircraft, or press Ctrl+K.</div>'
         self._about.content = about(chosen, self._palette, now) if chosen is not None else nobody
         self._facts.content = facts(chosen, now) if chosen is not None else ""

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from fleet.contract import State
+from viewer import mismatch
 from viewer.feed import Feed
 from viewer.palette import Palette, mix, rgb, triple
 from viewer.pins import Pins
@@ -17,7 +18,7 @@ from viewer.words import CLAIMS_S
 BANDS, BAND_STEPS = 4, 20  # the tube fades in bands, each of so many slices
 HINDCAST_S = 25.0  # how old the prediction is that is laid beside what happened
 BEYOND_S = 20.0  # how far past the horizon the grey dashes go
-LABELS = ("name", "horizon", "m0", "m1", "m2", "m3", "then")
+LABELS = ("name", "horizon", "m0", "m1", "m2", "m3", "then", "mismatch")
 
 
 class Selection:
@@ -35,6 +36,7 @@ class Selection:
         self._thin = Strokes(self._scene, "/selected/thin", 1.4)
         self._flown = Strokes(self._scene, "/selected/flown", 1.6)
         self._pins = Pins(server, palette)
+        self._mismatch = Strokes(self._scene, "/selected/mismatch", 4.4)
         self._route = Strokes(self._scene, "/selected/route", 2.0)
         self._bold = Strokes(self._scene, "/selected/bold", 2.7)
         self._horizon = Strokes(self._scene, "/selected/horizon", 3.6)
@@ -73,7 +75,7 @@ class Selection:
 
     def clear(self) -> None:
         """Hide everything: nobody is selected."""
-        for strokes in (self._thin, self._flown, self._route, self._bold, self._horizon):
+        for strokes in (self._thin, self._flown, self._route, self._bold, self._horizon, self._mismatch):
             strokes.draw(NOTHING.legs)
         self._pins.draw((), NOTHING.points, None, 1.0)
         for node in (*self._bands, self._curtain, *self._labels.values()):
@@ -174,6 +176,11 @@ class Selection:
         """Draw the whole flown path (n, 4), faintly, with what happened on it; `size` as for `draw`."""
         self._flown.draw(chain(rows[:, 1:]) if len(rows) > 1 else NOTHING.legs, self._flown_colour)
         self._pins.draw(vehicle.events, rows, vehicle.where(now), size)
+        found = vehicle.mismatch
+        self._mismatch.draw(mismatch.lines(found, rows), rgb(self._palette.mismatch))
+        begun = mismatch.place(found, rows)
+        said = f"▲ {mismatch.short(found)} from here" if found is not None and begun is not None else ""
+        self.say("mismatch", said, begun)
 
     def draw_route(self, route: Route, size: float) -> None:
         """Draw the mission: legs and loiters solid, jumps and returns dashed, a small ring at each item."""

@@ -14,6 +14,7 @@ from fleet.contract import (
     Controller,
     FleetRow,
     Link,
+    Mismatch,
     Mission,
     Model,
     Prediction,
@@ -114,6 +115,7 @@ class Vehicle:
     mission: Mission | None = None
     model: Model | None = None
     prediction: Prediction | None = None
+    mismatch: Mismatch | None = None
     controller: Controller | None = None  # the law in force, as last told
     forecast: Forecast | None = None
     row: FleetRow | None = None
@@ -241,6 +243,6 @@ class Vehicle:
         self.at, self.alerts, self.floor = None, {}, np.nan
         self.time, self.known, self.events = DataTime(), Known(), ()
         self.t, self.forecast, self.prediction, self.model, self.row = -np.inf, None, None, None, None
-        self.controller = None
+        self.controller = self.mismatch = None
         for history in (self.trail, self.past, self.fits, self.track):
             history.clear()

@@ -9,6 +9,7 @@ from fleet.contract import State
 from viewer.datatime import stamp, times
 from viewer.events import Kind
 from viewer.feed import Feed
+from viewer.mismatch import in_force, short
 from viewer.palette import GLYPH, MARK, WORD, Palette
 from viewer.vehicle import Vehicle
 
@@ -37,7 +38,7 @@ def standing(vehicle: Vehicle, palette: Palette, now: float) -> Standing:
 def severity(vehicle: Vehicle, now: float) -> tuple[bool, int, float, int]:
     """Rank a UAV: alerts first, then the worst state, then the shortest horizon; ended recordings last."""
     rank = len(SEVERITY) if vehicle.ended else SEVERITY.index(vehicle.state(now))
-    return (not vehicle.alerts, rank, horizon_s(vehicle), vehicle.uav)
+    return (not (vehicle.alerts or in_force(vehicle.mismatch)), rank, horizon_s(vehicle), vehicle.uav)
 
 
 def horizon_s(vehicle: Vehicle) -> float:
@@ -124,9 +125,12 @@ def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pic
 
 def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, *, on: bool, longest: float) -> str:
     one, horizon, mean = standing(vehicle, palette, now), horizon_s(vehicle), fit(vehicle)
-    colour = palette.mismatch if vehicle.alerts else one.colour
-    glyph = "▲" if vehicle.alerts else one.glyph
+    warned = bool(vehicle.alerts) or in_force(vehicle.mismatch)
+    colour = palette.mismatch if warned else one.colour
+    glyph = "▲" if warned else one.glyph
     word = f"{one.word} {ago(vehicle.age(now))}" if one.word == WORD[State.LINK_LOST] else one.word
+    if vehicle.mismatch is not None and in_force(vehicle.mismatch):
+        word += f'<br><span style="color:{palette.mismatch}">{escape(short(vehicle.mismatch))}</span>'
     bar = f'<i><i style="width:{min(horizon / longest, 1) * 100:.0f}%;background:{colour}"></i></i>'
     percent, seconds = "–" if mean is None else f"{mean:.0f}", f"{horizon:.0f} s" if horizon >= CLAIMS_S else "–"
     return (
@@ -138,10 +142,16 @@ def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, *, on: bool,
     )
 
 
-def alerts(feed: Feed, palette: Palette) -> str:
-    """List the alerts in force, newest first, at most 50."""
+def alerts(fleet: list[Vehicle], feed: Feed, palette: Palette) -> str:
+    """List the mismatches and the alerts in force, newest first, at most 50 of each."""
     found = feed.alerts()
+    strange = [(v, v.mismatch) for v in fleet if v.mismatch is not None and in_force(v.mismatch)]
     cards = "".join(
+        f'<div class="say" style="border-color:{palette.mismatch}"><b>▲ {vehicle.name}</b> '
+        f'<span class="soft">mismatch</span><br>{escape(short(told))}</div>'
+        for vehicle, told in sorted(strange, key=lambda one: -one[1].t)[:MAX_ROWS]
+    )
+    cards += "".join(
         f'<div class="say" style="border-color:{palette.mismatch}"><b>▲ {vehicle.name}</b> '
         f'<span class="soft">{escape(kind.value.replace("_", " "))}</span><br>{escape(alert.sentence)}</div>'
         for vehicle, kind, alert in found[:MAX_ROWS]

@@ -66,6 +66,7 @@ def table(rows: list[FleetRow]) -> Table:
         fit = f"{sum(row.fit.values()) / len(row.fit):.0f}" if row.fit else "-"
         horizon = f"{row.horizon_s:.0f}" if row.horizon_s else "-"
         age = "-" if row.sample_age_s is None else f"{row.sample_age_s:.1f}"
-        said = "\n".join((*(f"! {escape(alert)}" for alert in row.alerts), escape(row.verdict)))
+        found = [f"▲ mismatch: {escape(row.mismatch)}"] if row.mismatch else []
+        said = "\n".join((*(f"! {escape(alert)}" for alert in row.alerts), *found, escape(row.verdict)))
         out.add_row(str(row.uav), row.state.value, fit, horizon, age, said)
     return out
