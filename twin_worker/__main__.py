@@ -2,16 +2,22 @@
 
 import argparse
 import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fleet.airframes import GENERIC, load
 from fleet.bus import ROUTER, connect
 from fleet.cli import guarded, id_range, parser_for, stop_on_signal
 from fleet.contract import FleetState
 
+if TYPE_CHECKING:
+    from twin_worker.diagnose.baseline import Baseline
+
 EXAMPLES = """
   twin_worker --uavs 0-49
   twin_worker --uavs 0-9 --airframe my_aircraft.toml       copy fleet/airframes/small_fixed_wing.toml and fill it in
   twin_worker --uavs 50-99 --router tcp/192.168.1.10:7447
+  twin_worker --uavs 0-9 --baseline skywalker.json         what `fleet calibrate` wrote; otherwise each one's own past
 """
 
 
@@ -26,16 +32,33 @@ def _two_metres(text: str) -> tuple[float, float]:
     return wide, high
 
 
+def _base(path: Path | None) -> "Baseline | None":
+    """Read what every aircraft is compared with.
+
+    Raises:
+        ValueError: when the file is none; the sentence says what is wrong.
+        OSError: when it cannot be read.
+    """
+    if path is None:
+        return None
+    from twin_worker.diagnose.keep import load as load_baseline
+
+    return load_baseline(path)[0]
+
+
 def _run(args: argparse.Namespace) -> int:
-    airframe = load(args.airframe)
+    airframe, base = load(args.airframe), _base(args.baseline)
     stop = stop_on_signal()
     with connect(args.router) as bus:
         bus.present(f"worker/{bus.writer:016x}/{args.uavs.start}-{args.uavs.stop - 1}")
         bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
         from twin_worker.conflict.separation import Separation
+        from twin_worker.mismatch.background import Background
+        from twin_worker.mismatch.live import Live
         from twin_worker.warm import warm_up  # numba is slow to import: say what happens first
         from twin_worker.worker import Worker
 
+        hand = Background()
         worker = Worker(
             bus,
             args.uavs,
@@ -43,6 +66,7 @@ def _run(args: argparse.Namespace) -> int:
             method=args.method,
             airframe=airframe,
             separation=Separation(*args.separation),
+            diagnosis=None if args.no_diagnosis else Live(hand, base, adapt=not args.no_adapt),
         )
         worker.listen()
         worker.sentence = "compiling the twin's physics, once"
@@ -50,7 +74,10 @@ def _run(args: argparse.Namespace) -> int:
         warm_up()
         worker.sentence = ""
         print(f"twin_worker: holding UAVs {args.uavs.start}-{args.uavs.stop - 1}", flush=True)
-        worker.run(stop)
+        try:
+            worker.run(stop)
+        finally:
+            hand.close()
     return 0
 
 
@@ -77,6 +104,14 @@ def main(argv: list[str] | None = None) -> int:
         metavar="M,M",
         help="two aircraft nearer than both, over ground and in height, have lost separation (50,20)",
     )
+    parser.add_argument(
+        "--baseline",
+        type=Path,
+        metavar="MODEL",
+        help="compare every aircraft with this model, from `fleet calibrate` (each with its own first 110 s)",
+    )
+    parser.add_argument("--no-adapt", action="store_true", help="diagnose, but predict as if nothing was found")
+    parser.add_argument("--no-diagnosis", action="store_true", help="do not diagnose at all")
     args = parser.parse_args(argv)
     return guarded("twin_worker", _run, args)
 

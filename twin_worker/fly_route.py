@@ -30,37 +30,37 @@ def fly_route(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
         return nothing(start.sentence, start.seq)
     t = float(window.t[-1])
     due = twin.contest.due(t)
-    paths, why = _paths(twin, (now, start), ahead, due)
-    if not paths:
+    flown, why = paths(twin, (now, start), ahead, due)
+    if not flown:
         return nothing(why or "no model was believed yet", start.seq)
-    if due and len(paths) > 1 and not twin.lost:
-        twin.contest.keep(t, float(np.linalg.norm(start.good.v[-1])), ahead, paths)
+    if due and len(flown) > 1 and not twin.lost:
+        twin.contest.keep(t, float(np.linalg.norm(start.good.v[-1])), ahead, flown)
     _spread(twin, (now, start))
-    chosen = twin.contest.best(tuple(paths))
+    chosen = twin.contest.best(tuple(flown))
     sentence = " ".join(filter(None, (twin.contest.said(chosen), start.sentence)))
-    return Flight(paths[chosen], chosen, start.law.law, start.seq, sentence, start.law)
+    return Flight(flown[chosen], chosen, start.law.law, start.seq, sentence, start.law)
 
 
-def _paths(
+def paths(
     twin: Twin, begin: tuple[Situation, Start], ahead: np.ndarray, due: bool
 ) -> tuple[dict[str, np.ndarray], str]:
-    """Give the path of each method that flies, NED (k, 3) [m], and why another does not."""
-    paths: dict[str, np.ndarray] = {}
+    """Give the path of each method that flies, NED (k, 3) [m], and why another does not; `due`: all must fly."""
+    found: dict[str, np.ndarray] = {}
     why = ""
     if twin.hybrid is not None and twin.method in (HYBRID, "auto"):
         flown = fly_hybrid(*begin, twin.hybrid, ahead)
-        paths, why = _kept(paths, HYBRID, flown), flown.sentence
-    wanted = not paths or due or twin.contest.best((BOTH, HYBRID, DYNAMICS)) != HYBRID
+        found, why = _kept(found, HYBRID, flown), flown.sentence
+    wanted = not found or due or twin.contest.best((BOTH, HYBRID, DYNAMICS)) != HYBRID
     if twin.plant is not None and twin.method != HYBRID and wanted:
-        near = ahead[: np.searchsorted(ahead, max(_NEAR_S, ahead[0]), side="right")] if paths else ahead
+        near = ahead[: np.searchsorted(ahead, max(_NEAR_S, ahead[0]), side="right")] if found else ahead
         flown = fly_from(begin[1], twin.plant, near)
-        why = why if paths else flown.sentence
+        why = why if found else flown.sentence
         if flown.path is not None:
-            path = _lengthened(flown.path, paths[HYBRID]) if paths else flown.path
-            paths = {**paths, method(twin.plant): path}
-    if len(paths) > 1:
-        paths[BOTH] = 0.5 * (paths[HYBRID] + paths[method(twin.plant)])  # type: ignore[arg-type]
-    return paths, why
+            path = _lengthened(flown.path, found[HYBRID]) if found else flown.path
+            found = {**found, method(twin.plant): path}
+    if len(found) > 1:
+        found[BOTH] = 0.5 * (found[HYBRID] + found[method(twin.plant)])  # type: ignore[arg-type]
+    return found, why
 
 
 def _kept(paths: dict[str, np.ndarray], name: str, flown: Flown) -> dict[str, np.ndarray]:

@@ -10,11 +10,12 @@ from fleet.contract import SENTENCES, Array, Controller, Event, Message, Predict
 from twin_worker.calibration.groups import airframe_class, group_of
 from twin_worker.control import IDENTIFIED, Control
 from twin_worker.events.note import note
-from twin_worker.fly_route import fly_route, in_force
+from twin_worker.fly_route import BOTH, HYBRID, fly_route, in_force
 from twin_worker.horizon import AHEAD, QUANTILE, Made, Trust
 from twin_worker.imm import turn_on
 from twin_worker.kinds import Flight, fly_kind, hangs, nothing, seen
 from twin_worker.memory import Twin
+from twin_worker.plant import DYNAMICS
 from twin_worker.predict import LEAST_AHEAD_S
 from twin_worker.track import Track
 
@@ -22,6 +23,7 @@ _LOOK_BACK_S = 62.0  # telemetry a prediction starts from [s]
 _TELL_S = 10.0  # between laws and parameters that are no news [s]
 _STALE_S = 3.0  # positions older than other telemetry by more say nothing of now [s]
 _MISSED = 2  # autopilot parameters that may be lacking where they count as known [-]
+_LEARNT = (BOTH, HYBRID, DYNAMICS)
 _IMM_LAW, _NO_LAW = "none: turn rate only", "none: on the ground"
 
 
@@ -60,7 +62,7 @@ def foresee(twin: Twin, now: float) -> list[Message]:
     twin.prediction = msgspec.structs.replace(
         prediction,
         seq=made.seq,
-        sentence=" ".join(part for part in (_ago(twin, coast), made.sentence) if part),
+        sentence=" ".join(filter(None, (_ago(twin, coast), _with(twin, made), made.sentence))),
         coast_s=coast,
         law=made.law,
         controller=_controller(twin, made, now),
@@ -109,6 +111,11 @@ def _close(twin: Twin, coast: float, now: float) -> list[Message]:
 
 def _ago(twin: Twin, coast: float) -> str:
     return f"{'link lost' if twin.lost else 'positions stopped'} {coast:.0f} s ago" if coast or twin.lost else ""
+
+
+def _with(twin: Twin, made: Flight) -> str:
+    """Say what missing physics is in the model that flew; empty where it is as learnt."""
+    return f"flown with {twin.extended};" if twin.extended is not None and made.method in _LEARNT else ""
 
 
 def _event(twin: Twin) -> dict[str, Any]:

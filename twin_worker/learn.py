@@ -127,7 +127,7 @@ def _on_wings(twin: Twin, window: Window | None) -> Window | None:
     if window is None:
         return None
     slow = window.ok & (window.columns(("u",))[:, 0] < SLOW)
-    start = _after(slow, 0)
+    start = max(_after(slow, 0), int(np.searchsorted(window.t, twin.learn_from)))
     if twin.vehicle == QUADPLANE:
         hung = lifted(window.t, twin.history, twin.params.values if twin.params else {}, twin.modes)
         start = max(start, _after(slow | hung, int(SETTLE_S / DT)))

@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from twin_worker.history import History
 from twin_worker.horizon import Record
 from twin_worker.hybrid.fit import Hybrid
 from twin_worker.learn_law import OWN, Learnt
+from twin_worker.mismatch.marks import MOST, Mark
 from twin_worker.plant import Plant
 from twin_worker.predict import Onboard, Situation
 from twin_worker.preprocess import Grid
@@ -70,6 +72,17 @@ class Believed:
         return (True, -self.t) if np.isnan(self.miss) else (False, self.miss)
 
 
+@dataclass(frozen=True)
+class Extension:
+    """Missing physics that was put into the model in force: names of the effects, and their onset [s since 1970]."""
+
+    names: str
+    onset: float
+
+    def __str__(self) -> str:
+        return f"{self.names} since {datetime.fromtimestamp(self.onset, UTC):%H:%M:%S} UTC"
+
+
 @dataclass
 class Twin:
     """One aircraft's twin: what was heard of it, the model in force, and how past predictions fared."""
@@ -102,6 +115,9 @@ class Twin:
     contest: Contest = field(default_factory=Contest)
     spread: np.ndarray | None = None  # of the newest ensemble, along, cross, vertical, (k, 3) [m]
     earned: Earned = field(default_factory=Earned)
+    marks: deque[Mark] = field(default_factory=lambda: deque(maxlen=MOST))  # of the last minutes
+    extended: Extension | None = None  # what a diagnosis has put into the models in force
+    learn_from: float = -np.inf  # nothing is learnt from telemetry before [s since 1970]
     verdict: Verdict = field(default_factory=_unheard)
     pool: list[Believed] = field(default_factory=list)
     in_force: Verdict | None = None  # the verdict `plant` was believed on
@@ -233,7 +249,9 @@ def _hear_status(twin: Twin, status: Status) -> None:
         twin.grid.clear()
         twin.wind.t = twin.wind_t = twin.identify_t = twin.score_t = -np.inf  # the new time may lie before
         twin.flown_t = twin.told_t = twin.back_t = twin.hybrid_t = twin.checked_t = -np.inf
-        twin.near = twin.last = None
+        twin.near = twin.last = twin.extended = None
+        twin.learn_from = -np.inf
+        twin.marks.clear()
         twin.data_t = twin.turned_t = -np.inf
         twin.ground = Ground()
         void(twin, Event.CLOCK, status.t)

@@ -15,6 +15,7 @@ DYNAMICS, PAPER = "dynamics", "paper"  # coupled, two linear axes
 Plant = Coupled | tuple[Axis, Axis]
 
 SETTLE_S = 40.0  # telemetry whose mean the model must meet [s]
+_LEAST_S = 4.0  # of it [s]
 _EVERY = 5  # rows between those it is held against
 _DRIVEN = np.array([0, 2, 4, 1, 3, 5])  # state each offset drives, in the order of `OFFSETS`
 
@@ -37,7 +38,10 @@ def settled(plant: Plant, good: Window) -> tuple:
         plant: the model
         good: newest telemetry, unbroken
     """
-    recent = good.part(max(len(good) - int(SETTLE_S / good.dt), 0), len(good))
+    newest = max(len(good) - int(SETTLE_S / good.dt), 0)
+    if isinstance(plant, Coupled):  # nothing from before the flight it is of
+        newest = max(newest, min(int(np.searchsorted(good.t, plant.t0)), len(good) - int(_LEAST_S / good.dt)))
+    recent = good.part(newest, len(good))
     if isinstance(plant, Coupled):
         return coupled_plant(_level(plant, recent), plant.at)
     return linear_plant(*(part for axis in plant for part in (_centred(axis, recent), axis.means)))

@@ -37,6 +37,7 @@ def model_message(twin: Twin, window: Window) -> Model:
         interpolated=float(window.filled.mean()),
         wind_n=float(twin.wind.wind[0]),
         wind_e=float(twin.wind.wind[1]),
+        extended=str(twin.extended or ""),
     )
 
 

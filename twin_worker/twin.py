@@ -7,6 +7,7 @@ import numpy as np
 from fleet.contract import Alert, Event, FleetRow, Link, Message, Sample, State
 from fleet.frames import to_ned
 from twin_worker import contest
+from twin_worker.blow import blow
 from twin_worker.conflict.watch import link, watch
 from twin_worker.events.note import note
 from twin_worker.events.watch import watch as watch_events
@@ -14,6 +15,7 @@ from twin_worker.foresee import foresee
 from twin_worker.kinds import command_in_force
 from twin_worker.learn import learn
 from twin_worker.memory import Twin, hear
+from twin_worker.mismatch.marks import EVERY_S, mark
 
 HOP_S = 1.0  # between identifications [s]
 PREDICT_S = 1.0  # between predictions [s]
@@ -21,6 +23,7 @@ LOST_S = 3.0  # without a sample: link lost [s]
 _TICK_S = 1.0  # between turns while data are silent, and between scorings [s]
 _BEFORE_S = 3.0  # positions from before those that were scored last, so that none falls between [s]
 _SILENT_TURNS = 150  # most of them [-]
+_LATE_S = 10.0  # velocities older than this come too late for the wind [s]
 _LATEST = 4e9  # times beyond are noise [s since 1970]
 
 
@@ -75,6 +78,7 @@ def _turn(twin: Twin, now: float) -> list[Message]:
     _blow(twin)
     if _due(now, twin.score_t, _TICK_S):
         twin.score_t = now
+        _remember(twin)
         watch_events(twin, command_in_force(twin))
         _score(twin)
     if not twin.lost and _due(now, twin.identify_t, HOP_S):
@@ -104,22 +108,17 @@ def _watch_link(twin: Twin, now: float) -> list[Message]:
 
 
 def _blow(twin: Twin) -> None:
-    """Feed the wind filter once a second, five rows a second."""
-    if twin.history.newest - twin.wind_t < 1.0:
-        return
-    since = max(twin.wind_t, twin.history.newest - 10.0)
-    t_v, v = twin.history.rows("velocity", since)
-    t_air, air = twin.history.rows("air", since - 1.0)
-    t_att, attitude = twin.history.rows("attitude", since - 1.0)
-    if not (len(t_air) and len(t_att)):
-        return
-    for k in range(len(t_v)):
-        if t_v[k] - twin.wind_t < 0.199:
-            continue
-        i, j = np.searchsorted(t_air, t_v[k]) - 1, np.searchsorted(t_att, t_v[k]) - 1
-        if i >= 0 and j >= 0 and t_v[k] - t_air[i] < 0.5 and t_v[k] - t_att[j] < 0.5:
-            twin.wind_t = float(t_v[k])
-            twin.wind.update(twin.wind_t, v[k], float(air[i, 0]), float(attitude[j, 2]))
+    """Feed the wind filter once a second."""
+    if twin.history.newest - twin.wind_t >= 1.0:
+        since = max(twin.wind_t, twin.history.newest - _LATE_S)
+        twin.wind_t = blow(twin.wind, twin.history, twin.wind_t, since)
+
+
+def _remember(twin: Twin) -> None:
+    """Mark what is known now, so that a fault found later can be gone back before."""
+    t = twin.wind_t
+    if np.isfinite(t) and not (twin.marks and twin.marks[-1].t <= t < twin.marks[-1].t + EVERY_S):
+        twin.marks.append(mark(t, twin.wind, (twin.last, twin.plant), twin.hybrid))
 
 
 def _score(twin: Twin) -> None:

@@ -59,6 +59,20 @@ class WindFilter:
         self.t = t
         self._filter.x[2:6] = *wind[:2], 0.0, 0.0  # mean, and no drift from it
 
+    def jump(self, wind: np.ndarray, scale: float, doubt: float) -> None:
+        """Let wind and airspeed sensor change at once, by what is known only up to a share `doubt`.
+
+        Args:
+            wind: added, NED, (3,) [m/s]
+            scale: true over reported airspeed from now on, over what it was [-]
+            doubt: standard deviation, as a share of the change
+        """
+        x, P = self._filter.x, self._filter.P
+        x[2:4] += wind[:2]
+        P[[2, 3], [2, 3]] += (doubt * wind[:2]) ** 2
+        P[[0, 1], [0, 1]] += (doubt * (scale - 1.0) * x[:2]) ** 2
+        x[:2] *= scale
+
     @property
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Give a, b, mean, drift and gust, north before east, (8,) [-, m/s], and their covariance, (8, 8)."""

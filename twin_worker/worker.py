@@ -16,11 +16,26 @@ from scipy.interpolate import CubicSpline
 from fleet.airframes import GENERIC, Airframe, load
 from fleet.bus import Bus
 from fleet.codec import Stamp
-from fleet.contract import Alert, Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, Status, WhatIf
+from fleet.contract import (
+    Alert,
+    Array,
+    FleetState,
+    Message,
+    Mismatch,
+    Mission,
+    Model,
+    Params,
+    Prediction,
+    Sample,
+    Status,
+    WhatIf,
+)
 from twin_worker.conflict.separation import Separation
 from twin_worker.conflict.traffic import Traffic
 from twin_worker.horizon import AHEAD
 from twin_worker.memory import AUTO
+from twin_worker.mismatch.live import Live
+from twin_worker.mismatch.told import word
 from twin_worker.twin import Twin, advance, fleet_row
 from twin_worker.whatif import question
 from twin_worker.whatif.answer import answer
@@ -56,8 +71,10 @@ class Worker:
         method: str = AUTO,
         airframe: Airframe | None = None,
         separation: Separation | None = None,
+        diagnosis: Live | None = None,
     ) -> None:
         self.bus = bus
+        self.diagnosis = diagnosis
         self.uavs = uavs
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
         self.sentence = ""
@@ -75,6 +92,7 @@ class Worker:
         self.bus.answer(Prediction, self._predictions)
         self.bus.answer(Alert, lambda uav, *_: self._stamped((h, a) for h in self._asked(uav) for a in self.active(h)))
         self.bus.answer(Model, lambda uav, *_: self._stamped((h, h.twin.model) for h in self._asked(uav)))
+        self.bus.answer(Mismatch, lambda uav, *_: self._stamped((h, self._found(h)) for h in self._asked(uav)))
         self.bus.answer(FleetState, lambda *_: [(self.state(), None)])
         for kind in (Status, Mission, Params):
             for message, _ in self.bus.ask(kind):
@@ -123,12 +141,32 @@ class Worker:
             except Exception as error:  # a defect met by one aircraft must not stop the others
                 held.failed = f"{held.twin.name}: found a defect ({error}), its results are missing; report it"
                 _log.exception(held.failed)
+        self._diagnose()
         return taken
+
+    def _diagnose(self) -> None:
+        """Let the diagnosis go on in the background, and publish what it found."""
+        if self.diagnosis is None:
+            return
+        held = {one.twin.uav: one for one in self.holding()}
+        try:
+            for found in self.diagnosis.turn([(one.twin, one.lock) for one in held.values()]):
+                self.bus.publish(found, Stamp(held[found.uav].epoch, self.bus.writer))
+        except Exception:  # a defect of the diagnosis must not stop the predictions
+            _log.exception("the diagnosis met a defect and is off; report it")
+            self.sentence, self.diagnosis = "the diagnosis met a defect and is off; restart the worker", None
+
+    def _found(self, held: Held) -> Mismatch | None:
+        watch = self.diagnosis and self.diagnosis.watches.get(held.twin.uav)
+        return watch.told if watch else None
 
     def state(self) -> FleetState:
         """Give the fleet table of this worker."""
         writer = f"{self.bus.writer:016x}"
-        rows = [fleet_row(h.twin, data_time(h), self.active(h), worker=writer, epoch=h.epoch) for h in self.holding()]
+        rows = [
+            fleet_row(h.twin, data_time(h), self.active(h), worker=writer, epoch=h.epoch, mismatch=word(self._found(h)))
+            for h in self.holding()
+        ]
         shed = sum(held.shed for held in self.holding())
         said = [f"{shed} messages shed: too many UAVs for this worker"] if shed else []
         said += [held.failed for held in self.holding() if held.failed]

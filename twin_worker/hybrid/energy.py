@@ -88,6 +88,20 @@ def lifting(flight: Flight, V_0: float) -> Ridge:
     return ridge(np.column_stack([np.ones(len(X)), X]), mean(alpha), _LIFT)
 
 
+def _budget(flight: Flight, t_0: float, V_0: float) -> tuple[np.ndarray, np.ndarray]:
+    """Give what c_0 c_t c_v c_n are multiplied by, (n, 4), and the excess power that was had, (n,) [m/s2]."""
+    V = mean(flight.V)
+    y = slope(0.5 * flight.V**2 + G * flight.h) / np.maximum(V, 5.0)
+    n = mean(load(flight.phi) ** 2 - 1.0)
+    return np.column_stack([np.ones(len(y)), mean(flight.delta_t) - t_0, V - V_0, n]), y
+
+
+def missed(flight: Flight, c: np.ndarray, t_0: float, V_0: float) -> np.ndarray:
+    """Give the excess power that was had beyond what c, (4,), foretells, (n,) [m/s2]."""
+    X, y = _budget(flight, t_0, V_0)
+    return y - X @ c  # type: ignore[no-any-return]
+
+
 def power(flight: Flight, t_0: float, V_0: float) -> Ridge:
     """Identify c_0, c_t, c_v, c_n of the specific excess power, by instruments.
 
@@ -97,11 +111,8 @@ def power(flight: Flight, t_0: float, V_0: float) -> Ridge:
 
     Source: Soderstrom & Stoica 1989, chapter 8 (instrumental variables in closed loop).
     """
-    V = mean(flight.V)
-    y = slope(0.5 * flight.V**2 + G * flight.h) / np.maximum(V, 5.0)
-    n = mean(load(flight.phi) ** 2 - 1.0)
-    X = np.column_stack([np.ones(len(y)), mean(flight.delta_t) - t_0, V - V_0, n])
-    asked = np.column_stack([np.ones(len(y)), mean(flight.climb_c), mean(flight.V_c) - V_0, n])
+    X, y = _budget(flight, t_0, V_0)
+    asked = np.column_stack([np.ones(len(y)), mean(flight.climb_c), mean(flight.V_c) - V_0, X[:, 3]])
     usual, spread, noise = _POWER
     usual = usual.copy()
     usual[1] = _STEEPER * G / _GLIDE / max(t_0, 0.15)  # level flight takes t_0 against the drag, thrust grows faster

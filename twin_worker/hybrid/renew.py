@@ -13,6 +13,7 @@ from twin_worker.predict import Flown, set_out
 
 EVERY_S = 5.0  # between identifications [s]
 _HELD_S = 20.0  # newest flight held out [s]
+_AFRESH_S = 60.0  # flight since a fault before it replaces what a diagnosis made [s]
 _CHECK_S = 10.0  # between flights over it [s]
 _MOST = 0.10  # of the way, strayed at the end of it: more is not believed [-]
 _NEWS = 0.3  # weight of the newest check
@@ -26,8 +27,9 @@ def renew(twin: Twin) -> None:
     window = twin.window(SEEN_S + _HELD_S)
     if window is not None and not twin.learnt.t <= newest < twin.learnt.t + LEARN_S:
         learn_law(twin.learnt, twin.autopilot, twin.situation(window))
-    good = window and _whole(window)
-    if window is None or good is None or len(good) < (LEAST_S + _HELD_S) / window.dt + 1 or twin.method == PAPER:
+    good = window and _whole(window, twin.learn_from)
+    least = LEAST_S + _HELD_S if twin.extended is None else _AFRESH_S
+    if window is None or good is None or len(good) < least / window.dt + 1 or twin.method == PAPER:
         return
     twin.hybrid_t = newest
     if not twin.checked_t <= newest < twin.checked_t + _CHECK_S:
@@ -40,9 +42,9 @@ def renew(twin: Twin) -> None:
     twin.hybrid = twin.near_hybrid if twin.strays < _MOST else None
 
 
-def _whole(window: Window) -> Window:
-    """Cut what is unbroken up to the end."""
-    bad = np.flatnonzero(~window.ok)
+def _whole(window: Window, since: float) -> Window:
+    """Cut what is unbroken up to the end, from `since` on [s since 1970]."""
+    bad = np.flatnonzero(~(window.ok & (window.t >= since)))
     return window.part(int(bad[-1]) + 1 if len(bad) else 0, len(window))
 
 

@@ -1,0 +1,1 @@
+"""Mismatch live: diagnose what an aircraft did lately, in the background, and predict with what was found."""

@@ -1,0 +1,41 @@
+"""What a twin knew at moments of the last minutes, so that it can begin anew from before a fault."""
+
+from collections.abc import Iterable
+from copy import deepcopy
+from dataclasses import dataclass
+
+from twin_worker.coupled import Coupled
+from twin_worker.hybrid.fit import Hybrid
+from twin_worker.plant import Plant
+from twin_worker.wind import WindFilter
+
+EVERY_S = 10.0  # between marks [s]
+MOST = 15  # kept: as far back as telemetry is
+
+
+@dataclass(frozen=True)
+class Mark:
+    """One moment.
+
+    Attributes:
+        t: when [s since 1970]
+        wind: the wind filter, a copy
+        plant: the coupled model believed; None before any
+        hybrid: the hybrid believed; None before any
+    """
+
+    t: float
+    wind: WindFilter
+    plant: Coupled | None
+    hybrid: Hybrid | None
+
+
+def mark(t: float, wind: WindFilter, plants: tuple[Plant | None, ...], hybrid: Hybrid | None) -> Mark:
+    """Mark this moment; of the plants the first that is coupled counts."""
+    coupled = next((one for one in plants if isinstance(one, Coupled)), None)
+    return Mark(t, deepcopy(wind), coupled, hybrid)
+
+
+def before(marks: Iterable[Mark], t: float) -> Mark | None:
+    """Give the newest mark before time t [s since 1970]; None where there is none."""
+    return max((one for one in marks if one.t < t), key=lambda one: one.t, default=None)

@@ -1,0 +1,127 @@
+"""What is known of one aircraft's mismatch: its baseline, what was found, and when to look again. Data time only."""
+
+from dataclasses import dataclass, replace
+
+from fleet.contract import Found, Mismatch, Outcome
+from twin_worker.diagnose.baseline import Baseline
+from twin_worker.diagnose.card import UNKNOWN, Card
+from twin_worker.diagnose.report import Outcome as Result
+from twin_worker.diagnose.report import Report
+from twin_worker.kinds import WINGS
+from twin_worker.memory import ROUTE_MODES, Twin
+from twin_worker.mismatch.job import Answer, Job, Rows, rows_of
+from twin_worker.mismatch.told import message, since
+
+PAST_S = 105.0  # the own past that is what an aircraft is compared with [s]
+SEEN_S = 120.0  # flight that is diagnosed [s]
+LOOK_S, WHOLE_S = 8.0, 25.0  # between looks at the residuals, and between diagnoses whatever they say [s]
+LEAST_S = 45.0  # flight before anything is compared with a model [s]
+_AGAIN_S = 5.0  # before a finding is looked at again, to be confirmed [s]
+_RETRY_S = 30.0  # after a refusal [s]
+_SAME_S = 20.0  # two findings of one effect whose onsets lie farther apart are two [s]
+_GONE = 2  # looks in a row that find nothing, after which it is over
+_SOUND = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST, Outcome.STARVED)
+
+
+@dataclass
+class Watch:
+    """One aircraft's mismatch.
+
+    Attributes:
+        card: the aircraft, or `card.UNKNOWN`
+        base: what its flight is compared with; None: its own past
+        past: telemetry of that past; None before there was enough
+        told: what was published last
+        why: why there is no baseline, or no diagnosis
+    """
+
+    card: Card = UNKNOWN
+    base: Baseline | None = None
+    past: Rows | None = None
+    told: Mismatch | None = None
+    why: str = ""
+    begun: float = float("nan")  # when it was first heard [s since 1970]
+    past_t: float = float("-inf")  # end of the own past [s since 1970]
+    next_t: float = float("-inf")  # no look before [s since 1970]
+    whole_t: float = float("-inf")  # end of the newest flight diagnosed
+    last: Report | None = None  # the newest diagnosis, and its flight's begin
+    last_begin: float = 0.0
+    none: int = 0
+
+    def wants(self, twin: Twin) -> float | None:
+        """Give how urgent a look is; None where it is not due."""
+        newest = twin.history.newest
+        if newest < self.next_t - _RETRY_S - WHOLE_S:  # the clock jumped back
+            self.__init__(self.card, self.base)  # type: ignore[misc]
+        self.begun = newest if self.begun != self.begun else self.begun
+        if newest < self.next_t or twin.lost or twin.ground.landed or twin.vehicle not in WINGS or twin.origin is None:
+            return None
+        if self.base is None and self.past is None:
+            if self._steady_s(twin) < PAST_S:
+                return None
+            self.past = rows_of(twin.history, newest - PAST_S)
+            self.past_t = newest
+        if newest < (self.begun + LEAST_S if self.base is not None else self.past_t + LOOK_S):
+            return None
+        return 2.0 * (not self._sound(twin)) + (newest - self.whole_t) / WHOLE_S
+
+    def job(self, twin: Twin) -> Job:
+        """Give the job that is due."""
+        newest = twin.history.newest
+        self.next_t = newest + LOOK_S
+        whole = newest - self.whole_t >= WHOLE_S or not self._sound(twin) or self._to_confirm
+        rows = rows_of(twin.history, newest - SEEN_S, self.past)
+        return Job(twin.uav, rows, dict(twin.received), self.card, self.base, self.past_t, whole)
+
+    @property
+    def _to_confirm(self) -> bool:
+        return self.told is not None and self.told.outcome in (Found.SUSPECTED, Found.UNKNOWN)
+
+    def take(self, answer: Answer) -> Mismatch | None:
+        """Take an answer; give what is to be published, None where nothing is new."""
+        self.why = answer.refused
+        if answer.refused:
+            self.next_t = answer.end + _RETRY_S
+            return None
+        if answer.report is None:
+            return None
+        self.whole_t = answer.end
+        report = answer.report
+        confirmed = self._confirmed(report, answer.begin)
+        self.last, self.last_begin = report, answer.begin
+        if report.outcome in (Result.NAMED, Result.UNKNOWN) and not confirmed:
+            self.next_t = answer.end + _AGAIN_S
+            report = replace(report, outcome=Result.SUSPECTED)
+        held = self.told is not None and self.told.outcome in (Found.NAMED, Found.UNKNOWN)
+        self.none = self.none + 1 if report.outcome in (Result.NONE, Result.SUSPECTED) else 0
+        if held and 0 < self.none < _GONE:
+            return None  # one look that sees less takes nothing back
+        shown = since(report, answer.begin - self.begun)
+        self.told = message(answer.uav, shown, answer.begin, answer.end)
+        return self.told
+
+    def _confirmed(self, report: Report, begin: float) -> bool:
+        """Tell whether the diagnosis before said the same."""
+        if self.last is None:
+            return False
+        if report.outcome is Result.UNKNOWN:
+            return self.last.outcome is not Result.NONE
+        names = {name for one in self.last.findings for name in (one.guess.effect.name, *one.rivals)}
+        onsets = [self.last_begin + one.segments[0][0] for one in self.last.findings]
+        return any(
+            one.guess.effect.name in names
+            and any(abs(begin + one.segments[0][0] - onset) < _SAME_S for onset in onsets)
+            for one in report.findings
+        )
+
+    @staticmethod
+    def _sound(twin: Twin) -> bool:
+        return twin.plant is None or twin.verdict.outcome in _SOUND
+
+    @staticmethod
+    def _steady_s(twin: Twin) -> float:
+        """Give how long it has flown its mission without a break [s]."""
+        if twin.status is None or twin.status.mode not in ROUTE_MODES:
+            return 0.0
+        t = twin.history.rows("attitude", max(twin.since, twin.back_t, twin.history.newest - PAST_S - 5.0))[0]
+        return float(t[-1] - t[0]) if len(t) else 0.0
