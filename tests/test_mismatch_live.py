@@ -16,7 +16,7 @@ from twin_worker.diagnose.card import UNKNOWN
 from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.mismatch.background import Background
 from twin_worker.mismatch.job import Answer, Job, rows_of, work
-from twin_worker.mismatch.live import Live
+from twin_worker.mismatch.live import ALL, Live
 from twin_worker.mismatch.told import message, since, word
 from twin_worker.mismatch.watch import LEAST_S, LOOK_S, Watch
 
@@ -51,7 +51,7 @@ def answered(watch: Watch, end: float, report: Report) -> Mismatch | None:
 def looking(twin) -> tuple[Live, Hand, object]:
     """Diagnoses of one aircraft that has flown for a while, against a model."""
     hand = Hand()
-    live = Live(hand, BASE)
+    live = Live(hand, {ALL: BASE})
     list(live.turn([(twin, nullcontext())]))
     live.watch(1).begun -= LEAST_S
     return live, hand, twin
@@ -174,7 +174,7 @@ def test_kept_past_and_newest_flight_are_joined_without_doubles(twin):
 
 def test_the_worker_publishes_answers_and_shows_what_was_found(holder, monkeypatch):
     hand = Hand()
-    holder.diagnosis = Live(hand, BASE, adapt=False)
+    holder.diagnosis = Live(hand, {ALL: BASE}, adapt=False)
     told: list = []
     holder.bus.subscribe(Mismatch, lambda m, stamp: told.append((m, stamp)))
     holder.turn()
@@ -196,7 +196,7 @@ def test_a_defect_of_the_diagnosis_leaves_the_predictions(holder):
         def answer(self) -> Answer | None:
             raise RuntimeError("broken")
 
-    holder.diagnosis = Live(Broken(), BASE)
+    holder.diagnosis = Live(Broken(), {ALL: BASE})
     made_: list = []
     holder.bus.subscribe(Prediction, lambda m, _: made_.append(m))
     for m in f.messages(f.turn(6.0), uav=2):

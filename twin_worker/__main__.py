@@ -32,22 +32,24 @@ def _two_metres(text: str) -> tuple[float, float]:
     return wide, high
 
 
-def _base(path: Path | None) -> "Baseline | None":
-    """Read what every aircraft is compared with.
+def _bases(given: list[str]) -> "dict[int, Baseline]":
+    """Read what aircraft are compared with, by UAV id; the one of `ALL` is for all others.
 
     Raises:
-        ValueError: when the file is none; the sentence says what is wrong.
+        ValueError: when a file is no model; the sentence says what is wrong.
         OSError: when it cannot be read.
     """
-    if path is None:
-        return None
+    if not given:
+        return {}
     from twin_worker.diagnose.keep import load as load_baseline
+    from twin_worker.mismatch.live import ALL
 
-    return load_baseline(path)[0]
+    pairs = [text.partition("=") if text.partition("=")[0].isdecimal() else ("", "", text) for text in given]
+    return {int(uav) if uav else ALL: load_baseline(Path(path))[0] for uav, _, path in pairs}
 
 
 def _run(args: argparse.Namespace) -> int:
-    airframe, base = load(args.airframe), _base(args.baseline)
+    airframe, bases = load(args.airframe), _bases(args.baseline)
     stop = stop_on_signal()
     with connect(args.router) as bus:
         bus.present(f"worker/{bus.writer:016x}/{args.uavs.start}-{args.uavs.stop - 1}")
@@ -66,7 +68,7 @@ def _run(args: argparse.Namespace) -> int:
             method=args.method,
             airframe=airframe,
             separation=Separation(*args.separation),
-            diagnosis=None if args.no_diagnosis else Live(hand, base, adapt=not args.no_adapt),
+            diagnosis=None if args.no_diagnosis else Live(hand, bases, adapt=not args.no_adapt),
         )
         worker.listen()
         worker.sentence = "compiling the twin's physics, once"
@@ -106,9 +108,10 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument(
         "--baseline",
-        type=Path,
-        metavar="MODEL",
-        help="compare every aircraft with this model, from `fleet calibrate` (each with its own first 110 s)",
+        action="append",
+        default=[],
+        metavar="[ID=]MODEL",
+        help="compare one aircraft, or all, with this model from `fleet calibrate` (each with its own first 105 s)",
     )
     parser.add_argument("--no-adapt", action="store_true", help="diagnose, but predict as if nothing was found")
     parser.add_argument("--no-diagnosis", action="store_true", help="do not diagnose at all")

@@ -54,6 +54,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, default=8080, help="port of the web page (8080)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the simulated aircraft (1)")
     parser.add_argument("--router", default=ROUTER, help=f"Zenoh router, opened here if none is there ({ROUTER})")
+    parser.add_argument(
+        "--baseline",
+        action="append",
+        default=[],
+        metavar="[ID=]MODEL",
+        help="find mismatches against this model, of one aircraft or of all (each one's own first flight)",
+    )
     parser.add_argument("--summary", type=Path, metavar="FILE", help="write the last state of every UAV as JSON")
 
 
@@ -112,7 +119,8 @@ def _start(children: Children, args: argparse.Namespace) -> None:
     router = ["--router", args.router]
     if not args.results:
         ids = "0-999999" if args.replay else "0-249"
-        children.start("twin worker", "twin_worker", "--uavs", ids, *router)
+        base = [f"--baseline={text}" for text in args.baseline]
+        children.start("twin worker", "twin_worker", "--uavs", ids, *base, *router)
     links = [f"--link={text}" for text in args.link]
     links += [f"--link={link(file, args)}" for file in args.replay]
     if links:

@@ -1,18 +1,20 @@
 """Diagnose the aircraft of one worker in turn, the most urgent first, without ever making a prediction wait."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from types import MappingProxyType
 from typing import Protocol
 
 from fleet.contract import Found, Mismatch
 from twin_worker.diagnose.baseline import Baseline
-from twin_worker.diagnose.card import UNKNOWN, Card
+from twin_worker.diagnose.card import UNKNOWN
 from twin_worker.memory import Twin
 from twin_worker.mismatch.extend import extend
 from twin_worker.mismatch.job import Answer, Job
 from twin_worker.mismatch.told import judged
 from twin_worker.mismatch.watch import Watch
 
+ALL = -1  # instead of a UAV id
 Held = tuple[Twin, AbstractContextManager]  # a twin, and the lock it changes under
 
 
@@ -35,19 +37,20 @@ class Live:
 
     Args:
         hand: works the diagnoses out
-        base: what every aircraft is compared with; None: each with its own past
-        card: the aircraft, where there is no such model
+        bases: what aircraft are compared with, by UAV id, `ALL` for every other; without one, each with its own past
         adapt: predict with what was named
     """
 
-    def __init__(self, hand: Hand, base: Baseline | None = None, card: Card = UNKNOWN, *, adapt: bool = True) -> None:
-        self._hand, self._base, self._adapt = hand, base, adapt
-        self._card = base.card if base is not None else card
+    def __init__(self, hand: Hand, bases: Mapping[int, Baseline] = MappingProxyType({}), *, adapt: bool = True) -> None:
+        self._hand, self._bases, self._adapt = hand, bases, adapt
         self.watches: dict[int, Watch] = {}
 
     def watch(self, uav: int) -> Watch:
         """Give what is known of one aircraft."""
-        return self.watches.setdefault(uav, Watch(self._card, self._base))
+        if uav not in self.watches:
+            base = self._bases.get(uav, self._bases.get(ALL))
+            self.watches[uav] = Watch(UNKNOWN if base is None else base.card, base)
+        return self.watches[uav]
 
     def turn(self, held: Sequence[Held]) -> Iterator[Mismatch]:
         """Take an answer that has arrived, and begin the most urgent job where one may begin."""

@@ -1,0 +1,102 @@
+"""One flight heard by a twin that adapts to what is found, and by a copy of it that does not."""
+
+import copy
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fleet.contract import Message, Prediction, Sample
+from fleet.frames import to_ned
+from twin_worker.diagnose.baseline import Baseline
+from twin_worker.mismatch.job import Answer, Job, work
+from twin_worker.mismatch.live import ALL, Live
+from twin_worker.twin import Twin, advance
+
+ANSWER_S, REST_S = 3.0, 12.0  # after a diagnosis began: its answer, and the next one [s of data time]
+AHEAD_S = (10, 30, 60)
+MINUTE_S = 60.0
+
+
+@dataclass
+class Inline:
+    """Works a diagnosis out at once, and hands it over when a background process would."""
+
+    now: float = 0.0
+    cpu_s: float = 0.0
+    began: float = -np.inf
+    kept: Answer | None = None
+
+    @property
+    def free(self) -> bool:
+        """Tell whether a job may be given."""
+        return self.kept is None and self.now >= self.began + REST_S
+
+    def give(self, job: Job) -> None:
+        """Work a job out."""
+        self.kept, self.began = work(job), self.now
+        self.cpu_s += self.kept.cpu_s
+
+    def answer(self) -> Answer | None:
+        """Give its answer when it is due."""
+        if self.kept is None or self.now < self.began + ANSWER_S:
+            return None
+        found, self.kept = self.kept, None
+        return found
+
+
+@dataclass
+class Flown:
+    """What both said; `plain` is empty where nothing was put into the models.
+
+    Attributes:
+        begin: first telemetry [s since 1970]
+        truth: time, latitude, longitude, height as reported, (n, 4)
+    """
+
+    begin: float
+    truth: np.ndarray
+    adapting: list[Message] = field(default_factory=list)
+    plain: list[Message] = field(default_factory=list)
+    cpu_s: float = 0.0
+
+
+def hear(heard: list[Message], base: Baseline | None) -> Flown:
+    """Let both hear a flight."""
+    positions = [m.position for m in heard if isinstance(m, Sample) and m.position is not None]
+    truth = np.concatenate([np.column_stack([p.t.numpy(), p.x.numpy().astype(float)]) for p in positions])
+    flown, hand = Flown(float(truth[0, 0]), truth), Inline()
+    live = Live(hand, {} if base is None else {ALL: base})
+    twin, plain = Twin(heard[0].uav), None
+    for message in heard:
+        flown.adapting += advance(twin, (message,))
+        if plain is not None:
+            flown.plain += advance(plain, (message,))
+        if not isinstance(message, Sample):
+            continue
+        hand.now = message.t
+        before = copy.deepcopy(twin) if plain is None and hand.kept is not None and hand.kept.pushes else None
+        flown.adapting += live.turn([(twin, nullcontext())])
+        if before is not None and twin.extended is not None:
+            plain = before
+    flown.cpu_s = hand.cpu_s
+    return flown
+
+
+class Errors:
+    """How far predictions were from what came."""
+
+    @staticmethod
+    def of(said: list[Message], truth: np.ndarray, since: float) -> dict[int, float]:
+        """Give the mean distance by look-ahead [s] over the predictions of the minute after `since` [m]."""
+        miss: dict[int, list[float]] = {ahead: [] for ahead in AHEAD_S}
+        for made in said:
+            if isinstance(made, Prediction) and since + 1.0 < made.t <= since + MINUTE_S:
+                flown = to_ned(made.ned_origin(), *truth[:, 1:].T)
+                grid, path = made.ahead.numpy(), made.path.numpy()
+                for ahead in AHEAD_S:
+                    if grid[-1] >= ahead and made.t + ahead <= truth[-1, 0]:
+                        at = [np.interp(ahead, grid, path[:, i]) for i in range(3)]
+                        was = [np.interp(made.t + ahead, truth[:, 0], flown[:, i]) for i in range(3)]
+                        miss[ahead].append(float(np.linalg.norm(np.subtract(at, was))))
+        return {ahead: float(np.mean(found)) for ahead, found in miss.items() if found}

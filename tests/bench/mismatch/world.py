@@ -1,0 +1,64 @@
+"""Aircraft with a fault concealed in them, and the model a test pilot's healthy flights of the same aircraft give."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from fleet.contract import Message
+from fleet.pretend.conceal.cards import card
+from fleet.pretend.conceal.plan import EXCITED, Job, draw
+from fleet.pretend.conceal.record import fly
+from fleet.pretend.drive import to_tlog
+from fleet.pretend.faults.kinds import read
+from fleet.pretend.uav import PretendUav
+from fleet.telemetry.recordings import replay_messages
+from twin_worker.diagnose import card as cards
+from twin_worker.diagnose.baseline import Baseline
+from twin_worker.diagnose.calibrate import calibrate
+from twin_worker.diagnose.flight import read_flights
+from twin_worker.diagnose.keep import load, save
+
+ONSET_S = 120.0
+FAULTS = (
+    "thrust_loss,fraction=0.35",
+    "airspeed_scale,scale=0.85",
+    "wind_steady,speed_mps=6,from_deg=200",
+    "control_effectiveness_loss:aileron,loss=0.5",
+    "drag_increase,dCD=0.03",
+)
+
+
+def model(seed: int, folder: Path) -> Path:
+    """Give the model of aircraft 0 of a seed, from five healthy flights of it; made where it is not in the folder."""
+    path = folder / f"model_{seed}.json"
+    if path.exists():
+        return path
+    (folder / "card.json").write_text(json.dumps(card("small")))
+    known, flights = cards.read(folder / "card.json"), []
+    for k, strength in enumerate(EXCITED):
+        recording = folder / f"nominal_{seed}_{k}.tlog"
+        fly(draw(Job(recording.stem, "small", "nominal", (), k, strength), seed, 0), (), recording)
+        flights += read_flights(recording, known)
+        recording.unlink()
+    save(path, calibrate(flights, known))
+    return path
+
+
+def baseline(seed: int, folder: Path) -> Baseline:
+    """Give that model."""
+    return load(model(seed, folder))[0]
+
+
+def messages(fault: str, seed: int, seconds: int, folder: Path) -> list[Message]:
+    """Give what a gateway says of an ordinary flight of that aircraft, with a fault from `ONSET_S` on, or none."""
+    faults = (read(f"{fault},at={ONSET_S:.0f}", "small"),) if fault else ()
+    path = folder / "flight.tlog"
+    to_tlog(path, [PretendUav(0, seed, faults=faults)], seconds=seconds, loss=0.02, seed=seed)
+    heard = list(replay_messages(path))
+    path.unlink()
+    return heard
+
+
+def rows(heard: list[Message], kind: type) -> Iterator[Message]:
+    """Give the messages of one kind."""
+    return (message for message in heard if isinstance(message, kind))
