@@ -1,13 +1,15 @@
 """A diagnosis as it is published: times on the fleet clock, numbers finite."""
 
 from dataclasses import replace
-from math import isfinite
+from math import inf, isfinite
 
 import msgspec
 
 from fleet.contract import Cause, Found, Mismatch
 from twin_worker.diagnose.report import Finding, Outcome, Report
 from twin_worker.diagnose.words import sentence
+
+_WILDEST = 100.0  # errors beyond are of a simulation that left the air, and tell nothing [m/s2]
 
 
 def message(uav: int, report: Report, begin: float, end: float) -> Mismatch:
@@ -31,8 +33,8 @@ def message(uav: int, report: Report, begin: float, end: float) -> Mismatch:
         causes=causes if proven else (),
         fit_before=_or_none(report.fit_before),
         fit_after=_or_none(report.fit_after),
-        force_before=_or_none(report.force_before),
-        force_after=_or_none(report.force_after),
+        force_before=_or_none(report.force_before, _WILDEST),
+        force_after=_or_none(report.force_after, _WILDEST),
         stray_before=_or_none(report.stray_before),
         stray_after=_or_none(report.stray_after),
         seen_t0=begin,
@@ -81,5 +83,5 @@ def _cause(one: Finding, begin: float) -> Cause:
     )
 
 
-def _or_none(x: float) -> float | None:
-    return float(x) if isfinite(x) else None
+def _or_none(x: float, most: float = inf) -> float | None:
+    return float(x) if isfinite(x) and x < most else None

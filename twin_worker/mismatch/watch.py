@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from fleet.contract import Found, Mismatch, Outcome
 from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.card import UNKNOWN, Card
@@ -53,11 +55,13 @@ class Watch:
         newest = twin.history.newest
         if newest < self.next_t - _RETRY_S - WHOLE_S:  # the clock jumped back
             self.__init__(self.card, self.base)  # type: ignore[misc]
-        self.begun = newest if self.begun != self.begun else self.begun
+        if self.begun != self.begun and np.isfinite(newest):
+            self.begun = float(min(twin.history.rows("attitude")[0], default=newest))
         if newest < self.next_t or twin.lost or twin.ground.landed or twin.vehicle not in WINGS or twin.origin is None:
             return None
         if self.base is None and self.past is None:
             if self._steady_s(twin) < PAST_S:
+                self.next_t = newest + LOOK_S
                 return None
             self.past = rows_of(twin.history, newest - PAST_S)
             self.past_t = newest

@@ -44,9 +44,8 @@ def judged(fault: str, flown: Flown) -> dict[str, Any]:
         row["onset_error_s"] = first.segments[0][0] - since
     if adapted is not None:
         row["adapted_s"] = adapted.t - since
-        row["with"], row["without"] = (
-            Errors.of(said, flown.truth, adapted.t) for said in (flown.adapting, flown.plain)
-        )
+        both = {"with": flown.adapting, "without": flown.plain}
+        row |= {which: Errors.of(said, flown.truth, adapted.t) for which, said in both.items()}
     return row
 
 

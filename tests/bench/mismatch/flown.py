@@ -32,6 +32,11 @@ class Inline:
         """Tell whether a job may be given."""
         return self.kept is None and self.now >= self.began + REST_S
 
+    @property
+    def due(self) -> bool:
+        """Tell whether an answer is to be given now."""
+        return self.kept is not None and self.now >= self.began + ANSWER_S
+
     def give(self, job: Job) -> None:
         """Work a job out."""
         self.kept, self.began = work(job), self.now
@@ -39,7 +44,7 @@ class Inline:
 
     def answer(self) -> Answer | None:
         """Give its answer when it is due."""
-        if self.kept is None or self.now < self.began + ANSWER_S:
+        if self.kept is None or not self.due:
             return None
         found, self.kept = self.kept, None
         return found
@@ -75,7 +80,8 @@ def hear(heard: list[Message], base: Baseline | None) -> Flown:
         if not isinstance(message, Sample):
             continue
         hand.now = message.t
-        before = copy.deepcopy(twin) if plain is None and hand.kept is not None and hand.kept.pushes else None
+        pushes = hand.due and hand.kept is not None and hand.kept.pushes is not None
+        before = copy.deepcopy(twin) if pushes and plain is None else None
         flown.adapting += live.turn([(twin, nullcontext())])
         if before is not None and twin.extended is not None:
             plain = before
