@@ -120,7 +120,7 @@ def test_wind_and_airspeed_sensor_jump_at_the_onset_and_the_mark_stays(known):
     calm, _ = wind_since(twin, push(twin, onset), mark)
     told, t = wind_since(twin, push(twin, onset, scale=0.8), mark)
     assert told.scale > calm.scale + 0.01  # what is flown since pulls it back: nothing is wrong with this sensor
-    assert t == pytest.approx(twin.wind_t, abs=0.25) and mark.wind.scale == before_
+    assert twin.wind_t <= t <= twin.history.newest and mark.wind.scale == before_
 
 
 def test_nothing_changes_without_a_mark_from_before(twin):
