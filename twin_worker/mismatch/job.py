@@ -11,6 +11,8 @@ from twin_worker.diagnose.calibrate import own_weather
 from twin_worker.diagnose.card import Card
 from twin_worker.diagnose.diagnose import diagnose
 from twin_worker.diagnose.flight import Flight, lay
+from twin_worker.diagnose.held import lost
+from twin_worker.diagnose.own_past import later
 from twin_worker.diagnose.past import BEFORE_S, calibrate_past, since
 from twin_worker.diagnose.report import Report
 from twin_worker.diagnose.residual import Case
@@ -103,15 +105,16 @@ def _work(job: Job, found: Answer) -> Answer:
     for kind, (t, x) in job.rows.items():
         history.put(kind, t, x)
     flight = lay(f"uav-{job.uav}", history, job.params, job.card)
-    base = job.base
+    base, recorded, until = job.base, flight, job.until - flight.zero
     if base is None:
-        until = job.until - flight.zero
         base = calibrate_past(flight, until, job.card)
         flight = since(flight, until - BEFORE_S)
     found = replace(found, begin=flight.zero, grew=growth(flight, base))
     if not (job.whole or found.grew > GREW):
         return found
     report = diagnose(flight, base)
+    if job.base is None:
+        report = later(report, lost(recorded, until), until)
     return replace(found, report=report, pushes=pushes(flight, base, report))
 
 
