@@ -1,4 +1,4 @@
-"""One flight heard by a twin that adapts to what is found, and by a copy of it that does not."""
+"""One flight heard by a twin that adapts to what is named, and from the first name on by a copy that does not."""
 
 import copy
 from contextlib import nullcontext
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleet.contract import Message, Prediction, Sample
+from fleet.contract import Found, Message, Prediction, Sample
 from fleet.frames import to_ned
 from twin_worker.diagnose.baseline import Baseline
 from twin_worker.mismatch.job import Answer, Job, work
@@ -15,7 +15,6 @@ from twin_worker.twin import Twin, advance
 
 ANSWER_S, REST_S = 3.0, 12.0  # after a diagnosis began: its answer, and the next one [s of data time]
 AHEAD_S = (10, 30, 60)
-MINUTE_S = 60.0
 
 
 @dataclass
@@ -52,7 +51,7 @@ class Inline:
 
 @dataclass
 class Flown:
-    """What both said; `plain` is empty where nothing was put into the models.
+    """What both said; `plain` is empty where nothing was named.
 
     Attributes:
         begin: first telemetry [s since 1970]
@@ -80,29 +79,25 @@ def hear(heard: list[Message], base: Baseline | None) -> Flown:
         if not isinstance(message, Sample):
             continue
         hand.now = message.t
-        pushes = hand.due and hand.kept is not None and hand.kept.pushes is not None
-        before = copy.deepcopy(twin) if pushes and plain is None else None
-        flown.adapting += live.turn([(twin, nullcontext())])
-        if before is not None and twin.extended is not None:
-            plain = before
+        before = copy.deepcopy(twin) if plain is None and hand.due else None
+        told = list(live.turn([(twin, nullcontext())]))
+        flown.adapting += told
+        if any(one.outcome is Found.NAMED for one in told):
+            plain = plain or before
     flown.cpu_s = hand.cpu_s
     return flown
 
 
-class Errors:
-    """How far predictions were from what came."""
-
-    @staticmethod
-    def of(said: list[Message], truth: np.ndarray, since: float) -> dict[int, float]:
-        """Give the mean distance by look-ahead [s] over the predictions of the minute after `since` [m]."""
-        miss: dict[int, list[float]] = {ahead: [] for ahead in AHEAD_S}
-        for made in said:
-            if isinstance(made, Prediction) and since + 1.0 < made.t <= since + MINUTE_S:
-                flown = to_ned(made.ned_origin(), *truth[:, 1:].T)
-                grid, path = made.ahead.numpy(), made.path.numpy()
-                for ahead in AHEAD_S:
-                    if grid[-1] >= ahead and made.t + ahead <= truth[-1, 0]:
-                        at = [np.interp(ahead, grid, path[:, i]) for i in range(3)]
-                        was = [np.interp(made.t + ahead, truth[:, 0], flown[:, i]) for i in range(3)]
-                        miss[ahead].append(float(np.linalg.norm(np.subtract(at, was))))
-        return {ahead: float(np.mean(found)) for ahead, found in miss.items() if found}
+def errors(said: list[Message], truth: np.ndarray, since: float, until: float) -> dict[int, float]:
+    """Give the mean distance by look-ahead [s] of predictions made between two times from what came [m]."""
+    miss: dict[int, list[float]] = {ahead: [] for ahead in AHEAD_S}
+    for made in said:
+        if isinstance(made, Prediction) and since < made.t <= until:
+            flown = to_ned(made.ned_origin(), *truth[:, 1:].T)
+            grid, path = made.ahead.numpy(), made.path.numpy()
+            for ahead in AHEAD_S:
+                if grid[-1] >= ahead and made.t + ahead <= truth[-1, 0]:
+                    at = [np.interp(ahead, grid, path[:, i]) for i in range(3)]
+                    was = [np.interp(made.t + ahead, truth[:, 0], flown[:, i]) for i in range(3)]
+                    miss[ahead].append(float(np.linalg.norm(np.subtract(at, was))))
+    return {ahead: float(np.mean(found)) for ahead, found in miss.items() if found}
