@@ -106,6 +106,26 @@ def test_a_name_is_told_when_a_second_look_says_the_same():
     assert second.causes[0].segments[0][0] == pytest.approx(1210.0 - 120.0 + 73.0)
 
 
+def test_what_is_seen_once_says_so_and_where():
+    watch = Watch(base=BASE)
+    watch.begun = 1000.0
+    unknown = made(outcome=Outcome.UNKNOWN)
+    first = answered(watch, 1200.0, unknown)
+    assert first.outcome is Found.SUSPECTED and first.causes[0].channel == "pitch"
+    assert first.sentence.startswith("seen once, not confirmed: a mismatch no effect") and word(first) == "suspected"
+    assert answered(watch, 1210.0, unknown).outcome is Found.UNKNOWN
+
+
+def test_by_its_own_past_nothing_is_named_that_began_in_it(twin, monkeypatch):
+    for name, gives in {"calibrate_past": BASE, "growth": 1.0, "diagnose": made(), "pushes": None}.items():
+        monkeypatch.setattr(f"twin_worker.mismatch.job.{name}", lambda *_, gives=gives: gives)
+    rows = rows_of(twin.history, -np.inf)
+    begin = rows["attitude"][0][0]
+    named, suspected = (work(Job(1, rows, {}, UNKNOWN, None, begin + until, whole=True)) for until in (60.0, 100.0))
+    assert named.report.outcome is Outcome.NAMED
+    assert suspected.report.outcome is Outcome.SUSPECTED  # its onset is at 83 s
+
+
 def test_another_name_or_onset_at_a_second_look_is_no_confirmation():
     watch = Watch(base=BASE)
     watch.begun = 1000.0

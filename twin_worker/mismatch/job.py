@@ -11,7 +11,6 @@ from twin_worker.diagnose.calibrate import own_weather
 from twin_worker.diagnose.card import Card
 from twin_worker.diagnose.diagnose import diagnose
 from twin_worker.diagnose.flight import Flight, lay
-from twin_worker.diagnose.held import lost
 from twin_worker.diagnose.own_past import later
 from twin_worker.diagnose.past import BEFORE_S, calibrate_past, since
 from twin_worker.diagnose.report import Report
@@ -105,7 +104,7 @@ def _work(job: Job, found: Answer) -> Answer:
     for kind, (t, x) in job.rows.items():
         history.put(kind, t, x)
     flight = lay(f"uav-{job.uav}", history, job.params, job.card)
-    base, recorded, until = job.base, flight, job.until - flight.zero
+    base, until = job.base, job.until - flight.zero
     if base is None:
         base = calibrate_past(flight, until, job.card)
         flight = since(flight, until - BEFORE_S)
@@ -114,7 +113,7 @@ def _work(job: Job, found: Answer) -> Answer:
         return found
     report = diagnose(flight, base)
     if job.base is None:
-        report = later(report, lost(recorded, until), until)
+        report = later(report, None, until)  # the newest seconds may be a climb: nothing is lost for good yet
     return replace(found, report=report, pushes=pushes(flight, base, report))
 
 

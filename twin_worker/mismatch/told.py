@@ -51,6 +51,13 @@ def since(report: Report, shift: float) -> Report:
     return replace(report, sentence=said)
 
 
+def unconfirmed(found: Mismatch) -> Mismatch:
+    """Say that a second look must confirm it."""
+    return msgspec.structs.replace(
+        found, outcome=Found.SUSPECTED, sentence=f"seen once, not confirmed: {found.sentence}"
+    )
+
+
 def word(found: Mismatch | None) -> str:
     """Say what was found in a few words for the fleet table; empty where nothing was."""
     if found is None or found.outcome is Found.NONE:
@@ -58,7 +65,7 @@ def word(found: Mismatch | None) -> str:
     names = " and ".join(_place(one) for one in found.causes if one.name != "unknown")
     if found.outcome is Found.UNKNOWN:
         return f"unknown, in {found.causes[0].channel}" if found.causes else "unknown"
-    return f"{found.outcome.value} {names}"
+    return f"{found.outcome.value} {names}".rstrip()
 
 
 def judged(found: Mismatch, said: str, *, used: bool) -> Mismatch:

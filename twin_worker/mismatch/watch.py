@@ -1,6 +1,6 @@
 """What is known of one aircraft's mismatch: its baseline, what was found, and when to look again. Data time only."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from twin_worker.diagnose.report import Report
 from twin_worker.kinds import WINGS
 from twin_worker.memory import ROUTE_MODES, Twin
 from twin_worker.mismatch.job import Answer, Job, Rows, rows_of
-from twin_worker.mismatch.told import message, since
+from twin_worker.mismatch.told import message, since, unconfirmed
 
 PAST_S = 105.0  # the own past that is what an aircraft is compared with [s]
 SEEN_S = 120.0  # flight that is diagnosed [s]
@@ -91,18 +91,17 @@ class Watch:
             return None
         self.whole_t = answer.end
         report = answer.report
-        confirmed = self._confirmed(report, answer.begin)
-        self.last, self.last_begin = report, answer.begin
-        if report.outcome in (Result.NAMED, Result.UNKNOWN) and not confirmed:
+        told = message(answer.uav, since(report, answer.begin - self.begun), answer.begin, answer.end)
+        if told.outcome in (Found.NAMED, Found.UNKNOWN) and not self._confirmed(report, answer.begin):
             self.next_t = answer.end + _AGAIN_S
-            report = replace(report, outcome=Result.SUSPECTED)
+            told = unconfirmed(told)
+        self.last, self.last_begin = report, answer.begin
         held = self.told is not None and self.told.outcome in (Found.NAMED, Found.UNKNOWN)
-        self.none = self.none + 1 if report.outcome in (Result.NONE, Result.SUSPECTED) else 0
+        self.none = self.none + 1 if told.outcome in (Found.NONE, Found.SUSPECTED) else 0
         if held and 0 < self.none < _GONE:
             return None  # one look that sees less takes nothing back
-        shown = since(report, answer.begin - self.begun)
-        self.told = message(answer.uav, shown, answer.begin, answer.end)
-        return self.told
+        self.told = told
+        return told
 
     def _confirmed(self, report: Report, begin: float) -> bool:
         """Tell whether the diagnosis before said the same."""
