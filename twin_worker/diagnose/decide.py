@@ -14,12 +14,13 @@ from twin_worker.diagnose.sight import Sight
 
 MOST = 3  # effects named together
 _TRIED = 12  # guesses fitted properly at each step
-_LEAST, _LEAST_COARSE = 220.0, 400.0  # gain of a first effect, by the accelerometer and without
+_LEAST, _LEAST_COARSE = 300.0, 400.0  # gain of a first effect, by the accelerometer and without
 _CANCEL = 1.5  # an effect that gains this much more beside the others than all together undoes one of them
-_SECOND = 200.0  # and of every further one
+_SECOND = 160.0  # and of every further one
 _NEAR = 0.6  # of the best one's worth, from which an onset is worth a search
 _CHANCE = 1.5  # over what nominal flights reach by chance
 _SHARE, _SHARE_COARSE = 0.001, 0.25  # of the first one's gain a further one must bring
+_OWN = 0.1  # share of a gain that must be of numbers which count
 _NEXT = 0.02  # tie of which the simpler is chosen
 _FINE, _COARSE = (
     0.06,
@@ -144,18 +145,32 @@ def needed(sight: Sight, named: list[Named], found: Found) -> float:
     least = _LEAST if sight.base.vane else _LEAST_COARSE
     if not named:
         return max(least, chance)
-    return max(_SECOND, least, chance, (_SHARE if sight.base.vane else _SHARE_COARSE) * named[0].found.gain)
+    second, share = (_SECOND, _SHARE) if sight.base.vane else (least, _SHARE_COARSE)
+    return max(second, chance, share * named[0].found.gain)
 
 
 def believable(sight: Sight, guess: Guess) -> bool:
-    """Tell whether a guess is more than a sensor's bias such as data sheets allow for, and none of its numbers absurd."""
+    """Tell whether a guess is more than data sheets allow a sensor, by numbers of its own that are not absurd."""
     bounds = {
         n.index: n.released * max(sight.base.spread.get(n.name, n.floor), n.floor)
         for n in sight.nuisances
         if n.sensor and (n.effect.name, n.of) == (guess.effect.name, guess.of)
     }
-    sound = bool(bounds) and all(abs(x) < bounds[k] for k, x in enumerate(guess.par))
-    return not sound and all(abs(x) >= p.least for p, x in zip(guess.effect.parameters, guess.par, strict=True))
+    if bounds and all(abs(x) < bounds[k] for k, x in enumerate(guess.par)):
+        return False
+    if any(abs(x) < p.least for p, x in zip(guess.effect.parameters, guess.par, strict=True)):
+        return False
+    return _own(sight, guess) > _OWN
+
+
+def _own(sight: Sight, guess: Guess) -> float:
+    """Give the share of a guess's gain that is not of numbers that only come along."""
+    aside = np.array([p.aside for p in guess.effect.parameters])
+    if not aside.any():
+        return 1.0
+    none, all_of_it = sight.cost(()), sight.cost((guess,))
+    alone = sight.cost((guess.at(np.where(aside, guess.par, 0.0)),))
+    return (alone - all_of_it) / max(none - all_of_it, 1e-9)
 
 
 def _again(sight: Sight, named: list[Named], weather: tuple[Guess, ...]) -> list[Named]:
@@ -163,7 +178,7 @@ def _again(sight: Sight, named: list[Named], weather: tuple[Guess, ...]) -> list
     for i in range(len(named)):
         others = [one.found.guess for k, one in enumerate(named) if k != i]
         sight.grant((*weather, *others))
-        found = best(sight, others)
+        found = [one for one in best(sight, others) if believable(sight, one.guess)]
         kept = refine(sight, named[i].found.guess)
         if found:
             named[i] = choose(sight, sorted([kept, *found], key=lambda one: -rank(sight, one)))

@@ -30,6 +30,7 @@ from twin_worker.diagnose.words import sentence, since
 
 _TOLD = 0.10  # or of the error of forces told
 _KEPT = 0.15  # of an effect's gain that must show on held-out data too
+_BORNE, _MUCH = 0.5, 450.0  # or the gain itself, where it is much: the share of it on held-out data, and how much
 _STRANGE = 3.0  # a channel's residual over its usual that is not let pass unexplained
 _LEFT = 2.6  # and the same beside named effects
 _EXPLAINED = 0.6  # share of the excess that names must explain
@@ -76,8 +77,10 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     force = foretell.forces(case, weather, proof.fitted)
     errors = [foretell.rms(case, force.measured - x) for x in (force.base, force.model)]
     outcome = _outcome(findings, proof, 1.0 - errors[1] / errors[0], before, after)
-    odds = () if any(one.guess.effect.variance for one in findings) else oddities(sight)
     believed = findings if outcome is Outcome.NAMED else ()
+    if not believed:
+        sight.grant(weather)
+    odds = () if any(one.guess.effect.variance for one in findings) else oddities(sight.held())
     strange = next((odd for odd in odds if _strange(odd, base, believed, after[CHANNELS.index(odd.channel)])), None)
     if strange is not None:
         outcome = Outcome.UNKNOWN
@@ -237,7 +240,8 @@ def _outcome(
 ) -> Outcome:
     """Decide; `told` is the share of the error of forces held out that went."""
     gusty = any(one.guess.effect.variance for one in findings)
-    gained = proof.gain >= HELD or (told >= _TOLD and proof.gain > 0.0)
+    borne_out = all(one.held >= _BORNE for one in findings) and sum(one.gain for one in findings) > _MUCH
+    gained = proof.gain >= HELD or (proof.gain > 0.0 and (told >= _TOLD or borne_out))
     sound = all(one.held >= _KEPT and _significant(one) and not _at_its_end(one) for one in findings)
     proven = gusty or (gained and sound)
     excess = [np.maximum(x[_TELLING] - 1.0, 0.0).sum() for x in (before, after)]

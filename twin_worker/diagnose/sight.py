@@ -107,6 +107,7 @@ class Sight:
         more = np.ones(len(self.base.others))
         slow = np.array([self.base.spread.get(one.name, one.floor) for one in self.wanders])
         self.precision = np.array([*(1.0 / self._spread(n) ** 2 for n in self.nuisances), *slow**-2.0, *more])
+        self.usual = self.precision.copy()
         free = np.array([n.scatter or (self.weather and n.weather) for n in self.nuisances])
         free = np.concatenate([free, np.zeros(len(slow) + len(more), bool)])
         flat = self.Jn.reshape(-1, self.Jn.shape[2])
@@ -121,6 +122,13 @@ class Sight:
                 break
             self.precision[worst] = _TIGHT
         self.gain_n = float(self.bn @ self.xn)
+
+    def held(self) -> "Sight":
+        """Give the same with every nuisance held to its spread, none handed to the hypotheses."""
+        out = copy(self)
+        out.Ann = self.Ann - np.diag(self.precision) + np.diag(self.usual)
+        out.xn = np.linalg.solve(out.Ann, self.bn)
+        return out
 
     def _bounds(self, more: int) -> np.ndarray:
         """Give how many spreads each nuisance may be off before it is handed over, (nuisances + wanders + more,)."""

@@ -105,7 +105,8 @@ HIDDEN: dict[str, Hidden] = {
     "gyro_bias": Hidden("imu", _either("bias_dps", *_same(0.7, 2.0)), of=("p", "q", "r"), told=None),
     "accel_bias": Hidden("imu", _either("bias_mps2", *_same(0.3, 0.8)), of=("x", "y", "z"), told=None),
     "heading_bias": Hidden("heading", _either("bias_deg", *_same(6.0, 15.0)), told=None),
-    "baro_bias": Hidden("baro", _either("bias_m", (10.0, 25.0), (8.0, 20.0)), told=None),
+    # a constant one is the sea level pressure of the day
+    "baro_bias": Hidden("baro", _either("bias_m", (10.0, 25.0), (8.0, 20.0)), _STEPS, told=None),
 }
 UNKNOWN: dict[str, Hidden] = {
     "_crossed_linkage": Hidden("", _either("gain", *_same(0.7, 1.2)), _STEPS),
