@@ -64,7 +64,7 @@ def pushes(flight: Flight, base: Baseline, report: Report) -> Push | None:
         moved=moved(acting, command),
         wind=_wind(acting, flight),
         scale=_scale(acting, float(np.median(flight.readings.get("Va", np.full(2, base.speed))))),
-        onset=flight.zero + min(one.segments[0][0] for one in report.findings),
+        onset=float(flight.zero + min(one.segments[0][0] for one in report.findings)),
     )
 
 

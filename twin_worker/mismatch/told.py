@@ -23,8 +23,7 @@ def message(uav: int, report: Report, begin: float, end: float) -> Mismatch:
     causes = tuple(_cause(one, begin) for one in report.findings)
     if report.outcome is Outcome.UNKNOWN:
         channel, where = report.where
-        segments = tuple((begin + a, begin + b) for a, b in where)
-        causes = (Cause(name="unknown", channel=channel, segments=segments), *causes)
+        causes = (Cause(name="unknown", channel=channel, segments=_on_the_clock(begin, where)), *causes)
     proven = report.outcome is not Outcome.NONE
     return Mismatch(
         uav=uav,
@@ -78,16 +77,20 @@ def _place(one: Cause) -> str:
 
 
 def _cause(one: Finding, begin: float) -> Cause:
-    told = {name: x for name, x in one.told.items() if isfinite(x)}
+    told = {name: float(x) for name, x in one.told.items() if isfinite(x)}
     return Cause(
         name=one.guess.effect.name,
         channel=one.channel,
         surface=one.surface,
         rivals=one.rivals,
-        segments=tuple((begin + a, begin + b) for a, b in one.segments),
+        segments=_on_the_clock(begin, one.segments),
         parameters=told,
-        sigma={name: x for name, x in one.sigma.items() if name in told and isfinite(x)},
+        sigma={name: float(x) for name, x in one.sigma.items() if name in told and isfinite(x)},
     )
+
+
+def _on_the_clock(begin: float, stretches: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    return tuple((float(begin + a), float(begin + b)) for a, b in stretches)
 
 
 def _or_none(x: float, most: float = inf) -> float | None:

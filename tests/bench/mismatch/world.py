@@ -20,7 +20,7 @@ from twin_worker.diagnose.keep import load, save
 
 ONSET_S = 120.0
 USUAL_W20_MPS = wind_at_20ft(2) * FT  # of ordinary flights, so that the model knows what is usual of them
-FAULT = "airspeed_scale,scale=0.85"
+FAULT = "airspeed_bias,bias_mps=-6"
 
 
 def model(seed: int, folder: Path) -> Path:
