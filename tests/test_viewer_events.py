@@ -22,8 +22,9 @@ from fleet.contract import (
 )
 from fleet.contract import Event as Happened
 from viewer.chronicle import ROWS, listing
-from viewer.events import MAX_EVENTS, MAX_RAISED, MAX_STEPS, MAX_WORDS, Event, Kind, Known, closed, hear, merged
+from viewer.events import MAX_EVENTS, MAX_RAISED, Event, Kind, closed, merged
 from viewer.palette import DARK, LIGHT, MARK
+from viewer.tell import MAX_STEPS, MAX_WORDS, Known, hear
 
 
 def told(*messages) -> list[tuple[float, Kind, str]]:

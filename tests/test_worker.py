@@ -10,7 +10,8 @@ from fleet.bus import MemoryBus
 from fleet.codec import Stamp
 from fleet.contract import Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, State, Status
 from twin_worker import worker as live
-from twin_worker.worker import Worker, resample, wanted
+from twin_worker.whatif.grid import resample, wanted
+from twin_worker.worker import Worker
 
 NAN = float("nan")
 

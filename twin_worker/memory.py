@@ -2,7 +2,6 @@
 
 from collections import deque
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from twin_worker.history import History
 from twin_worker.horizon import Record
 from twin_worker.hybrid.fit import Hybrid
 from twin_worker.learn_law import OWN, Learnt
-from twin_worker.mismatch.marks import MOST, Mark
+from twin_worker.mismatch.marks import MOST, Extension, Mark
 from twin_worker.plant import Plant
 from twin_worker.predict import Onboard, Situation
 from twin_worker.preprocess import Grid
@@ -70,17 +69,6 @@ class Believed:
     def rank(self) -> tuple[bool, float]:
         """Give the sort key: least miss first; those that never flew a route last, the newest of them first."""
         return (True, -self.t) if np.isnan(self.miss) else (False, self.miss)
-
-
-@dataclass(frozen=True)
-class Extension:
-    """Missing physics that was put into the model in force: names of the effects, and their onset [s since 1970]."""
-
-    names: str
-    onset: float
-
-    def __str__(self) -> str:
-        return f"{self.names} since {datetime.fromtimestamp(self.onset, UTC):%H:%M:%S} UTC"
 
 
 @dataclass

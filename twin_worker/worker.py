@@ -10,15 +10,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
-import numpy as np
-from scipy.interpolate import CubicSpline
 
 from fleet.airframes import GENERIC, Airframe, load
 from fleet.bus import Bus
 from fleet.codec import Stamp
 from fleet.contract import (
     Alert,
-    Array,
     FleetState,
     Message,
     Mismatch,
@@ -32,13 +29,13 @@ from fleet.contract import (
 )
 from twin_worker.conflict.separation import Separation
 from twin_worker.conflict.traffic import Traffic
-from twin_worker.horizon import AHEAD
 from twin_worker.memory import AUTO
 from twin_worker.mismatch.live import Live
 from twin_worker.mismatch.told import word
 from twin_worker.twin import Twin, advance, fleet_row
 from twin_worker.whatif import question
 from twin_worker.whatif.answer import answer
+from twin_worker.whatif.grid import resample, wanted
 
 _log = logging.getLogger(__name__)
 _INBOX = 4096  # messages waiting per UAV; the oldest go first and are counted
@@ -73,9 +70,7 @@ class Worker:
         separation: Separation | None = None,
         diagnosis: Live | None = None,
     ) -> None:
-        self.bus = bus
-        self.diagnosis = diagnosis
-        self.uavs = uavs
+        self.bus, self.uavs, self.diagnosis = bus, uavs, diagnosis
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
         self.sentence = ""
         self.traffic = Traffic(separation or Separation())
@@ -252,33 +247,3 @@ def _advance_all(held: Held, messages: list[Message], traffic: Traffic) -> Itera
         with held.lock:
             results = advance(twin, (), now)
         yield from traffic.after(twin.uav, twin.turned_t, results)
-
-
-def wanted(asked: dict[str, str]) -> np.ndarray | None:
-    """Read `?horizon=30;step=0.5` into look-ahead times [s]; None where nothing was asked.
-
-    Raises:
-        ValueError: when they are no numbers or ask for more than 1,000 points.
-    """
-    if not asked.keys() & {"horizon", "step"}:
-        return None
-    try:
-        horizon, step = float(asked.get("horizon", AHEAD[-1])), float(asked.get("step", 1.0))
-    except ValueError:
-        raise ValueError(f"query: found {asked}, expected numbers, e.g. ?horizon=30;step=0.5; correct them") from None
-    if not (0 < horizon <= AHEAD[-1] and 0 < step <= 60 and horizon / step <= 1000):
-        raise ValueError(
-            f"query: found horizon {horizon}, step {step}; ask for at most {AHEAD[-1]:.0f} s and 1,000 points"
-        )
-    return np.arange(0.0, horizon + 1e-9, step)
-
-
-def resample(prediction: Prediction, grid: np.ndarray | None) -> Prediction:
-    """Give the prediction on other look-ahead times, (n,) [s], as far as it reaches; the whole of it for None."""
-    if grid is None:
-        return prediction
-    ahead = prediction.ahead.numpy().astype(float)
-    grid = grid[grid <= ahead[-1] + 1e-6]
-    path = CubicSpline(ahead, prediction.path.numpy())(grid)  # a chord over 4 s of a turn would cut it by metres
-    tube = np.column_stack([np.interp(grid, ahead, column) for column in prediction.tube.numpy().T])
-    return msgspec.structs.replace(prediction, ahead=Array.of(grid), path=Array.of(path), tube=Array.of(tube))

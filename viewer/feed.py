@@ -23,24 +23,15 @@ from fleet.contract import (
     State,
     Status,
 )
-from fleet.frames import Origin
 from viewer.events import MAX_RAISED
-from viewer.place import Place, TooFar
+from viewer.place import Place, TooFar, checked, first_fix
 from viewer.vehicle import ENDED_S, GIVE_UP_S, JUMP_S, Forecast, Vehicle, forecast
 
 MAX_VEHICLES = 2_000  # ids are written by strangers: more than this many are counted, not kept
 COASTING_S = 1.0  # a prediction so long after the last sample is of no flight that anything can be laid beside [s]
 MAX_WRITERS = 16  # workers whose sentences are kept: a restarted one is another
-LATE = (
-    Status,
-    Mission,
-    Model,
-    Prediction,
-    Alert,
-    Mismatch,
-    FleetState,
-    Account,
-)  # asked for at the start, so that a late viewer is complete
+# asked for at the start, so that a late viewer is complete
+LATE = (Status, Mission, Model, Prediction, Alert, Mismatch, FleetState, Account)
 
 
 class Feed:
@@ -150,7 +141,7 @@ class Feed:
         return self.vehicles[uav]
 
     def _sample(self, sample: Sample, _: Stamp | None, now: float) -> None:
-        if self.place is None and (origin := _first_fix(sample)) is not None:
+        if self.place is None and (origin := first_fix(sample)) is not None:
             self.place = Place(origin)
         if self.place is None:
             return
@@ -159,7 +150,7 @@ class Feed:
             vehicle.hear_sample(sample, self.place, now)
         except TooFar:
             others = (v for v in self.vehicles.values() if v is not vehicle and v.at is not None)
-            if (origin := _first_fix(sample)) is None or any(now - v.heard < GIVE_UP_S for v in others):
+            if (origin := first_fix(sample)) is None or any(now - v.heard < GIVE_UP_S for v in others):
                 raise
             self._move(Place(origin))
             vehicle.hear_sample(sample, self.place, now)
@@ -206,7 +197,7 @@ class Feed:
         vehicle.note(message, now)
         vehicle.controller = message.controller or vehicle.controller
         if self.place is None and message.path.shape[0]:
-            self.place = Place(_checked(message.ned_origin()))
+            self.place = Place(checked(message.ned_origin()))
         found = forecast(message, self.place, now) if self.place is not None else None
         vehicle.prediction, vehicle.forecast = message, found
         if found is None:
@@ -254,20 +245,3 @@ class Feed:
             copies = [vehicle.still(now) for vehicle in self.vehicles.values() if vehicle.alerts]
             found = [(copy, alert.kind, alert) for copy in copies for alert in copy.alerts.values()]
         return sorted(found, key=lambda one: -one[2].t)
-
-
-def _first_fix(sample: Sample) -> Origin | None:
-    """Read the frame's origin off the first position of a sample; None before a fix."""
-    if sample.position is None:
-        return None
-    x = sample.position.x.numpy()
-    if x.ndim != 2 or x.shape[1] < 3 or not len(x) or not np.isfinite(x[0]).all() or not x[0, :2].any():
-        return None
-    return _checked(Origin(int(x[0, 0]), int(x[0, 1]), int(x[0, 2])))
-
-
-def _checked(origin: Origin) -> Origin:
-    """Refuse an origin that is not on this earth."""
-    if abs(origin.lat_e7) > 890_000_000 or abs(origin.lon_e7) > 1_800_000_000 or abs(origin.alt_mm) > 100_000_000:
-        raise ValueError(f"origin: found {origin}, expected a place below 89 degrees and 100 km; check the sender")
-    return origin

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from fleet.contract import Sample
 from fleet.frames import Origin, to_geodetic, to_ned
 
 UNIT_M = 10.0  # metres per scene unit: keeps a fleet of kilometres well inside the renderer's near and far planes
@@ -68,3 +69,20 @@ def scene_quat(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarra
         ],
         axis=-1,
     )
+
+
+def first_fix(sample: Sample) -> Origin | None:
+    """Read the frame's origin off the first position of a sample; None before a fix."""
+    if sample.position is None:
+        return None
+    x = sample.position.x.numpy()
+    if x.ndim != 2 or x.shape[1] < 3 or not len(x) or not np.isfinite(x[0]).all() or not x[0, :2].any():
+        return None
+    return checked(Origin(int(x[0, 0]), int(x[0, 1]), int(x[0, 2])))
+
+
+def checked(origin: Origin) -> Origin:
+    """Refuse an origin that is not on this earth."""
+    if abs(origin.lat_e7) > 890_000_000 or abs(origin.lon_e7) > 1_800_000_000 or abs(origin.alt_mm) > 100_000_000:
+        raise ValueError(f"origin: found {origin}, expected a place below 89 degrees and 100 km; check the sender")
+    return origin

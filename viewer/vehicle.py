@@ -23,8 +23,9 @@ from fleet.contract import (
     Status,
 )
 from viewer.datatime import DataTime
-from viewer.events import Event, Known, closed, hear, merged
+from viewer.events import Event, closed, merged
 from viewer.place import UNIT_M, Place
+from viewer.tell import Known, hear
 from viewer.track import Track
 
 TRAIL_ROWS = 900  # about 90 s at 10 Hz

@@ -18,8 +18,8 @@ from twin_worker.coupled import Coupled
 from twin_worker.fly_route import paths
 from twin_worker.hybrid.extend import Added
 from twin_worker.hybrid.extend import extended as extended_hybrid
-from twin_worker.memory import Believed, Extension, Twin
-from twin_worker.mismatch.marks import Mark, before
+from twin_worker.memory import Believed, Twin
+from twin_worker.mismatch.marks import Extension, Mark, before
 from twin_worker.mismatch.push import Push
 from twin_worker.predict import Flown, set_out
 from twin_worker.preprocess import Grid

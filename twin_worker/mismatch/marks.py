@@ -1,8 +1,9 @@
-"""What a twin knew at moments of the last minutes, so that it can begin anew from before a fault."""
+"""What a twin knew at moments of the last minutes, so that it can begin anew from before a fault, and with what."""
 
 from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 from twin_worker.coupled import Coupled
 from twin_worker.hybrid.fit import Hybrid
@@ -28,6 +29,17 @@ class Mark:
     wind: WindFilter
     plant: Coupled | None
     hybrid: Hybrid | None
+
+
+@dataclass(frozen=True)
+class Extension:
+    """Missing physics that was put into the model in force: names of the effects, and their onset [s since 1970]."""
+
+    names: str
+    onset: float
+
+    def __str__(self) -> str:
+        return f"{self.names} since {datetime.fromtimestamp(self.onset, UTC):%H:%M:%S} UTC"
 
 
 def mark(t: float, wind: WindFilter, plants: tuple[Plant | None, ...], hybrid: Hybrid | None) -> Mark:
