@@ -126,6 +126,13 @@ def test_by_its_own_past_nothing_is_named_that_began_in_it(twin, monkeypatch):
     assert suspected.report.outcome is Outcome.SUSPECTED  # its onset is at 83 s
 
 
+def test_who_waits_to_be_confirmed_goes_first(twin):
+    calm, waiting = Watch(base=BASE), Watch(base=BASE)
+    answered(waiting, twin.history.newest - 10.0, made())
+    calm.whole_t = waiting.whole_t - 30.0  # and has waited longer
+    assert waiting.wants(twin) > calm.wants(twin)
+
+
 def test_another_name_or_onset_at_a_second_look_is_no_confirmation():
     watch = Watch(base=BASE)
     watch.begun = 1000.0

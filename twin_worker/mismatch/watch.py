@@ -67,7 +67,7 @@ class Watch:
             self.past_t = newest
         if newest < (self.begun + LEAST_S if self.base is not None else self.past_t + LOOK_S):
             return None
-        return 2.0 * (not self._sound(twin)) + (newest - self.whole_t) / WHOLE_S
+        return 2.0 * (not self._sound(twin)) + 4.0 * self._to_confirm + (newest - self.whole_t) / WHOLE_S
 
     def job(self, twin: Twin) -> Job:
         """Give the job that is due."""
