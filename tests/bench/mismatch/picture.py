@@ -16,7 +16,7 @@ from pathlib import Path
 from fleet.bus import connect, reachable
 from fleet.contract import Found, Mismatch, Sample
 
-from .world import model
+from .world import FAULT, model
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 ARGS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -38,7 +38,7 @@ def main() -> int:
     parser.add_argument("out", type=Path)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--uavs", type=int, default=4)
-    parser.add_argument("--fault", default="control_effectiveness_loss:aileron,loss=0.5")
+    parser.add_argument("--fault", default=FAULT)
     parser.add_argument("--models", type=Path, help="folder of models already calibrated (made anew)")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
