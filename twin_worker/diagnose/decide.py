@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleet.effects import Stage
 from twin_worker.diagnose.baseline import CHANNELS
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.refine import refine
@@ -14,12 +15,12 @@ from twin_worker.diagnose.sight import Sight
 
 MOST = 3  # effects named together
 _TRIED = 12  # guesses fitted properly at each step
-_LEAST, _LEAST_COARSE = 300.0, 400.0  # gain of a first effect, by the accelerometer and without
+_LEAST, _LEAST_COARSE = 150.0, 400.0  # gain of a first effect, by the accelerometer and without
 _CANCEL = 1.5  # an effect that gains this much more beside the others than all together undoes one of them
-_SECOND = 160.0  # and of every further one
+_SECOND = 300.0  # and of every further one
 _NEAR = 0.6  # of the best one's worth, from which an onset is worth a search
 _CHANCE = 1.5  # over what nominal flights reach by chance
-_SHARE, _SHARE_COARSE = 0.001, 0.25  # of the first one's gain a further one must bring
+_SHARE, _SHARE_COARSE = 0.02, 0.25  # of the first one's gain a further one must bring
 _OWN = 0.1  # share of a gain that must be of numbers which count
 _NEXT = 0.02  # tie of which the simpler is chosen
 _FINE, _COARSE = (
@@ -141,12 +142,18 @@ def choose(sight: Sight, found: list[Found]) -> Named:
 
 def needed(sight: Sight, named: list[Named], found: Found) -> float:
     """Give the gain a guess must reach: more than chance, and a share of the first one's."""
-    chance = _CHANCE * sight.base.chance.get(found.kind, 0.0)
+    chance = _CHANCE * max((x for kind, x in sight.base.chance.items() if _akin(kind, found.guess)), default=0.0)
     least = _LEAST if sight.base.vane else _LEAST_COARSE
     if not named:
         return max(least, chance)
     second, share = (_SECOND, _SHARE) if sight.base.vane else (least, _SHARE_COARSE)
     return max(second, chance, share * named[0].found.gain)
+
+
+def _akin(kind: str, guess: Guess) -> bool:
+    """Tell whether chance of this kind speaks of a guess too: the same effect, or the same surface."""
+    label = kind.partition("|")[0]
+    return label == guess.label or (guess.effect.stage is Stage.DELTA and label.endswith(f":{guess.of}"))
 
 
 def believable(sight: Sight, guess: Guess) -> bool:

@@ -81,7 +81,7 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     if not believed:
         sight.grant(weather)
     odds = () if any(one.guess.effect.variance for one in findings) else oddities(sight.held())
-    strange = next((odd for odd in odds if _strange(odd, base, believed, after[CHANNELS.index(odd.channel)])), None)
+    strange = next((odd for odd in odds if _strange(odd, base, believed, after.max())), None)
     if strange is not None:
         outcome = Outcome.UNKNOWN
     series = _series(case, white_before, white_after, force)
@@ -116,7 +116,7 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
 
 
 def _strange(odd: Odd, base: Baseline, named: tuple[Finding, ...], loud: float) -> bool:
-    """Tell whether a channel's equation changed in a way that names do not explain; `loud`: its residual over usual."""
+    """Tell whether a channel's equation changed in a way that names do not explain; `loud`: the loudest residual."""
     if not named:
         return odd.worth > odd.limit(base)
     gained = sum(one.gain for one in named)

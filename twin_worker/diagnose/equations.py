@@ -28,7 +28,7 @@ TERMS = {"alpha": ALPHA, "beta": BETA, "X": X, "T": THRUST, "L": LATERAL, "M": (
 USUAL = {
     "alpha": (np.inf, np.inf, 0.05, 1.5, 1.5, 0.03),
     "beta": (np.inf, np.inf, 0.1, 0.3, 0.06),
-    "X": (np.inf, np.inf, np.inf, 0.03, np.inf, *6 * (np.inf,)),
+    "X": (np.inf, np.inf, np.inf, 0.3, np.inf, *6 * (np.inf,)),
 }
 """Equation -> how large the coefficients of a wing usually are, where flight by itself does not tell: at every trim the
 elevator goes with the lift. Of beta: those of the side force it is turned round from; of X: thrust behind it."""

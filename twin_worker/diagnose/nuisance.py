@@ -22,9 +22,9 @@ WAVES = 3  # slow courses a wandering nuisance may take
 _WANDERS = {  # what sensors and weather do not keep to during a flight: effect -> floor over that of its mean
     "accel_bias": 0.4,
     "gyro_bias": 0.3,
-    "heading_bias": 0.5,
+    "heading_bias": 0.25,
     "imu_misalignment": 0.4,
-    "wind_steady": 0.3,
+    "wind_steady": 0.1,
 }
 
 _SHARES = ("L:delta_a", "L:p", "L:beta", "M:delta_e", "M:c_z", "M:q", "N:delta_r", "N:r", "N:beta")
