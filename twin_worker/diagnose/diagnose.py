@@ -80,7 +80,8 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     believed = findings if outcome is Outcome.NAMED else ()
     if not believed:
         sight.grant(weather)
-    odds = () if any(one.guess.effect.variance for one in findings) else oddities(sight.held())
+    gusty = any(one.guess.effect.variance for one in findings)
+    odds = oddities(sight.held()) if base.vane and not gusty else ()  # plain telemetry knows its equations too loosely
     strange = next((odd for odd in odds if _strange(odd, base, believed, after.max())), None)
     if strange is not None:
         outcome = Outcome.UNKNOWN
