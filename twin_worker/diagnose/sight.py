@@ -121,7 +121,6 @@ class Sight:
             if past[worst] < 1.0:
                 break
             self.precision[worst] = _TIGHT
-        self.gain_n = float(self.bn @ self.xn)
 
     def held(self) -> "Sight":
         """Give the same with every nuisance held to its spread, none handed to the hypotheses."""
