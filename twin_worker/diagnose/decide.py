@@ -28,7 +28,7 @@ _FINE, _COARSE = (
     0.15,
 )  # and of what is not told apart: by the accelerometer; by plain telemetry, whose baseline is wrong by about as much
 _GUSTS = 1.2, 1.5  # of the air channels' scatter over the usual: least, median
-_LEAST_TIE = 20.0
+_LEAST_TIE, _WIDEST_TIE = 20.0, 300.0
 
 Say = Callable[[str], None]
 
@@ -123,7 +123,9 @@ def rank(sight: Sight, found: Found) -> float:
 
 def tie(sight: Sight, found: Found) -> float:
     """Give how much less another guess may be worth and still not be told apart."""
-    return max(_LEAST_TIE, (_FINE if sight.base.vane else _COARSE) * found.gain)
+    if not sight.base.vane:
+        return max(_LEAST_TIE, _COARSE * found.gain)
+    return max(_LEAST_TIE, _NEXT * found.gain, min(_FINE * found.gain, _WIDEST_TIE))
 
 
 def choose(sight: Sight, found: list[Found]) -> Named:

@@ -4,13 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleet.effects import Onset
 from twin_worker.diagnose.foretell import blocks
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.refine import refine
 from twin_worker.diagnose.sight import Sight
 
 HELD = 0.03  # share of the residual that must go on held-out data for a name
+_SHORT_S, _PASSES = 2.0, 0.01  # blocks of what passes by; share of it from which it passes
 SHOWS = 1.15  # a channel's residual over its usual, from which it takes part in the proof
+_TAKEN = 0.95  # or the share of it that the effects leave in the half they are fitted on
 
 
 @dataclass(frozen=True)
@@ -18,7 +21,7 @@ class Proof:
     """Held-out evidence.
 
     Attributes:
-        before, after: whitened rms on odd blocks without and with the effects, channels that show something
+        before, after: whitened rms on odd blocks without and with the effects, in channels that show something
         fitted: the effects as fitted on even blocks
         kept: what each gains on odd blocks beside the others, doubled to compare with the whole flight
     """
@@ -43,13 +46,17 @@ def held_out(sight: Sight, guesses: tuple[Guess, ...], shows: np.ndarray) -> Pro
         shows: each channel's residual over its usual, (c,)
     """
     weather = sight.granted
-    even, odd = (sight.part(blocks(sight.case.t, odd=side)) for side in (False, True))
+    even, odd = (sight.part(_half(sight, guesses, odd=side)) for side in (False, True))
     fitted = list(guesses)
     for _ in range(1 + (len(guesses) > 1)):
         for i, guess in enumerate(fitted):
             even.grant((*weather, *(g for k, g in enumerate(fitted) if k != i)))
             fitted[i] = refine(even, guess, rounds=3, move=False).guess
-    use = shows > SHOWS if (shows > SHOWS).any() else np.ones_like(shows, bool)
+    even.grant(weather)
+    unexplained = _powers(even)
+    even.grant((*weather, *fitted))
+    use = (shows > SHOWS) | (_powers(even) < _TAKEN * unexplained)
+    use = use if use.any() else np.ones_like(use)
     cost = odd.cost(fitted)
     kept = tuple(2.0 * (odd.cost([g for k, g in enumerate(fitted) if k != i]) - cost) for i in range(len(fitted)))
     before = _rms(odd, use)
@@ -57,6 +64,20 @@ def held_out(sight: Sight, guesses: tuple[Guess, ...], shows: np.ndarray) -> Pro
     return Proof(before, _rms(odd, use), tuple(fitted), kept)
 
 
+def _half(sight: Sight, guesses: tuple[Guess, ...], odd: bool) -> np.ndarray:
+    """Tell which rows are of this half, (n,) bool; what only passes is judged while it passes, by shorter blocks."""
+    t = sight.case.t
+    if any(guess.when.kind is not Onset.BUMP for guess in guesses):
+        return blocks(t, odd=odd)
+    passing = np.any([guess.when.gate(t) > _PASSES for guess in guesses], axis=0)
+    return passing & ((np.floor(t / _SHORT_S) % 2 == 1) == odd)
+
+
+def _powers(sight: Sight) -> np.ndarray:
+    """Give the mean square of what each channel leaves, (c,)."""
+    e = (sight.e + sight.Jn @ sight.xn)[sight.ok]
+    return (e**2).mean(axis=0) if e.size else np.zeros(e.shape[1])
+
+
 def _rms(sight: Sight, use: np.ndarray) -> float:
-    e = (sight.e + sight.Jn @ sight.xn)[sight.ok][:, use]
-    return float(np.sqrt((e**2).mean())) if e.size else 0.0
+    return float(np.sqrt(_powers(sight)[use].mean()))
