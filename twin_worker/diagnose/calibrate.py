@@ -146,7 +146,7 @@ def _with_noise(base: Baseline, cases: Sequence[Case], winds: Sequence[np.ndarra
     for k, n in enumerate(several):
         if n.effect.name == "wind_steady":
             spread[k] = max(spread[k], np.sqrt(np.mean([w[n.index] ** 2 for w in winds])))
-    names = [*(n.name for n in several), *(one.name for one in wanders(several))]
+    names = [*(n.name for n in several), *(one.name for one in wanders(several, base.vane))]
     named = dict(zip(names, spread.tolist(), strict=True))
     return replace(base, noise=Noise(noise.ar, noise.sigma * _SAFE), spread=named)
 
@@ -155,7 +155,7 @@ def _slopes(case: Case, granted: tuple[Guess, ...], rows: np.ndarray) -> np.ndar
     """Give how residuals change with each nuisance, (n, c, nuisances)."""
     several = nuisances(case.base.vane)
     own = np.stack([(case.residuals((*granted, n.guess(n.step))) - rows) / n.step for n in several], axis=2)
-    return np.concatenate([own, wandering(own, wanders(several), case.t)], axis=2)
+    return np.concatenate([own, wandering(own, wanders(several, case.base.vane), case.t)], axis=2)
 
 
 def _spreads(
@@ -166,7 +166,7 @@ def _spreads(
     A nuisance that a flight says nothing about leaves its spread where it was.  Source: Dempster, Laird & Rubin 1977.
     """
     several = nuisances(cases[0].base.vane)
-    floors = np.array([*(n.floor for n in several), *(one.floor for one in wanders(several))])
+    floors = np.array([*(n.floor for n in several), *(one.floor for one in wanders(several, cases[0].base.vane))])
     parts = []
     for case, x, J in zip(cases, rows, slopes, strict=True):
         white = np.stack([noise.whiten(J[:, :, k]) for k in range(J.shape[2])], axis=2)[case.ok]

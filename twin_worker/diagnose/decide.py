@@ -19,7 +19,7 @@ _LEAST, _LEAST_COARSE = 150.0, 400.0  # gain of a first effect, by the accelerom
 _CANCEL = 1.5  # an effect that gains this much more beside the others than all together undoes one of them
 _SECOND = 300.0  # and of every further one
 _NEAR = 0.6  # of the best one's worth, from which an onset is worth a search
-_CHANCE = 1.5  # over what nominal flights reach by chance
+_CHANCE, _CHANCE_COARSE = 1.5, 1.2  # over what nominal flights reach by chance
 _SHARE, _SHARE_COARSE = 0.02, 0.25  # of the first one's gain a further one must bring
 _OWN = 0.1  # share of a gain that must be of numbers which count
 _NEXT = 0.02  # tie of which the simpler is chosen
@@ -144,7 +144,10 @@ def choose(sight: Sight, found: list[Found]) -> Named:
 
 def needed(sight: Sight, named: list[Named], found: Found) -> float:
     """Give the gain a guess must reach: more than chance, and a share of the first one's."""
-    chance = _CHANCE * max((x for kind, x in sight.base.chance.items() if _akin(kind, found.guess)), default=0.0)
+    known = sight.base.chance
+    chance = _CHANCE_COARSE * known.get(found.kind, 0.0)
+    if sight.base.vane:
+        chance = _CHANCE * max((x for kind, x in known.items() if _akin(kind, found.guess)), default=0.0)
     least = _LEAST if sight.base.vane else _LEAST_COARSE
     if not named:
         return max(least, chance)

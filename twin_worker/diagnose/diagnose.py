@@ -35,6 +35,7 @@ _STRANGE = 3.0  # a channel's residual over its usual that is not let pass unexp
 _LEFT = 2.6  # and the same beside named effects
 _EXPLAINED = 0.6  # share of the excess that names must explain
 _DOUBT = 2.0  # standard deviations below which a number is none
+_BESIDE_LOUD = 0.25  # and where a channel stays loud
 _BESIDE = 0.5  # of what names gained: a changed equation that gains more shows that they are wrong
 _AGAINST = 3.0  # and so many times what chance reaches
 _OTHER = 1.7  # another aircraft flies faster or slower by this factor
@@ -121,7 +122,8 @@ def _strange(odd: Odd, base: Baseline, named: tuple[Finding, ...], loud: float) 
     if not named:
         return odd.worth > odd.limit(base)
     gained = sum(one.gain for one in named)
-    return odd.worth > _AGAINST * odd.limit(base) and (odd.worth > _BESIDE * gained or loud > _LEFT)
+    beside = _BESIDE_LOUD if loud > _LEFT else _BESIDE
+    return odd.worth > max(_AGAINST * odd.limit(base), beside * gained)
 
 
 def _fits(flight: Flight, base: Baseline) -> None:

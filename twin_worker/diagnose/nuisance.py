@@ -113,21 +113,22 @@ class Wander:
     floor: float
 
 
-def wanders(known: Sequence[Nuisance]) -> tuple[Wander, ...]:
-    """List the slow courses of those that wander."""
+def wanders(known: Sequence[Nuisance], vane: bool) -> tuple[Wander, ...]:
+    """List the slow courses of those that wander; without the vane noise covers them."""
     return tuple(
         Wander(f"{n.name}~{wave}", k, wave, _WANDERS[n.effect.name] * n.floor)
         for k, n in enumerate(known)
         if n.effect.name in _WANDERS
         for wave in range(1, WAVES + 1)
+        if vane
     )
 
 
 def wandering(columns: np.ndarray, several: Sequence[Wander], t: np.ndarray) -> np.ndarray:
     """Give the slopes of slow courses, (n, c, wanders), by those of what wanders, (n, c, nuisances), at t (n,)."""
     share = (t - t[0]) / max(t[-1] - t[0], 1e-9)
-    waves = [np.sqrt(2.0) * np.cos(np.pi * one.wave * share) for one in several]
-    return np.stack([columns[:, :, one.of] * wave[:, None] for one, wave in zip(several, waves, strict=True)], axis=2)
+    waves = np.sqrt(2.0) * np.cos(np.pi * np.outer(share, [one.wave for one in several]))
+    return columns[:, :, [one.of for one in several]] * waves[:, None, :]
 
 
 def nuisances(vane: bool) -> tuple[Nuisance, ...]:

@@ -38,7 +38,7 @@ class Sight:
         self.noise = self._scaled()
         self.weather = is_weather(self.base)
         self.nuisances: tuple[Nuisance, ...] = nuisances(self.base.vane)
-        self.wanders = wanders(self.nuisances)
+        self.wanders = wanders(self.nuisances, self.base.vane)
         self.clip = np.full(len(CHANNELS), CLIP)
         self.granted = granted
         if self.ok.any():
