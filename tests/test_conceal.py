@@ -13,7 +13,6 @@ from fleet.pretend.conceal import acts as acting
 from fleet.pretend.conceal import exam as examination
 from fleet.pretend.conceal import plan as planning
 from fleet.pretend.conceal import record as recording
-from fleet.pretend.conceal.__main__ import main
 from fleet.pretend.conceal.effects import BOTH, HIDDEN, UNKNOWN
 from fleet.pretend.conceal.exam import exam, jobs_of
 from fleet.pretend.conceal.plan import Job, Planned, draw
@@ -208,7 +207,6 @@ def test_the_card_is_what_an_operator_knows(airframe: str, held: Held) -> None:
     assert set(card["surface_full_deg"]) == {"aileron", "elevator", "rudder"}
 
 
-def test_wrong_use_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    assert main(["--seed", "1", "--flights", "3", "--out", str(tmp_path)]) == 2
-    assert "found 3, expected 6 at least" in capsys.readouterr().err
-    assert main(["--seed", "-1", "--out", str(tmp_path)]) == 2
+def test_wrong_use_is_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="found 3, expected 6 at least"):
+        examination.exam(1, 3, tmp_path)

@@ -49,7 +49,7 @@ def _examined(args: argparse.Namespace, folder: Path) -> int:
     try:
         marked = examine(paper, stop_on_signal(), _say)
     except Ended as ended:
-        return int(str(ended))
+        return ended.code
     scores = score(marked.marks)
     Console().print(shown.table(marked.marks, scores))
     if args.json:

@@ -16,7 +16,11 @@ Say = Callable[[str], None]
 
 
 class Ended(Exception):
-    """A step ended early: the exit code."""
+    """A step ended early; `code` is for the shell."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,7 @@ def examine(paper: Paper, stop: Event, say: Say) -> Marked:
         _conceal(paper, key, stop)
         sealed = digest(paper.sealed)
         say(f"labels sealed, the key kept elsewhere: sha256 {sealed}")
-        written = [_diagnose(paper, folder, stop, say) for folder in airframes(paper.folder)]
+        written = [_diagnose(paper, folder, stop, say) for folder in _airframes(paper.folder)]
         reports = digest(*written)
         say(f"reports committed: sha256 {reports}")
         labels: dict[str, Any] = json.loads(unseal(paper.sealed, key, sealed))
@@ -78,7 +82,7 @@ def examine(paper: Paper, stop: Event, say: Say) -> Marked:
     return Marked(marks, sealed, reports)
 
 
-def airframes(folder: Path) -> list[Path]:
+def _airframes(folder: Path) -> list[Path]:
     """Give the folders of the airframes flown."""
     return sorted(path.parent for path in folder.glob("*/*.card.json"))
 

@@ -106,6 +106,11 @@ class Mark:
     acts: Mapping[str, Any] = field(default_factory=dict)
 
     @property
+    def said(self) -> tuple[str, ...]:
+        """Give the names, or what was said instead of any."""
+        return self.named or ("unknown" if self.verdict == "unknown" else "nothing",)
+
+    @property
     def hit(self) -> bool:
         """Tell whether it was answered as well as can be."""
         if self.role == "control":

@@ -7,7 +7,7 @@ from typing import Any
 from fleet.page.html import document, safe
 from fleet.prove.course import Marked, Paper
 from fleet.prove.mark import Mark
-from fleet.prove.score import ASKED, met
+from fleet.prove.score import lines
 from fleet.prove.shown import confusion, fit, numbers, ordered
 
 _HOW = (
@@ -38,12 +38,9 @@ def write(paper: Paper, marked: Marked, scores: Mapping[str, Any]) -> Path:
 def _scores(scores: Mapping[str, Any]) -> str:
     """Show each score beside what was asked."""
     cards = []
-    for name, (asked, words) in ASKED.items():
-        value = scores[name]
-        bound = f"at most {-asked:.3g}" if asked < 0 else f"at least {asked:.3g}"
-        chip = '<span class="chip none">met</span>' if met(name, value) else '<span class="chip named">missed</span>'
-        reached = "–" if value is None else f"{value:.3g}"
-        cards.append(f'<div class="card"><b>{reached} {chip}</b>{words}, {bound}</div>')
+    for one in lines(scores):
+        chip = '<span class="chip none">met</span>' if one.met else '<span class="chip named">missed</span>'
+        cards.append(f'<div class="card"><b>{one.reached} {chip}</b>{one.words}, {one.asked}</div>')
     return f'<div class="cards">{"".join(cards)}</div>'
 
 
@@ -59,7 +56,7 @@ def _flight(one: Mark) -> str:
         chip,
         f'<a href="{one.airframe}/pages/{one.flight}.html">{safe(one.flight)}</a><br>{safe(one.airframe)}',
         ", ".join(map(safe, one.concealed)) or "nothing",
-        ", ".join(map(safe, one.named)) or ("unknown" if one.verdict == "unknown" else "nothing"),
+        ", ".join(map(safe, one.said)),
         "<br>".join(map(safe, numbers(one))),
         "<br>".join(f"{dt:+.1f} s" for dt, _ in one.late),
         fit(one),

@@ -1,8 +1,8 @@
 """The scores of an examination, and what was asked of each."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,25 @@ ASKED = {  # score: least or most, and in words
     "named_improving": (1.0, "named flights whose held-out fit improves"),
 }
 """What is asked: at least, or with a minus sign at most."""
+
+
+class Line(NamedTuple):
+    """One score beside what was asked, in words."""
+
+    met: bool
+    words: str
+    asked: str
+    reached: str
+
+
+def lines(scores: Mapping[str, Any]) -> list[Line]:
+    """Lay out what was asked and reached."""
+    out = []
+    for name, (asked, words) in ASKED.items():
+        value = scores[name]
+        bound = f"at most {-asked:.3g}" if asked < 0 else f"at least {asked:.3g}"
+        out.append(Line(met(name, value), words, bound, "nothing to score" if value is None else f"{value:.3g}"))
+    return out
 
 
 def met(name: str, value: float | None) -> bool:

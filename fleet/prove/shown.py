@@ -11,7 +11,7 @@ from rich.text import Text
 
 from fleet.prove.course import Marked, Paper
 from fleet.prove.mark import Mark
-from fleet.prove.score import ASKED, met
+from fleet.prove.score import ASKED, lines, met
 
 
 def written(paper: Paper, marked: Marked, scores: Mapping[str, Any]) -> dict[str, Any]:
@@ -36,7 +36,7 @@ def confusion(marks: Sequence[Mark]) -> Counter[tuple[str, str]]:
         pairs.update((name, name) for name in right)
         missed = [name for name in one.concealed if name not in right]
         extra = [name for name in one.named if name not in right]
-        nothing = "unknown" if one.verdict == "unknown" else "nothing"
+        nothing = one.said[0] if not one.named else "nothing"
         for k in range(max(len(missed), len(extra))):
             pairs[(missed[k] if k < len(missed) else "nothing", extra[k] if k < len(extra) else nothing)] += 1
         if not one.concealed and not one.named:
@@ -63,7 +63,7 @@ def _flights(marks: Sequence[Mark]) -> Table:
             Text("ok", "green") if one.hit else Text("MISS", "red"),
             f"{one.airframe} {one.flight}",
             ", ".join(one.concealed) or "nothing",
-            ", ".join(one.named) or ("unknown" if one.verdict == "unknown" else "nothing"),
+            ", ".join(one.said),
             "\n".join(numbers(one)),
             "\n".join(f"{dt:+.1f} s" for dt, _ in one.late),
             fit(one),
@@ -90,9 +90,6 @@ def _scores(scores: Mapping[str, Any]) -> Table:
     out = Table(box=None, pad_edge=False)
     for heading in ("", "score", "asked", "reached"):
         out.add_column(heading)
-    for name, (asked, words) in ASKED.items():
-        value = scores[name]
-        reached = "nothing to score" if value is None else f"{value:.3g}"
-        bound = f"≤ {-asked:.3g}" if asked < 0 else f"≥ {asked:.3g}"
-        out.add_row(Text("met", "green") if met(name, value) else Text("missed", "red"), words, bound, reached)
+    for one in lines(scores):
+        out.add_row(Text("met", "green") if one.met else Text("missed", "red"), one.words, one.asked, one.reached)
     return out

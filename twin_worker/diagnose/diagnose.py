@@ -10,13 +10,13 @@ import numpy as np
 from fleet.effects import Onset, Stage, catalogue
 from twin_worker.diagnose import foretell, prove
 from twin_worker.diagnose.apart import manoeuvre
-from twin_worker.diagnose.baseline import CHANNELS, Baseline
+from twin_worker.diagnose.baseline import CHANNELS, SHOWN_BY, Baseline
 from twin_worker.diagnose.calibrate import own_weather
 from twin_worker.diagnose.decide import Named, decide, turbulent
 from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.freely import stray
 from twin_worker.diagnose.guess import ALWAYS, Guess
-from twin_worker.diagnose.odd import Odd, oddities
+from twin_worker.diagnose.odd import oddities, strange
 from twin_worker.diagnose.prove import HELD, Proof
 from twin_worker.diagnose.refine import refine
 from twin_worker.diagnose.report import Finding, Outcome, Report, Series, Tried
@@ -35,9 +35,6 @@ _STRANGE = 3.0  # a channel's residual over its usual that is not let pass unexp
 _LEFT = 2.6  # and the same beside named effects
 _EXPLAINED = 0.6  # share of the excess that names must explain
 _DOUBT = 2.0  # standard deviations below which a number is none
-_BESIDE_LOUD = 0.25  # and where a channel stays loud
-_BESIDE = 0.5  # of what names gained: a changed equation that gains more shows that they are wrong
-_AGAINST = 3.0  # and so many times what chance reaches
 _OTHER = 1.7  # another aircraft flies faster or slower by this factor
 _GUESSED = 0.2  # doubt of a turbulence's intensity, as a share of it
 _GUSTY = 450.0  # gain of turbulence
@@ -81,16 +78,15 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     believed = findings if outcome is Outcome.NAMED else ()
     if not believed:
         sight.grant(weather)
-    gusty = any(one.guess.effect.variance for one in findings)
-    odds = oddities(sight.held()) if base.vane and not gusty else ()  # plain telemetry knows its equations too loosely
-    strange = next((odd for odd in odds if _strange(odd, base, believed, after.max())), None)
-    if strange is not None:
+    odds = [] if any(one.guess.effect.variance for one in findings) else oddities(sight)
+    odd = strange(odds, base, sum(one.gain for one in believed), loud=after.max() > _LEFT)
+    if odd is not None:
         outcome = Outcome.UNKNOWN
     series = _series(case, white_before, white_after, force)
     where: tuple[str, tuple[tuple[float, float], ...]] = ("", ())
     terms: dict[str, float] = {}
     if outcome is Outcome.UNKNOWN:
-        channel = CHANNELS.index(strange.channel) if strange else _TELLING[int(np.argmax(after[_TELLING]))]
+        channel = CHANNELS.index(odd.channel) if odd else _TELLING[int(np.argmax(after[_TELLING]))]
         where = (CHANNELS[channel], stretches(case.t, white_after[:, channel], sight.ok))
         terms = free_form(case, weather, channel)
     report = Report(
@@ -107,7 +103,7 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
         stray_before=float(np.degrees(stray(case, weather))),
         stray_after=float(np.degrees(stray(case, (*weather, *proof.fitted)))),
         where=where,
-        odd={odd.channel: odd.worth / odd.limit(base) for odd in odds},
+        odd={one.channel: one.worth / one.limit(base) for one in odds},
         terms=terms,
         tried=_ranking(ranked, named),
         lacks=(*flight.lacks, *uncovered(base)),
@@ -115,15 +111,6 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
         seconds=time.perf_counter() - begun,
     )
     return sentence(report)
-
-
-def _strange(odd: Odd, base: Baseline, named: tuple[Finding, ...], loud: float) -> bool:
-    """Tell whether a channel's equation changed in a way that names do not explain; `loud`: the loudest residual."""
-    if not named:
-        return odd.worth > odd.limit(base)
-    gained = sum(one.gain for one in named)
-    beside = _BESIDE_LOUD if loud > _LEFT else _BESIDE
-    return odd.worth > max(_AGAINST * odd.limit(base), beside * gained)
 
 
 def _fits(flight: Flight, base: Baseline) -> None:
@@ -143,12 +130,11 @@ def _fits(flight: Flight, base: Baseline) -> None:
 
 def uncovered(base: Baseline) -> tuple[str, ...]:
     """Say which axes the nominal flights did not calibrate."""
-    doublets = {"L": "roll", "M": "pitch", "N": "yaw"}
     cure = {"L": "aileron", "M": "elevator", "N": "rudder"}
     return tuple(
-        f"{doublets[name]} not covered: the nominal flights explain {base.r2.get(name, 0.0):.0%} of it; "
-        f"it needs {cure[name]} doublets"
-        for name in doublets
+        f"{SHOWN_BY[name]} not covered: the nominal flights explain {base.r2.get(name, 0.0):.0%} of it; "
+        f"it needs {surface} doublets"
+        for name, surface in cure.items()
         if base.r2.get(name, 1.0) <= WELL
     )
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from fleet.effects import catalogue
 from twin_worker.diagnose import equations as eq
@@ -13,6 +14,7 @@ from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.residual import RHO_0, Case, Terms
 from twin_worker.diagnose.smooth import thinned
+from twin_worker.ridge import ridge
 
 RIDGE = 3e-4  # pull of a coefficient towards zero, as a share of its term's length
 _ORDER, _WHITENINGS = 3, 1  # of the residuals' autoregression; rounds
@@ -21,10 +23,8 @@ _FADED = 4.0  # residual rows that count as one: whitening is never whole
 _SHEAR = 1.0  # usual growth of wind with height [m/s per 100 m]
 CORRELATED = 50.0  # residual rows that count as one
 _SIDE = 0.5  # weight of sideslip in the wind fit [-]
-_CALM, _STILL = (
-    np.array([0.0, 0.0, 1.0]),
-    np.array([0.5, 0.5, 100.0]),
-)  # no wind, true airspeed; and how far to hold to it
+_CALM = np.array([0.0, 0.0, 1.0])  # no wind [m/s], true airspeed [-]
+_STILL = np.array([0.5, 0.5, 100.0])  # how far a flight is held to that
 _LAGS = (0.0, 0.03, 0.06, 0.1, 0.14, 0.18, 0.22, 0.28, 0.35)  # [s]
 _DELAYS, _ENGINES = (0.0, 0.02, 0.04, 0.06), (0.1, 0.25, 0.5)  # [s]
 
@@ -36,9 +36,9 @@ def wind(w: np.ndarray) -> tuple[Guess, ...]:
 
 
 def fit(
-    flights: Sequence[Flight], card: Card, timing: Timing, vane: bool, ridge: float = RIDGE
+    flights: Sequence[Flight], card: Card, timing: Timing, vane: bool, pull: float = RIDGE
 ) -> tuple[Baseline, list[np.ndarray]]:
-    """Fit every equation, and the weather of each flight, (4,); little data wants a stronger ridge.
+    """Fit every equation, and the weather of each flight, (4,); little data wants a stronger pull to zero.
 
     Raises:
         ValueError: when the flights do not excite an equation at all.
@@ -52,10 +52,10 @@ def fit(
         winds = [fit_wind(case, w) for case, w in zip(cases, winds, strict=True)]
         made = [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)]
         base = replace(base, airspeed=_airspeed(cases, made))
-        alpha = _solve(Rows(cases, made, "alpha", ridge), 0)[0]
-        base = replace(base, coef={"alpha": alpha, "beta": _side(Rows(cases, made, "beta", ridge), made, vane)})
+        alpha = _solve(Rows(cases, made, "alpha", pull), 0)[0]
+        base = replace(base, coef={"alpha": alpha, "beta": _side(Rows(cases, made, "beta", pull), made, vane)})
         cases = _with(cases, base)
-        base = _moments(cases, [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)], base, ridge)
+        base = _moments(cases, [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)], base, pull)
         cases = _with(cases, base)
     return base, winds
 
@@ -64,14 +64,14 @@ def _with(cases: list[Case], base: Baseline) -> list[Case]:
     return [Case(case.flight, base, like=case) for case in cases]
 
 
-def _moments(cases: list[Case], made: list[Terms], base: Baseline, ridge: float) -> Baseline:
+def _moments(cases: list[Case], made: list[Terms], base: Baseline, pull: float) -> Baseline:
     """Fit forces and moments, the flow angles given."""
     coef, r2 = dict(base.coef), {}
-    both, r2["X"] = _solve(axial(cases, made, ridge), 0)
+    both, r2["X"] = _solve(axial(cases, made, pull), 0)
     coef["X"], coef["T"] = both[: len(eq.X)], both[len(eq.X) :]
-    coef["M"], r2["M"] = _solve(pitch(cases, made, coef, ridge))
+    coef["M"], r2["M"] = _solve(pitch(cases, made, coef, pull))
     for name in ("L", "N"):
-        coef[name], r2[name] = _solve(Rows(cases, made, name, ridge))
+        coef[name], r2[name] = _solve(Rows(cases, made, name, pull))
     for name in ("alpha", "beta"):
         rows = Rows(cases, made, name)
         r2[name] = _r2(rows.A[rows.ok] @ coef[name], rows.y[rows.ok])
@@ -101,10 +101,10 @@ class Rows:
         cases: list[Case],
         made: list[Terms],
         name: str,
-        ridge: float = RIDGE,
+        pull: float = RIDGE,
         more: Callable[[Terms], np.ndarray] | None = None,
     ) -> None:
-        self.ridge = ridge
+        self.pull = pull
         A, y, ok, whole = [], [], [], []
         for case, m in zip(cases, made, strict=True):
             rows = m.terms[name] * m.scale.get(name, 1.0)
@@ -140,11 +140,11 @@ def _solve(rows: Rows, whitenings: int = _WHITENINGS) -> tuple[np.ndarray, float
     shrinks the derivatives: both sides are filtered by the residuals' own autoregression.
     Source: Clarke 1967 (generalised least squares); Klein & Morelli 2006, section 5.2.
     """
-    x = _ridge(rows.A[rows.ok], rows.y[rows.ok], rows, CORRELATED)
+    x = _held(rows.A[rows.ok], rows.y[rows.ok], rows, CORRELATED)
     r2 = _r2(rows.A[rows.ok] @ x, rows.y[rows.ok])
     for _ in range(whitenings):
         white = rows.whitener(x)
-        x = _ridge(white(rows.A)[rows.whole], white(rows.y)[rows.whole], rows, _FADED)
+        x = _held(white(rows.A)[rows.whole], white(rows.y)[rows.whole], rows, _FADED)
     return x, r2
 
 
@@ -158,20 +158,15 @@ def _r2(fitted: np.ndarray, y: np.ndarray) -> float:
     return float(1.0 - ((y - fitted) ** 2).sum() / max(((y - y.mean()) ** 2).sum(), 1e-12))
 
 
-def _ridge(A: np.ndarray, y: np.ndarray, of: Rows, as_one: float) -> np.ndarray:
+def _held(A: np.ndarray, y: np.ndarray, of: Rows, as_one: float) -> np.ndarray:
     """Solve by least squares, held to zero a little, and to what is usual as far as the residuals leave it open.
 
     `as_one` residual rows count as one.
     """
+    x = ridge(A, y, of.pull)
+    noise = np.sqrt(as_one * np.mean((y - A @ x) ** 2))
     length = np.linalg.norm(A, axis=0) + 1e-12
-    k = A.shape[1]
-    pull = np.full(k, of.ridge)
-    for _ in range(2):
-        rows, told = np.vstack([A / length, np.diag(pull)]), np.concatenate([y, np.zeros(k)])
-        x = np.linalg.lstsq(rows, told, rcond=None)[0] / length
-        noise = np.sqrt(as_one * np.mean((y - A @ x) ** 2))
-        pull = np.maximum(of.ridge, noise / (of.usual * length))
-    return x
+    return ridge(A, y, np.maximum(of.pull, noise / (of.usual * length)))
 
 
 def _airspeed(cases: list[Case], made: list[Terms]) -> float:
@@ -197,20 +192,12 @@ def _scale(cases: list[Case]) -> float:
         m, r, ok = case.terms(()), case.flight.readings, case.ok
         told = m.measured["airspeed"][ok] / np.sqrt(m.flow.rho[ok] / RHO_0)
         v = np.stack([thinned(r[name])[ok] for name in ("v_n", "v_e", "v_d")])
-        x = np.array([0.0, 0.0, 1.0])
-        for _ in range(8):
-            air = v - np.array([x[0], x[1], 0.0])[:, None]
-            speed = np.linalg.norm(air, axis=0)
-            J = np.column_stack([-x[2] * air[0] / speed, -x[2] * air[1] / speed, speed])
-            x = (
-                x
-                + np.linalg.lstsq(
-                    np.vstack([J, np.diag(_STILL)]),
-                    np.concatenate([told - x[2] * speed, _STILL * (_CALM - x)]),
-                    rcond=None,
-                )[0]
-            )
-        found.append(x[2])
+
+        def miss(x: np.ndarray, v: np.ndarray = v, told: np.ndarray = told) -> np.ndarray:
+            speed = np.linalg.norm(v - np.array([x[0], x[1], 0.0])[:, None], axis=0)
+            return np.concatenate([told - x[2] * speed, _STILL * (x - _CALM)])
+
+        found.append(least_squares(miss, _CALM).x[2])
     return float(np.median(found))
 
 
@@ -266,11 +253,11 @@ def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
     return best
 
 
-def pitch(cases: list[Case], made: list[Terms], coef: dict[str, np.ndarray], ridge: float = RIDGE) -> Rows:
+def pitch(cases: list[Case], made: list[Terms], coef: dict[str, np.ndarray], pull: float = RIDGE) -> Rows:
     """Give the rows of the pitching moment, thrust's own among its terms."""
-    return Rows(cases, made, "M", ridge, more=lambda m: (coef["T"] @ m.terms["T"])[None])
+    return Rows(cases, made, "M", pull, more=lambda m: (coef["T"] @ m.terms["T"])[None])
 
 
-def axial(cases: list[Case], made: list[Terms], ridge: float = RIDGE) -> Rows:
+def axial(cases: list[Case], made: list[Terms], pull: float = RIDGE) -> Rows:
     """Give the rows of axial force, drag's terms before those of thrust."""
-    return Rows(cases, made, "X", ridge, more=lambda m: m.terms["T"])
+    return Rows(cases, made, "X", pull, more=lambda m: m.terms["T"])

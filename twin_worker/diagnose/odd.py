@@ -4,20 +4,22 @@ For each channel every coefficient of its equation is let go at once, and the ch
 it. A named effect that is right leaves nothing to gain; one that only resembles what happened leaves much.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 from fleet.effects import Onset
-from twin_worker.diagnose.baseline import CHANNELS, Baseline
+from twin_worker.diagnose.baseline import CHANNELS, SHOWN_BY, Baseline
 from twin_worker.diagnose.residual import Terms
 from twin_worker.diagnose.scan import PRICE, WELL, gates_of, normals, solved
 from twin_worker.diagnose.sight import Sight
 from twin_worker.diagnose.smooth import STEP_S
 
-_EQUATION = {"roll": "L", "pitch": "M", "yaw": "N", "force_x": "X", "lift": "alpha", "side": "beta"}
 _LEAST, _CHANCE = 300.0, 2.0  # gain; over what nominal flights reach by chance
+_AGAINST = 3.0  # and that many limits, to be held against names; and
+_BESIDE, _BESIDE_LOUD = 0.5, 0.25  # so much of what they gained, less where some channel stays loud
 _AIR_LAG_S = 4.0  # of a pressure line that is partly blocked
 
 
@@ -39,7 +41,13 @@ class Odd(NamedTuple):
 
 
 def oddities(sight: Sight) -> list[Odd]:
-    """Give what every channel would gain by changing since its best instant, best first."""
+    """Give what every channel would gain by changing since its best instant, best first, no nuisance handed over.
+
+    Plain telemetry knows its equations too loosely to tell.
+    """
+    if not sight.base.vane:
+        return []
+    sight = sight.held()
     rows, whens = gates_of(sight.case.t, Onset.STEP)
     out = []
     for channel, terms in _terms(sight):
@@ -54,10 +62,17 @@ def oddities(sight: Sight) -> list[Odd]:
     return sorted(out, key=lambda one: -one.worth)
 
 
+def strange(odds: Sequence[Odd], base: Baseline, gained: float, loud: bool) -> Odd | None:
+    """Give the first that names do not explain; `gained` by them in all, 0 without any; `loud`: a channel stays so."""
+    least = (_BESIDE_LOUD if loud else _BESIDE) * gained
+    limits = _AGAINST if gained else 1.0
+    return next((odd for odd in odds if odd.worth > max(limits * odd.limit(base), least)), None)
+
+
 def _terms(sight: Sight) -> Iterator[tuple[str, list[np.ndarray]]]:
     """Give the terms that each channel may change by, (n,) each."""
     made = sight.case.terms(sight.granted)
-    for channel, equation in _EQUATION.items():
+    for equation, channel in SHOWN_BY.items():
         if sight.base.r2.get(equation, 1.0) > WELL:
             own = made.terms[equation] * made.scale.get(equation, 1.0)
             yield channel, [*own, *_more(channel, made)]
@@ -65,9 +80,8 @@ def _terms(sight: Sight) -> Iterator[tuple[str, list[np.ndarray]]]:
     if "Va" in sight.case.flight.readings:
         slow = _lagged(flow.Va, _AIR_LAG_S) - flow.Va
         yield "airspeed", [np.ones_like(flow.Va), flow.Va, slow]
-    if sight.base.vane:
-        for name, rate in (("gyro_roll", flow.p), ("gyro_pitch", flow.q), ("gyro_yaw", flow.r)):
-            yield name, [np.ones_like(rate), rate]
+    for name, rate in (("gyro_roll", flow.p), ("gyro_pitch", flow.q), ("gyro_yaw", flow.r)):
+        yield name, [np.ones_like(rate), rate]
 
 
 def _more(channel: str, made: Terms) -> list[np.ndarray]:
@@ -78,7 +92,6 @@ def _more(channel: str, made: Terms) -> list[np.ndarray]:
 
 def _lagged(x: np.ndarray, tau: float) -> np.ndarray:
     """Give x, (n,), behind a first-order lag [s]."""
-    out, share = x.copy(), 1.0 - np.exp(-STEP_S / tau)
-    for k in range(1, len(x)):
-        out[k] = out[k - 1] + share * (x[k] - out[k - 1])
+    kept = np.exp(-STEP_S / tau)
+    out: np.ndarray = lfilter([1.0 - kept], [1.0, -kept], x, zi=[kept * x[0]])[0]
     return out

@@ -10,6 +10,7 @@ from twin_worker.history import History
 from twin_worker.hybrid import lags
 from twin_worker.hybrid.energy import Flight, load, missed
 from twin_worker.hybrid.fit import Hybrid, flight_of
+from twin_worker.ridge import ridge
 
 _LEAST_S = 10.0  # flight that anything is corrected on [s]
 _RIDGE = 0.05  # pull of an increment towards zero, as a share of its term's length
@@ -69,7 +70,4 @@ def _power(body: np.ndarray, added: Added) -> np.ndarray:
     along = (added.force * added.air).sum(axis=1) / V
     n = load(added.phi)
     A = np.column_stack([np.ones(len(V)), added.throttle - body[H.T_0], V - body[H.V_0], n * n - 1.0])
-    length = np.linalg.norm(A, axis=0) + 1e-12
-    stacked = np.vstack([A / length, _RIDGE * np.eye(4)])
-    found: np.ndarray = np.linalg.lstsq(stacked, np.concatenate([along, np.zeros(4)]), rcond=None)[0] / length
-    return found
+    return ridge(A, along, _RIDGE)

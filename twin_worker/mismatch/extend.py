@@ -23,6 +23,7 @@ from twin_worker.mismatch.marks import Extension, Mark, before
 from twin_worker.mismatch.push import Push
 from twin_worker.predict import Flown, set_out
 from twin_worker.preprocess import Grid
+from twin_worker.ridge import ridge
 from twin_worker.wind import WindFilter
 
 _EARLIER_S = 2.0  # a mark so near to the onset may know of it already [s]
@@ -123,10 +124,7 @@ def extended_plant(plant: Coupled, push: Push, window: Window) -> Coupled:
     for row, x, delta in zip(A, flown, push.moved, strict=True):
         terms(x[0], x[1], x[2], x[3:6], delta, plant.at, row)
     for which, first, end in _ROWS:
-        length = np.linalg.norm(A[:, first:end], axis=0) + 1e-12
-        stacked = np.vstack([A[:, first:end] / length, _RIDGE * np.eye(end - first)])
-        target = np.concatenate([push.wrench[:, which], np.zeros(end - first)])
-        added[first:end] = np.linalg.lstsq(stacked, target, rcond=None)[0] / length
+        added[first:end] = ridge(A[:, first:end], push.wrench[:, which], _RIDGE)
     added[WIND:] = push.wind[:2]
     changed = par + added - plant.par
     covariance = plant.covariance + np.diag((_DOUBT * changed) ** 2)

@@ -1,0 +1,19 @@
+"""Least squares held to zero a little: what the rows leave open stays small, whatever its unit."""
+
+import numpy as np
+
+
+def ridge(A: np.ndarray, y: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
+    """Give x of  min |y - A x|^2 + sum (pull_k |a_k| x_k)^2, a_k the k-th column, (k,).
+
+    Args:
+        A: terms, (n, k)
+        y: (n,)
+        pull: as a share of a term's length, one for all or one each, (k,)
+    Source: Hoerl & Kennard 1970 (ridge regression), terms scaled to unit length.
+    """
+    length = np.linalg.norm(A, axis=0) + 1e-12
+    k = A.shape[1]
+    rows, told = np.vstack([A / length, np.diag(np.full(k, pull))]), np.concatenate([y, np.zeros(k)])
+    found: np.ndarray = np.linalg.lstsq(rows, told, rcond=None)[0] / length
+    return found
