@@ -183,20 +183,19 @@ def test_a_flight_of_another_autopilot_is_predicted_on_its_own_mission(router: s
     uav = 1000  # apart from every other test
     predicted: list[Prediction] = []
     models: list[Model] = []
+
+    def by_model(p: Prediction) -> bool:
+        return p.state is State.PREDICTING and p.method in ("dynamics", "hybrid", "both")
+
     with connect(router) as bus, process("twin_worker", "--uavs", f"{uav}-{uav + 99}", "--router", router) as worker:
         wait(lambda: "holding" in worker.stdout.readline(), worker)
         bus.subscribe(Prediction, lambda message, _: predicted.append(message))
         bus.subscribe(Model, lambda message, _: models.append(message))
         link = f"replay:{flight}?speed=30"
         with process("gateway", "--link", link, f"--offset={uav}", "--router", router) as gateway:
-            wait(
-                lambda: any(
-                    p.state is State.PREDICTING and p.method in ("dynamics", "hybrid", "both") for p in predicted
-                ),
-                gateway,
-            )
+            wait(lambda: any(by_model(p) for p in predicted), gateway)
             ((mission, _),), ((params, _),) = bus.ask(Mission), bus.ask(Params)
-    good = next(p for p in predicted if p.state is State.PREDICTING)
+    good = next(filter(by_model, predicted))
     assert mission.complete and len(mission.items) == 17
     assert params.complete and "NAVL1_PERIOD" in params.values
     verified = [m.verdict for m in models if m.verdict.outcome is Outcome.VERIFIED]
