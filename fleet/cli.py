@@ -4,6 +4,7 @@ import argparse
 import importlib
 import os
 import pkgutil
+import queue
 import signal
 import sys
 import threading
@@ -42,9 +43,11 @@ def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
 
 def stop_on_signal() -> threading.Event:
     """Give an event that Ctrl-C, SIGTERM and the death of a parent set, so that every process ends by its own door."""
-    stop = threading.Event()
+    stop, told = threading.Event(), queue.SimpleQueue[int]()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+        # not stop.set(): a handler runs in the main thread, which may hold that event's own lock in wait(), for ever
+        signal.signal(number, lambda number, _: told.put(number))
+    threading.Thread(target=lambda: (told.get(), stop.set()), daemon=True).start()
     if parent := os.environ.get(PARENT):
         threading.Thread(target=_outlive_nobody, args=(int(parent), stop), daemon=True).start()
     return stop

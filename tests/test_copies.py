@@ -330,7 +330,7 @@ def test_the_command_sends_and_ctrl_c_ends_it(tmp_path):
             child.send_signal(signal.SIGINT)
             _, errors = child.communicate(timeout=PATIENCE_S)
     assert systems == {7, 8, 9}
-    assert child.returncode == 0 and time.monotonic() - began < 5
+    assert child.returncode == 0 and time.monotonic() - began < 20  # of 60 s
     assert "3 aircraft" in errors and "Traceback" not in errors
 
 
