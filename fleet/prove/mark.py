@@ -61,16 +61,22 @@ class Size:
         if self.told is None:
             return 1.0
         if self.name == "from_deg":
-            return abs((self.told - self.truth + 180.0) % 360.0 - 180.0) / _SPAN_DEG
+            return self.away / _SPAN_DEG
         if self.name in _LEAST:
-            return abs(self.told - self.truth) / max(abs(self.truth - 1.0), _LEAST[self.name])
+            return self.away / max(abs(self.truth - 1.0), _LEAST[self.name])
         least = 1.0 if self.name.endswith("_deg") and self.name != "bias_deg" else 1e-6
-        return abs(self.told - self.truth) / max(abs(self.truth), least)
+        return self.away / max(abs(self.truth), least)
+
+    @property
+    def away(self) -> float:
+        """Give how far what was told is from the truth; directions on the circle."""
+        off = (self.told or 0.0) - self.truth
+        return abs((off + 180.0) % 360.0 - 180.0 if self.name == "from_deg" else off)
 
     @property
     def covered(self) -> bool | None:
         """Tell whether the truth lies within two standard deviations; None where none was told."""
-        return abs((self.told or 0.0) - self.truth) <= 2.0 * self.sigma if self.sigma else None
+        return self.away <= 2.0 * self.sigma if self.sigma else None
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 from twin_worker.diagnose.baseline import CHANNELS, Baseline, Noise
 from twin_worker.diagnose.card import Card
 from twin_worker.diagnose.decide import best
-from twin_worker.diagnose.fit import fit, fit_timing, fit_wind, wind
+from twin_worker.diagnose.fit import fit, fit_timing, fit_wind, loose, wind
 from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.nuisance import WIDEST, nuisances, wandering, wanders
@@ -43,13 +43,13 @@ def calibrate(flights: Sequence[Flight], card: Card, say: Say = lambda word: Non
     say("timing of servos and engine")
     timing = fit_timing(flights, card, vane)
     card = replace(card, body=replace(card.body, lag=timing.servo + timing.delay))
-    base, _ = fit(flights, card, timing, vane)
+    base, winds = fit(flights, card, timing, vane)
     say("leaving each flight out in turn")
     parts = list(flights) if len(flights) > 1 else halves(flights[0])
     left = [fit([f for f in parts if f is not one], card, timing, vane)[0] for one in parts]
     cases = [Case(one, without) for one, without in zip(parts, left, strict=True)]
     others = tuple({name: b.coef[name] - x for name, x in base.coef.items()} for b in left)
-    base = replace(base, others=others)
+    base = replace(base, others=(*others, loose([Case(flight, base) for flight in flights], winds)))
     _believable(base)
     _alike(cases)
     return settled(base, cases, [fit_wind(case, np.zeros(4)) for case in cases], say)

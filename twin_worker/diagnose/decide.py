@@ -17,10 +17,10 @@ MOST = 3  # effects named together
 _TRIED = 12  # guesses fitted properly at each step
 _LEAST, _LEAST_COARSE = 150.0, 400.0  # gain of a first effect, by the accelerometer and without
 _CANCEL = 1.5  # an effect that gains this much more beside the others than all together undoes one of them
-_SECOND = 300.0  # and of every further one
+_SECOND = 250.0  # and of every further one
 _NEAR = 0.6  # of the best one's worth, from which an onset is worth a search
 _CHANCE, _CHANCE_COARSE = 1.5, 1.2  # over what nominal flights reach by chance
-_SHARE, _SHARE_COARSE = 0.02, 0.25  # of the first one's gain a further one must bring
+_SHARE, _SHARE_COARSE = 0.03, 0.25  # of what others gain in a channel that may be their error; of the first one's gain
 _OWN = 0.1  # share of a gain that must be of numbers which count
 _NEXT = 0.02  # tie of which the simpler is chosen
 _FINE, _COARSE = (
@@ -61,7 +61,8 @@ def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: Non
         say(f"effect {len(named) + 1}")
         found = best(sight, [one.found.guess for one in named])
         ranking = ranking or found
-        found = [one for one in found if one.gain > needed(sight, named, one) and believable(sight, one.guess)]
+        borne = first.borne(named)
+        found = [one for one in found if earned(sight, named, one, borne) and believable(sight, one.guess)]
         if not found:
             break
         more = [*named, choose(sight, found)]
@@ -85,12 +86,37 @@ class Joint:
         """Give the gain of all."""
         return self._none - self._sight.cost([one.found.guess for one in named])
 
+    def borne(self, named: list[Named]) -> np.ndarray:
+        """Give what all gain by channel, (c,)."""
+        return self._sight.powers(()) - self._sight.powers([one.found.guess for one in named])
+
     def better(self, more: list[Named], fewer: list[Named]) -> bool:
         """Tell whether one more is worth it: together they gain enough, and do not merely cancel each other."""
         gain = self.gain(more)
         without = min(self.gain([one for one in more if one is not left]) for left in more)
         cancelling = gain - without > _CANCEL * gain
-        return not cancelling and gain - self.gain(fewer) > needed(self._sight, fewer, more[-1].found)
+        before, own = self.borne(fewer), self.borne(more) - self.borne(fewer)
+        gained = min(gain - self.gain(fewer), aside(self._sight, own, before))
+        return not cancelling and gained > needed(self._sight, fewer, more[-1].found)
+
+
+def earned(sight: Sight, named: list[Named], found: Found, borne: np.ndarray) -> bool:
+    """Tell whether a guess gains what it must beside what is named, which gains `borne` by channel, (c,)."""
+    least = needed(sight, named, found)
+    if found.gain < least:
+        return False
+    own = sight.powers(()) - sight.powers((found.guess,)) if named else np.array([found.gain])
+    return min(found.gain, aside(sight, own, borne)) > least if named else True
+
+
+def aside(sight: Sight, own: np.ndarray, borne: np.ndarray) -> float:
+    """Give what a guess gains beyond errors of those beside it, which are a share of what they gain there.
+
+    Args:
+        own, borne: gain of the guess and of the others by channel, (c,)
+    """
+    share = _SHARE if sight.base.vane else 0.0
+    return float(np.maximum(own - share * np.maximum(borne, 0.0), 0.0).sum())
 
 
 def best(sight: Sight, beside: Sequence[Guess]) -> list[Found]:
@@ -151,8 +177,7 @@ def needed(sight: Sight, named: list[Named], found: Found) -> float:
     least = _LEAST if sight.base.vane else _LEAST_COARSE
     if not named:
         return max(least, chance)
-    second, share = (_SECOND, _SHARE) if sight.base.vane else (least, _SHARE_COARSE)
-    return max(second, chance, share * named[0].found.gain)
+    return max(_SECOND, chance) if sight.base.vane else max(least, chance, _SHARE_COARSE * named[0].found.gain)
 
 
 def _akin(kind: str, guess: Guess) -> bool:

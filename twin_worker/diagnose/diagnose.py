@@ -30,7 +30,8 @@ from twin_worker.diagnose.words import sentence, since
 
 _TOLD = 0.10  # or of the error of forces told
 _KEPT = 0.15  # of an effect's gain that must show on held-out data too
-_BORNE, _MUCH = 0.5, 450.0  # or the gain itself, where it is much: the share of it on held-out data, and how much
+_BORNE, _MUCH = 0.4, 450.0  # or the gain itself, where it is much: the share of it on held-out data, and how much;
+_RARE, _LITTLE = 5.0, 150.0  # less where nominal flights never come near: times what they reach by chance, and least
 _STRANGE = 3.0  # a channel's residual over its usual that is not let pass unexplained
 _LEFT = 2.6  # and the same beside named effects
 _EXPLAINED = 0.6  # share of the excess that names must explain
@@ -74,7 +75,8 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
         findings = (*findings, gust)
     force = foretell.forces(case, weather, proof.fitted)
     errors = [foretell.rms(case, force.measured - x) for x in (force.base, force.model)]
-    outcome = _outcome(findings, proof, 1.0 - errors[1] / errors[0], before, after)
+    much = sum(_much(base, one) for one in findings)
+    outcome = _outcome(findings, proof, (1.0 - errors[1] / errors[0], much), before, after)
     believed = findings if outcome is Outcome.NAMED else ()
     if not believed:
         sight.grant(weather)
@@ -225,11 +227,12 @@ def _gusts(sight: Sight, alone: bool) -> Finding | None:
 
 
 def _outcome(
-    findings: tuple[Finding, ...], proof: Proof, told: float, before: np.ndarray, after: np.ndarray
+    findings: tuple[Finding, ...], proof: Proof, enough: tuple[float, float], before: np.ndarray, after: np.ndarray
 ) -> Outcome:
-    """Decide; `told` is the share of the error of forces held out that went."""
+    """Decide; `enough`: the share of the error of forces held out that went, and the gain that is much."""
+    told, much = enough
     gusty = any(one.guess.effect.variance for one in findings)
-    borne_out = all(one.held >= _BORNE for one in findings) and sum(one.gain for one in findings) > _MUCH
+    borne_out = all(one.held >= _BORNE for one in findings) and sum(one.gain for one in findings) > much
     gained = proof.gain >= HELD or (proof.gain > 0.0 and (told >= _TOLD or borne_out))
     sound = all(one.held >= _KEPT and _significant(one) and not _at_its_end(one) for one in findings)
     proven = gusty or (gained and sound)
@@ -241,6 +244,12 @@ def _outcome(
     if before[_TELLING].max() > _STRANGE:
         return Outcome.UNKNOWN
     return Outcome.SUSPECTED if findings else Outcome.NONE
+
+
+def _much(base: Baseline, one: Finding) -> float:
+    """Give the gain that is much for an effect: as far as it goes, by what nominal flights reach by chance."""
+    chance = max((x for kind, x in base.chance.items() if kind.startswith(f"{one.guess.label}|")), default=0.0)
+    return min(max(_RARE * chance, _LITTLE), _MUCH)
 
 
 def _significant(one: Finding) -> bool:

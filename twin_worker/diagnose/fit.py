@@ -17,7 +17,7 @@ from twin_worker.diagnose.smooth import thinned
 from twin_worker.ridge import ridge
 
 RIDGE = 3e-4  # pull of a coefficient towards zero, as a share of its term's length
-_ORDER, _WHITENINGS = 3, 1  # of the residuals' autoregression; rounds
+_ORDER, _WHITENINGS = 3, 2  # of the residuals' autoregression; rounds until it stands
 _ROUNDS = 2
 _FADED = 4.0  # residual rows that count as one: whitening is never whole
 _SHEAR = 1.0  # usual growth of wind with height [m/s per 100 m]
@@ -26,7 +26,8 @@ _SIDE = 0.5  # weight of sideslip in the wind fit [-]
 _CALM = np.array([0.0, 0.0, 1.0])  # no wind [m/s], true airspeed [-]
 _STILL = np.array([0.5, 0.5, 100.0])  # how far a flight is held to that
 _LAGS = (0.0, 0.03, 0.06, 0.1, 0.14, 0.18, 0.22, 0.28, 0.35)  # [s]
-_DELAYS, _ENGINES = (0.0, 0.02, 0.04, 0.06), (0.1, 0.25, 0.5)  # [s]
+_DELAYS = (0.0, 0.02, 0.04, 0.06)  # [s]
+_ENGINES = np.geomspace(0.1, 5.0, 13)  # an electric motor turns up in a tenth, a piston engine in seconds [s]
 
 
 def wind(w: np.ndarray) -> tuple[Guess, ...]:
@@ -150,7 +151,7 @@ def _solve(rows: Rows, whitenings: int = _WHITENINGS) -> tuple[np.ndarray, float
 
 def _surprise(rows: Rows) -> float:
     """Give the logarithm of the innovations' variance after the fit."""
-    x, _ = _solve(rows)
+    x, _ = _solve(rows, 1)
     return float(np.log(np.var(rows.whitener(x)(rows.y - rows.A @ x)[rows.whole])))
 
 
@@ -167,6 +168,22 @@ def _held(A: np.ndarray, y: np.ndarray, of: Rows, as_one: float) -> np.ndarray:
     noise = np.sqrt(as_one * np.mean((y - A @ x) ** 2))
     length = np.linalg.norm(A, axis=0) + 1e-12
     return ridge(A, y, np.maximum(of.pull, noise / (of.usual * length)))
+
+
+def loose(cases: list[Case], winds: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """Give how drag's coefficients may be wrong together where flight does not tell: one standard deviation.
+
+    That of the elevator, held to what is usual, moves by its own doubt; those told only together with it follow.
+    """
+    coef = cases[0].base.coef
+    rows = axial(cases, [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)])
+    A, k = rows.A[rows.ok], eq.X.index("delta_e")
+    noise = CORRELATED * np.mean(rows.told(np.concatenate([coef["X"], coef["T"]])) ** 2)
+    pull = rows.pull * np.linalg.norm(A, axis=0)
+    doubt = np.linalg.inv((A.T @ A + np.diag(pull**2)) / noise + np.diag(rows.usual**-2.0))
+    change = doubt[:, k] / np.sqrt(doubt[k, k])
+    still = {name: np.zeros_like(x) for name, x in coef.items()}
+    return {**still, "X": change[: len(eq.X)], "T": change[len(eq.X) :]}
 
 
 def _airspeed(cases: list[Case], made: list[Terms]) -> float:
@@ -249,7 +266,7 @@ def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
     # a longer lag looks much like a longer delay: one after the other stops beside the best pair
     pairs = [replace(best, servo=servo, delay=delay) for servo in _LAGS for delay in _DELAYS]
     best = min(pairs, key=lambda timing: left(timing)["servo"])
-    best = min((replace(best, engine=engine) for engine in _ENGINES), key=lambda timing: left(timing)["engine"])
+    best = min((replace(best, engine=float(tau)) for tau in _ENGINES), key=lambda timing: left(timing)["engine"])
     return best
 
 

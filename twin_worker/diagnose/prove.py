@@ -4,13 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.effects import Onset
+from fleet.effects import Onset, Stage
 from twin_worker.diagnose.foretell import blocks
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.refine import refine
 from twin_worker.diagnose.sight import Sight
 
 HELD = 0.03  # share of the residual that must go on held-out data for a name
+_JUMP_S = 2.0  # a sensor's jump is seen so near to it
 _SHORT_S, _PASSES = 2.0, 0.01  # blocks of what passes by; share of it from which it passes
 SHOWS = 1.15  # a channel's residual over its usual, from which it takes part in the proof
 _TAKEN = 0.95  # or the share of it that the effects leave in the half they are fitted on
@@ -65,10 +66,19 @@ def held_out(sight: Sight, guesses: tuple[Guess, ...], shows: np.ndarray) -> Pro
 
 
 def _half(sight: Sight, guesses: tuple[Guess, ...], odd: bool) -> np.ndarray:
-    """Tell which rows are of this half, (n,) bool; what only passes is judged while it passes, by shorter blocks."""
+    """Tell which rows are of this half, (n,) bool.
+
+    What only passes is judged while it passes, by shorter blocks; a sensor's jump, which slow noise hides before and
+    after, by every second row around it.
+    """
     t = sight.case.t
     if any(guess.when.kind is not Onset.BUMP for guess in guesses):
-        return blocks(t, odd=odd)
+        half = blocks(t, odd=odd)
+        for guess in guesses:
+            if guess.effect.stage is Stage.SENSOR and guess.when.kind is Onset.STEP:
+                near = np.abs(t - guess.when.t0) < _JUMP_S
+                half = np.where(near, (np.arange(len(t)) % 2 == 1) == odd, half)
+        return half
     passing = np.any([guess.when.gate(t) > _PASSES for guess in guesses], axis=0)
     return passing & ((np.floor(t / _SHORT_S) % 2 == 1) == odd)
 

@@ -15,7 +15,7 @@ WELL = 0.6  # share of variance from which an equation counts as calibrated
 _SURFACE = {"aileron": "L", "elevator": "M", "rudder": "N"}
 _SHOWS_IN = {"roll": "L", "pitch": "M", "yaw": "N", "thrust": "X", "drag": "X", "lift": "alpha"}
 _EDGE_S = 15.0, 20.0  # no onset is sought nearer to the start and the end [s]
-_EVERY = 5  # rows between two onsets tried
+_EVERY = 1  # rows between two onsets tried
 _RAMPS_S = (20.0, 40.0, 60.0, 90.0, 130.0)
 _BUMPS_S = (3.0, 5.0, 8.0, 14.0, 25.0, 45.0)
 
@@ -71,12 +71,16 @@ def _by_slope(sight: Sight, effect: Effect, of: str) -> list[Found]:
     if not (scale > 1e-9).all():
         return []
     J = J / scale
+    jumps = sight.coming(nothing, step) / scale if Onset.STEP in effect.onsets else None
     out = []
     for kind in effect.onsets:
         gates, whens = gates_of(sight.case.t, kind)
         if not len(gates):
             continue
-        gain, x = solved(sight, *normals(sight, J, gates, kind))
+        sums = normals(sight, J, gates, kind)
+        if kind is Onset.STEP and jumps is not None:
+            sums = _begun(sight, J, jumps, gates, sums)
+        gain, x = solved(sight, *sums)
         best = int(np.argmax(gain))
         out.append(Found(float(gain[best]), nothing.at(x[best] / scale, whens[best])))
     return out
@@ -109,6 +113,20 @@ def normals(sight: Sight, J: np.ndarray, gates: np.ndarray, kind: Onset) -> tupl
     flat = [x.reshape(len(x), -1) for x in (A, b, C)]
     sums = (gates**2 @ flat[0], gates @ flat[1], gates @ flat[2])
     return tuple(s.reshape(len(gates), *x.shape[1:]) for s, x in zip(sums, (A, b, C), strict=True))  # type: ignore[return-value]
+
+
+def _begun(
+    sight: Sight, J: np.ndarray, jumps: np.ndarray, rows: np.ndarray, sums: tuple[np.ndarray, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Put a step's first two rows, (2, n, c, k), in the place of those of what was always there."""
+    A, b, C = sums
+    for late, jump in enumerate(jumps):
+        at = rows + late
+        new, old, e, Jn = jump[at], J[at], sight.e[at], sight.Jn[at]
+        A = A + np.einsum("mci,mcj->mij", new, new) - np.einsum("mci,mcj->mij", old, old)
+        b = b - np.einsum("mci,mc->mi", new - old, e)
+        C = C + np.einsum("mci,mcj->mij", new - old, Jn)
+    return A, b, C
 
 
 def solved(sight: Sight, A: np.ndarray, b: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

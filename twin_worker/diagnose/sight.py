@@ -1,6 +1,6 @@
 """Whitened residuals of one flight, the nuisances profiled out: what every hypothesis is measured by."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 
@@ -11,7 +11,8 @@ from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.nuisance import RELEASED, WEATHER_MPS, Nuisance, nuisances, wandering, wanders
 from twin_worker.diagnose.residual import Case
 
-CLIP = 6.0  # whitened residuals beyond count as much [-]; or
+CLIP = 6.0  # whitened residuals beyond count as much [-];
+_JUMPS = 30.0  # by the barometer, whose noise wanders so that a lasting jump is a single large residual; or
 _WIDE = 3.0  # beyond so many times the scatter a channel has on this flight
 _TIGHT = 1e14  # precision of a nuisance that was handed to the hypotheses
 _QUIETEST = 0.45  # a flight may be quieter than the nominal ones by this much
@@ -40,10 +41,11 @@ class Sight:
         self.nuisances: tuple[Nuisance, ...] = nuisances(self.base.vane)
         self.wanders = wanders(self.nuisances, self.base.vane)
         self.clip = np.full(len(CHANNELS), CLIP)
+        self.clip[CHANNELS.index("baro")] = _JUMPS
         self.granted = granted
         if self.ok.any():
             scatter = 1.4826 * np.median(np.abs(self.whitened(())[self.ok]), axis=0)
-            self.clip = np.maximum(CLIP, _WIDE * scatter)
+            self.clip = np.maximum(self.clip, _WIDE * scatter)
         self._lay()
 
     def part(self, span: np.ndarray) -> "Sight":
@@ -147,9 +149,30 @@ class Sight:
         b = -np.einsum("tci,tc->i", self.Jn, e)
         return float((e * e).sum() - b @ np.linalg.solve(self.Ann, b))
 
+    def powers(self, guesses: Sequence[Guess]) -> np.ndarray:
+        """Give each channel's sum of squares with these guesses, the nuisances profiled out, (c,)."""
+        e = self.clipped(guesses)
+        left = e - self.Jn @ np.linalg.solve(self.Ann, np.einsum("tci,tc->i", self.Jn, e))
+        return np.asarray((left * left).sum(axis=0))
+
     def slopes(self, guess: Guess, step: np.ndarray) -> np.ndarray:
         """Give how the whitened residuals change with each parameter about a guess, (n, c, k)."""
-        here = self.whitened((guess,))
+        return self._slopes(guess, step, self.whitened)
+
+    def coming(self, guess: Guess, step: np.ndarray) -> np.ndarray:
+        """Give the first two whitened rows if what `slopes` shows began at each row, (2, n, c, k).
+
+        Noise that wanders slowly hides what lasts: a step then shows by its first rows alone.
+        """
+        J = self._slopes(guess, step, lambda guesses: self.case.residuals((*self.granted, *guesses)))
+        ar, sigma = self.noise.ar, self.noise.sigma[:, None]
+        first, second = J / sigma, J / sigma
+        second[1:] -= ar[:, :1] * J[:-1] / sigma
+        return np.stack([first, second]) * self.ok[None, :, None, None]
+
+    @staticmethod
+    def _slopes(guess: Guess, step: np.ndarray, seen: Callable[[Sequence[Guess]], np.ndarray]) -> np.ndarray:
+        here = seen((guess,))
         out = []
         for k, h in enumerate(step):
             par = np.array(guess.par)
@@ -158,7 +181,7 @@ class Sight:
             if not h:  # at the upper bound
                 moved = guess.at(par - step[k] * np.eye(len(par))[k])
                 h = moved.par[k] - par[k]
-            out.append((self.whitened((moved,)) - here) / (h or 1.0))
+            out.append((seen((moved,)) - here) / (h or 1.0))
         return np.stack(out, axis=2)
 
     def left(self) -> np.ndarray:

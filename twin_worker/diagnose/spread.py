@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from fleet.effects import Onset
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.refine import refine, steps
 from twin_worker.diagnose.sight import Sight
@@ -12,6 +13,7 @@ from twin_worker.diagnose.sight import Sight
 _BLOCK = 50  # rows of a block of the sandwich, 10 s
 _PARTS = 4  # of the flight, each left out in turn
 _WORKS = 0.01  # of an effect's course, from which it is at work
+_FORM = 0.02  # the simulation's form is no better known, as a share of a number
 _CLOCK_S = 0.01  # clocks of messages agree no better [s]
 
 
@@ -19,7 +21,7 @@ def covariances(sight: Sight, weather: tuple[Guess, ...], guesses: Sequence[Gues
     """Give the covariance of each fitted guess's parameters, (k, k).
 
     A sandwich over blocks of 10 s, the effects joint and the nuisances profiled out, plus the spread between fits that
-    leave a quarter of the time at work out. Source: White 1982 (sandwich); Efron & Tibshirani 1993, section 11.5.
+    leave a quarter of the time at work out; and a floor. Source: White 1982 (sandwich); Efron & Tibshirani 1993, section 11.5.
     """
     sight.grant(weather)
     sandwich = _sandwich(sight, guesses)
@@ -28,10 +30,22 @@ def covariances(sight: Sight, weather: tuple[Guess, ...], guesses: Sequence[Gues
         k = len(guess.par)
         others = (*weather, *(g for n, g in enumerate(guesses) if n != i))
         own = sandwich[at : at + k, at : at + k] + _jackknife(sight, others, guess)
-        times = np.array([p.unit == "s" for p in guess.effect.parameters])
-        out.append(own + np.diag(times * _CLOCK_S**2))
+        out.append(own + np.diag(_floor(sight, guess)))
         at += k
     return out
+
+
+def _floor(sight: Sight, guess: Guess) -> np.ndarray:
+    """Give the variance no flight can undercut, (k,): clocks, the simulation's form, what is usual of the aircraft.
+
+    What was always there cannot be told from what this aircraft has by itself.
+    """
+    times = np.array([p.unit == "s" for p in guess.effect.parameters])
+    usual = np.zeros(len(times))
+    for n in sight.nuisances:
+        if guess.when.kind is Onset.ALWAYS and (n.effect.name, n.of) == (guess.effect.name, guess.of):
+            usual[n.index] = sight.base.spread.get(n.name, n.floor)
+    return times * _CLOCK_S**2 + (_FORM * np.array(guess.par)) ** 2 + usual**2
 
 
 def told_sigma(guess: Guess, covariance: np.ndarray, body: object) -> dict[str, float]:
