@@ -76,7 +76,7 @@ def settled(
         usual.append(sight.left())
         for found in best(sight, ()):
             chance[found.kind] = max(chance.get(found.kind, 0.0), found.gain)
-        for odd in oddities(sight):
+        for odd in oddities(sight, sight):
             chance[odd.kind] = max(chance.get(odd.kind, 0.0), odd.worth)
     return replace(base, chance=chance, usual=np.maximum(np.median(usual, axis=0), _LEAST_USUAL))
 

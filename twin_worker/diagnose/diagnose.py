@@ -80,7 +80,7 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     believed = findings if outcome is Outcome.NAMED else ()
     if not believed:
         sight.grant(weather)
-    odds = [] if any(one.guess.effect.variance for one in findings) else oddities(sight)
+    odds = [] if any(one.guess.effect.variance for one in findings) else oddities(sight, plain)
     odd = strange(odds, base, sum(one.gain for one in believed), loud=after.max() > _LEFT)
     if odd is not None:
         outcome = Outcome.UNKNOWN
@@ -105,7 +105,7 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
         stray_before=float(np.degrees(stray(case, weather))),
         stray_after=float(np.degrees(stray(case, (*weather, *proof.fitted)))),
         where=where,
-        odd={one.channel: one.worth / one.limit(base) for one in odds},
+        odd={one.kind: one.worth / one.limit(base) for one in odds},
         terms=terms,
         tried=_ranking(ranked, named),
         lacks=(*flight.lacks, *uncovered(base)),

@@ -1,97 +1,92 @@
-"""Is anything left that no effect of the catalogue explains: has an equation itself changed, since any instant?
+"""Is anything left that no effect of the catalogue explains: has an equation itself changed, or does it hum?
 
 For each channel every coefficient of its equation is let go at once, and the channel's own slow and fast terms beside
-it. A named effect that is right leaves nothing to gain; one that only resembles what happened leaves much.
+it: since any instant, and since any instant against what they were before it. A named effect that is right leaves
+nothing to gain; one that only resembles what happened leaves much. And what no effect stands for is tried against the
+names themselves: a single coefficient that explains as much as they do is the better word.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-from scipy.signal import lfilter
-
-from fleet.effects import Onset
-from twin_worker.diagnose.baseline import CHANNELS, SHOWN_BY, Baseline
-from twin_worker.diagnose.residual import Terms
-from twin_worker.diagnose.scan import PRICE, WELL, gates_of, normals, solved
+from twin_worker.diagnose.baseline import Baseline
+from twin_worker.diagnose.changed import equations_of
 from twin_worker.diagnose.sight import Sight
-from twin_worker.diagnose.smooth import STEP_S
+from twin_worker.diagnose.tones import tones
 
-_LEAST, _CHANCE = 300.0, 2.0  # gain; over what nominal flights reach by chance
-_AGAINST = 3.0  # and that many limits, to be held against names; and
-_BESIDE, _BESIDE_LOUD = 0.5, 0.25  # so much of what they gained, less where some channel stays loud
-_AIR_LAG_S = 4.0  # of a pressure line that is partly blocked
+
+class Rule(NamedTuple):
+    """When one kind of evidence counts.
+
+    Attributes:
+        least: gain
+        chance: over what nominal flights reach by chance
+        against: so many limits, to be held against names; and
+        beside, loud: so much of what they gained, the latter where some channel stays loud
+    """
+
+    least: float
+    chance: float
+    against: float
+    beside: float
+    loud: float
+
+
+RULES = {
+    "odd": Rule(240.0, 2.0, 3.0, 0.5, 0.25),  # the whole equation is another, beside the names
+    "shift": Rule(160.0, 1.6, 1.0, 0.02, 0.02),  # it changed in flight, beside the names
+    "one": Rule(110.0, 2.0, 1.0, 0.9, 0.9),  # one coefficient changed, instead of the names
+    "tone": Rule(150.0, 1.5, 1.0, 0.0, 0.0),  # it hums, beside the names
+}
 
 
 class Odd(NamedTuple):
-    """What a changed equation would gain beyond its price, in which channel, since when [s]."""
+    """What a changed equation would gain beyond its price, in which channel, since when [s]; or how loud it hums."""
 
     worth: float
     channel: str
     t0: float
+    rule: str = "odd"
+    term: str = ""
 
     @property
     def kind(self) -> str:
         """Name it beside what nominal flights reach by chance."""
-        return f"odd:{self.channel}"
+        return ":".join(filter(None, (self.rule, self.channel, self.term)))
 
     def limit(self, base: Baseline) -> float:
         """Give what it must gain to be more than chance."""
-        return max(_LEAST, _CHANCE * base.chance.get(self.kind, 0.0))
+        rule = RULES[self.rule]
+        return max(rule.least, rule.chance * base.chance.get(self.kind, 0.0))
+
+    def counts(self, base: Baseline, gained: float, loud: bool) -> bool:
+        """Tell whether names that gained so much in all, 0 without any, do not explain it."""
+        rule = RULES[self.rule]
+        least = (rule.loud if loud else rule.beside) * gained
+        return self.worth > max((rule.against if gained else 1.0) * self.limit(base), least)
 
 
-def oddities(sight: Sight) -> list[Odd]:
-    """Give what every channel would gain by changing since its best instant, best first, no nuisance handed over.
+def oddities(sight: Sight, plain: Sight) -> list[Odd]:
+    """Give what every channel would gain by changing since its best instant, and how it hums; best first.
 
     Plain telemetry knows its equations too loosely to tell.
+
+    Args:
+        sight: with the names granted
+        plain: the same with none of them
     """
     if not sight.base.vane:
         return []
-    sight = sight.held()
-    rows, whens = gates_of(sight.case.t, Onset.STEP)
-    out = []
-    for channel, terms in _terms(sight):
-        J = np.zeros((len(sight.case.t), len(CHANNELS), len(terms)))
-        c = CHANNELS.index(channel)
-        for k, x in enumerate(terms):
-            J[:, c, k] = x / (np.std(x[sight.ok]) + 1e-12)
-        white = np.stack([sight.noise.whiten(J[:, :, k]) for k in range(len(terms))], axis=2) * sight.ok[:, None, None]
-        gain, _ = solved(sight, *normals(sight, white, rows, Onset.STEP))
-        best = int(np.argmax(gain))
-        out.append(Odd(float(gain[best]) - PRICE * len(terms), channel, whens[best].t0))
-    return sorted(out, key=lambda one: -one.worth)
+    held = sight.held()  # no nuisance handed over
+    out = [Odd(*tone, "tone") for tone in tones(held)]
+    for one in equations_of(held):
+        for rule, (worth, t0) in (("odd", one.all_of_it()), ("shift", one.in_flight())):
+            out.append(Odd(worth, one.channel, t0, rule))
+    for one in equations_of(plain):
+        out += [Odd(worth, one.channel, t0, "one", name) for name, (worth, t0) in one.one_by_one()]
+    return sorted(out, key=lambda odd: -odd.worth)
 
 
 def strange(odds: Sequence[Odd], base: Baseline, gained: float, loud: bool) -> Odd | None:
     """Give the first that names do not explain; `gained` by them in all, 0 without any; `loud`: a channel stays so."""
-    least = (_BESIDE_LOUD if loud else _BESIDE) * gained
-    limits = _AGAINST if gained else 1.0
-    return next((odd for odd in odds if odd.worth > max(limits * odd.limit(base), least)), None)
-
-
-def _terms(sight: Sight) -> Iterator[tuple[str, list[np.ndarray]]]:
-    """Give the terms that each channel may change by, (n,) each."""
-    made = sight.case.terms(sight.granted)
-    for equation, channel in SHOWN_BY.items():
-        if sight.base.r2.get(equation, 1.0) > WELL:
-            own = made.terms[equation] * made.scale.get(equation, 1.0)
-            yield channel, [*own, *_more(channel, made)]
-    flow = made.flow
-    if "Va" in sight.case.flight.readings:
-        slow = _lagged(flow.Va, _AIR_LAG_S) - flow.Va
-        yield "airspeed", [np.ones_like(flow.Va), flow.Va, slow]
-    for name, rate in (("gyro_roll", flow.p), ("gyro_pitch", flow.q), ("gyro_yaw", flow.r)):
-        yield name, [np.ones_like(rate), rate]
-
-
-def _more(channel: str, made: Terms) -> list[np.ndarray]:
-    """Give what a channel may feel that no wing does: thrust, and loads that shift with the force on them."""
-    f_x, f_y, _ = made.aside["f"]
-    return {"force_x": list(made.terms["T"][:1]), "roll": [f_y], "pitch": [f_x]}.get(channel, [])
-
-
-def _lagged(x: np.ndarray, tau: float) -> np.ndarray:
-    """Give x, (n,), behind a first-order lag [s]."""
-    kept = np.exp(-STEP_S / tau)
-    out: np.ndarray = lfilter([1.0 - kept], [1.0, -kept], x, zi=[kept * x[0]])[0]
-    return out
+    return next((odd for odd in odds if odd.counts(base, gained, loud)), None)

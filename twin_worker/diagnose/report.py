@@ -89,7 +89,7 @@ class Report:
         force_before, force_after: rms error of simulated specific force on held-out blocks [m/s2]
         stray_before, stray_after: rms attitude error of free flights of 5 s on held-out blocks [deg]
         where: for unknown: channel and segments
-        odd: by channel, what its equation would gain by changing beside all that was named, over what chance reaches
+        odd: by kind of evidence, channel and term, what a change that nobody named would gain, over what chance reaches
         terms: for unknown: a sparse free-form term, no physics: `term -> coefficient`
         tried: the ranking of candidates
         lacks: what power was lost for want of data
