@@ -21,7 +21,8 @@ def covariances(sight: Sight, weather: tuple[Guess, ...], guesses: Sequence[Gues
     """Give the covariance of each fitted guess's parameters, (k, k).
 
     A sandwich over blocks of 10 s, the effects joint and the nuisances profiled out, plus the spread between fits that
-    leave a quarter of the time at work out; and a floor. Source: White 1982 (sandwich); Efron & Tibshirani 1993, section 11.5.
+    leave a quarter of the time at work out; and a floor.
+    Source: White 1982 (sandwich); Efron & Tibshirani 1993, section 11.5.
     """
     sight.grant(weather)
     sandwich = _sandwich(sight, guesses)
