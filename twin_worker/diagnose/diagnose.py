@@ -248,6 +248,8 @@ def _outcome(
 
 def _much(base: Baseline, one: Finding) -> float:
     """Give the gain that is much for an effect: as far as it goes, by what nominal flights reach by chance."""
+    if not base.vane:
+        return _MUCH
     chance = max((x for kind, x in base.chance.items() if kind.startswith(f"{one.guess.label}|")), default=0.0)
     return min(max(_RARE * chance, _LITTLE), _MUCH)
 

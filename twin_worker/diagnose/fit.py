@@ -17,7 +17,8 @@ from twin_worker.diagnose.smooth import thinned
 from twin_worker.ridge import ridge
 
 RIDGE = 3e-4  # pull of a coefficient towards zero, as a share of its term's length
-_ORDER, _WHITENINGS = 3, 2  # of the residuals' autoregression; rounds until it stands
+_ORDER = 3  # of the residuals' autoregression
+_WHITENINGS = {True: 2, False: 1}  # rounds by the accelerometer, and without: terms are noisier then
 _ROUNDS = 2
 _FADED = 4.0  # residual rows that count as one: whitening is never whole
 _SHEAR = 1.0  # usual growth of wind with height [m/s per 100 m]
@@ -27,7 +28,10 @@ _CALM = np.array([0.0, 0.0, 1.0])  # no wind [m/s], true airspeed [-]
 _STILL = np.array([0.5, 0.5, 100.0])  # how far a flight is held to that
 _LAGS = (0.0, 0.03, 0.06, 0.1, 0.14, 0.18, 0.22, 0.28, 0.35)  # [s]
 _DELAYS = (0.0, 0.02, 0.04, 0.06)  # [s]
-_ENGINES = np.geomspace(0.1, 5.0, 13)  # an electric motor turns up in a tenth, a piston engine in seconds [s]
+_ENGINES = {  # an electric motor turns up in a tenth, a piston engine in seconds; velocity tells less [s]
+    True: (0.1, 0.14, 0.19, 0.27, 0.37, 0.51, 0.71, 0.98, 1.36, 1.88, 2.6, 3.61, 5.0),
+    False: (0.1, 0.25, 0.5),
+}
 
 
 def wind(w: np.ndarray) -> tuple[Guess, ...]:
@@ -118,7 +122,8 @@ class Rows:
             good[:_ORDER] = False
             whole.append(good)
         self.A, self.y = np.concatenate(A), np.concatenate(y)
-        known = cases[0].base.card.known and cases[0].base.vane
+        self.vane = cases[0].base.vane
+        known = cases[0].base.card.known and self.vane
         self.usual = np.array(eq.USUAL[name] if known and name in eq.USUAL else [np.inf] * self.A.shape[1])
         self.ok, self.whole = np.concatenate(ok), np.concatenate(whole)
 
@@ -134,7 +139,7 @@ class Rows:
         return lambda z: z - sum(a * np.roll(z, k + 1, axis=0) for k, a in enumerate(ar))
 
 
-def _solve(rows: Rows, whitenings: int = _WHITENINGS) -> tuple[np.ndarray, float]:
+def _solve(rows: Rows, whitenings: int | None = None) -> tuple[np.ndarray, float]:
     """Solve by generalised least squares; give coefficients and the share of variance explained.
 
     The residuals of a flight in gusts, under an autopilot that answers them, are coloured, and plain least squares
@@ -143,7 +148,7 @@ def _solve(rows: Rows, whitenings: int = _WHITENINGS) -> tuple[np.ndarray, float
     """
     x = _held(rows.A[rows.ok], rows.y[rows.ok], rows, CORRELATED)
     r2 = _r2(rows.A[rows.ok] @ x, rows.y[rows.ok])
-    for _ in range(whitenings):
+    for _ in range(_WHITENINGS[rows.vane] if whitenings is None else whitenings):
         white = rows.whitener(x)
         x = _held(white(rows.A)[rows.whole], white(rows.y)[rows.whole], rows, _FADED)
     return x, r2
@@ -266,8 +271,8 @@ def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
     # a longer lag looks much like a longer delay: one after the other stops beside the best pair
     pairs = [replace(best, servo=servo, delay=delay) for servo in _LAGS for delay in _DELAYS]
     best = min(pairs, key=lambda timing: left(timing)["servo"])
-    best = min((replace(best, engine=float(tau)) for tau in _ENGINES), key=lambda timing: left(timing)["engine"])
-    return best
+    engines = [replace(best, engine=engine) for engine in _ENGINES[vane]]
+    return min(engines, key=lambda timing: left(timing)["engine"])
 
 
 def pitch(cases: list[Case], made: list[Terms], coef: dict[str, np.ndarray], pull: float = RIDGE) -> Rows:

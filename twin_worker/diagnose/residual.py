@@ -123,9 +123,13 @@ class Case:
         for guess in faults:
             par = [-x * guess.when.gate(self.flight.t) for x in guess.par]
             try:
-                readings |= guess.effect.act(readings, *par, **_of(guess))
+                undone = guess.effect.act(readings, *par, **_of(guess))
             except KeyError:  # the flight has no such reading: the fault cannot show
                 continue
+            if "Va" in undone and self.base.vane:  # raw noise shrinks or grows with the reading
+                faster = guess.effect.act({**readings, "Va": readings["Va"] + 1.0}, *par, **_of(guess))
+                readings["Va_share"] = readings.get("Va_share", 1.0) * (faster["Va"] - undone["Va"])
+            readings |= undone
         changed = {name: x for name, x in readings.items() if x is not self.flight.readings.get(name) and name != "t"}
         return {**self._smooth, **self._filtered(changed)}
 
@@ -205,6 +209,7 @@ class Case:
         }
         aside = {"mass": mass, "force": force, "c_z": c_z, "apart": apart, "f": f}
         aside["delta"] = np.array([d_a, d_e, d_r, d_t])
+        aside["Va_share"] = s.get("Va_share", np.ones_like(Va))
         aside["baro"] = s.get("baro", s["h"]) - s.get("gnss", s["h"])
         scale = {"X": q_S, "L": q_S * body.b, "N": q_S * body.b, "M": q_S * body.c}
         return Terms(flow, add, terms, measured, aside, scale)
@@ -246,6 +251,7 @@ def channels(case: Case, made: Terms) -> np.ndarray:
     readings = case.flight.readings
     if "Va" in readings:
         out[:, 6] = made.measured["airspeed"] / base.airspeed - flow.Va * np.sqrt(flow.rho / RHO_0)
+        out[:, 6] /= aside["Va_share"]  # as the sensor would read it
     out[:, 7:13] = aside["apart"]
     if "baro" in readings:
         out[:, 13] = aside["baro"] - case.trend - add.get("baro", 0.0)

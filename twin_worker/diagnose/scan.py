@@ -15,7 +15,7 @@ WELL = 0.6  # share of variance from which an equation counts as calibrated
 _SURFACE = {"aileron": "L", "elevator": "M", "rudder": "N"}
 _SHOWS_IN = {"roll": "L", "pitch": "M", "yaw": "N", "thrust": "X", "drag": "X", "lift": "alpha"}
 _EDGE_S = 15.0, 20.0  # no onset is sought nearer to the start and the end [s]
-_EVERY = 1  # rows between two onsets tried
+_EVERY = 5  # rows between two onsets tried, where no jump can be met to the row
 _RAMPS_S = (20.0, 40.0, 60.0, 90.0, 130.0)
 _BUMPS_S = (3.0, 5.0, 8.0, 14.0, 25.0, 45.0)
 
@@ -71,10 +71,11 @@ def _by_slope(sight: Sight, effect: Effect, of: str) -> list[Found]:
     if not (scale > 1e-9).all():
         return []
     J = J / scale
-    jumps = sight.coming(nothing, step) / scale if Onset.STEP in effect.onsets else None
+    sharp = sight.base.vane and Onset.STEP in effect.onsets  # a force taken from the velocity knows no first rows
+    jumps = sight.coming(nothing, step) / scale if sharp else None
     out = []
     for kind in effect.onsets:
-        gates, whens = gates_of(sight.case.t, kind)
+        gates, whens = gates_of(sight.case.t, kind, 1 if sharp else _EVERY)
         if not len(gates):
             continue
         sums = normals(sight, J, gates, kind)
@@ -86,20 +87,20 @@ def _by_slope(sight: Sight, effect: Effect, of: str) -> list[Found]:
     return out
 
 
-def gates_of(t: np.ndarray, kind: Onset) -> tuple[np.ndarray, list[When]]:
-    """Give the courses to try: gates (m, n), and what they are; for steps, gates hold row numbers (m,)."""
+def gates_of(t: np.ndarray, kind: Onset, every: int = _EVERY) -> tuple[np.ndarray, list[When]]:
+    """Give the courses to try: gates (m, n), and what they are; for steps, gates hold rows (m,), `every` so many."""
     first, last = t[0] + _EDGE_S[0], t[-1] - _EDGE_S[1]
     if kind is Onset.ALWAYS:
         return np.ones((1, len(t))), [ALWAYS]
     if kind is Onset.STEP:
-        rows = np.flatnonzero((t > first) & (t < last))[::_EVERY]
+        rows = np.flatnonzero((t > first) & (t < last))[::every]
         return rows, [When(kind, float(t[i])) for i in rows]
     lengths = _RAMPS_S if kind is Onset.RAMP else _BUMPS_S
     whens = []
     for T in lengths:
-        every = 10.0 if kind is Onset.RAMP else max(T / 6, 1.0)
+        apart = 10.0 if kind is Onset.RAMP else max(T / 6, 1.0)
         end = last - 10.0 if kind is Onset.RAMP else t[-1] - T
-        whens += [When(kind, float(t0), T) for t0 in np.arange(t[0] + 5.0, end, every)]
+        whens += [When(kind, float(t0), T) for t0 in np.arange(t[0] + 5.0, end, apart)]
     return np.stack([when.gate(t) for when in whens]) if whens else np.empty((0, len(t))), whens
 
 

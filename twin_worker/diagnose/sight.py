@@ -12,7 +12,7 @@ from twin_worker.diagnose.nuisance import RELEASED, WEATHER_MPS, Nuisance, nuisa
 from twin_worker.diagnose.residual import Case
 
 CLIP = 6.0  # whitened residuals beyond count as much [-];
-_JUMPS = 30.0  # by the barometer, whose noise wanders so that a lasting jump is a single large residual; or
+_JUMPS = 100.0  # by the barometer, whose noise wanders so that a lasting jump is a single large residual; or
 _WIDE = 3.0  # beyond so many times the scatter a channel has on this flight
 _TIGHT = 1e14  # precision of a nuisance that was handed to the hypotheses
 _QUIETEST = 0.45  # a flight may be quieter than the nominal ones by this much
@@ -41,7 +41,8 @@ class Sight:
         self.nuisances: tuple[Nuisance, ...] = nuisances(self.base.vane)
         self.wanders = wanders(self.nuisances, self.base.vane)
         self.clip = np.full(len(CHANNELS), CLIP)
-        self.clip[CHANNELS.index("baro")] = _JUMPS
+        if self.base.vane:
+            self.clip[CHANNELS.index("baro")] = _JUMPS
         self.granted = granted
         if self.ok.any():
             scatter = 1.4826 * np.median(np.abs(self.whitened(())[self.ok]), axis=0)
