@@ -129,6 +129,10 @@ def examined() -> list[Mark]:
     return [mark(f"rec_{k}", one, said) for k, (one, said) in enumerate(flights)]
 
 
+def test_a_direction_is_covered_across_north() -> None:
+    assert Size("from_deg", 355.0, 3.0, 5.0).covered and not Size("from_deg", 355.0, 3.0, 3.0).covered
+
+
 def test_scores_count_what_they_say() -> None:
     told = score(examined())
     expected = {

@@ -1,0 +1,40 @@
+"""Sensors as hypotheses: noise of a scaled reading scales with it; a jump is met to the row though noise wanders."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from effect_flights import CRAFT, Plan, flown
+
+from fleet.effects import Onset, catalogue
+from twin_worker.diagnose.baseline import CHANNELS
+from twin_worker.diagnose.flight import Flight
+from twin_worker.diagnose.guess import Guess, When
+from twin_worker.diagnose.residual import Case
+from twin_worker.diagnose.scan import scan
+from twin_worker.diagnose.sight import Sight
+
+JUMP_S = 40.4
+KNOWN = catalogue()
+
+
+@cache
+def flight(bias_m: float = 0.0) -> Flight:
+    """Fly one minute and a bit, the barometer jumping if asked to."""
+    hidden = (Guess(KNOWN["baro_bias"], "", (bias_m,), When(Onset.STEP, JUMP_S)),) if bias_m else ()
+    return flown([Plan("sensors", 77, hidden)])[0]
+
+
+@pytest.mark.parametrize("scale", [-0.3, 0.3])
+def test_noise_of_an_airspeed_undone_is_that_of_the_sensor(scale: float) -> None:
+    case, k = Case(flight(), CRAFT), CHANNELS.index("airspeed")
+    usual, undone = (
+        np.diff(case.residuals(guesses)[case.ok, k], n=2).std()
+        for guesses in ((), (Guess(KNOWN["airspeed_scale"], "", (scale,)),))
+    )
+    assert undone == pytest.approx(usual, rel=0.1)
+
+
+def test_a_jump_is_met_to_the_row() -> None:
+    best = next(one for one in scan(Sight(Case(flight(8.0), CRAFT))) if one.guess.effect.name == "baro_bias")
+    assert best.guess.when.kind is Onset.STEP and abs(best.guess.when.t0 - JUMP_S) < 0.5
