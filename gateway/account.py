@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from fleet.contract import Account
+from fleet.telemetry.heard import Heard
 from fleet.telemetry.intake import Intake
 from gateway.link import Link
 
@@ -15,10 +16,10 @@ class Tally:
         self.datagrams = 0
         self.bytes_in = 0
 
-    def add(self, data: bytes) -> None:
-        """Count one piece of bytes."""
-        self.datagrams += 1
-        self.bytes_in += len(data)
+    def add(self, heard: Heard) -> None:
+        """Count pieces of bytes."""
+        self.datagrams += len(heard.start)
+        self.bytes_in += int((heard.stop - heard.start).sum())
 
     def account(self, t: float, links: Sequence[Link], intakes: Sequence[Intake], players: set[int]) -> Account:
         """Make the message; `t` is fleet time [s since 1970], `players` the UAV ids of recordings."""
@@ -39,7 +40,7 @@ class Tally:
             bytes_in=self.bytes_in,
             messages=counts["messages"],
             bad_bytes=counts["bad_bytes"],
-            bad_frames=counts["bad_frames"],
+            bad_frames=counts["bad_frames"] + counts["unknown"],
             refused=dict(refused),
             sentence="" if uavs else "no aircraft heard yet; point its telemetry at one of the links",
         )

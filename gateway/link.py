@@ -9,7 +9,7 @@ from collections.abc import Hashable, Sequence
 from typing import Any, NamedTuple, Protocol, cast
 
 from fleet.codec import Wire
-from fleet.telemetry.decode import Piece
+from fleet.telemetry.heard import Heard
 from gateway.spec import Spec
 
 QUEUE = 20_000  # batches between receiving and decoding
@@ -27,7 +27,7 @@ class Batch(NamedTuple):
     """What one link heard: bytes as they came, or the news of a recording and of its copies."""
 
     link: int
-    heard: Sequence[Piece] = ()
+    heard: Heard | None = None
     news: Sequence[Any] = ()
     copies: Sequence[Wire] = ()
     ended: bool = False
@@ -75,7 +75,7 @@ class Udp:
             except OSError:  # nothing for a while, or an earlier answer found nobody
                 continue
             try:
-                out.put_nowait(Batch(number, heard=[(wall(), sender, data)]))
+                out.put_nowait(Batch(number, heard=Heard.of([(wall(), sender, data)])))
             except queue.Full:
                 self.dropped += 1
 

@@ -68,9 +68,9 @@ class Pump:
     def take(self, batch: Batch) -> None:
         """Work through one batch."""
         intake = self.intakes[batch.link]
-        for t, source, data in batch.heard:
-            self.tally.add(data)
-            intake.hear(t, data, source)
+        if batch.heard is not None:
+            self.tally.add(batch.heard)
+            intake.listen(batch.heard)
         if batch.news:
             self._recorded = max(self._recorded, *(news.t for news in batch.news))
             self._players.update(news.uav for news in batch.news if isinstance(news, Message))

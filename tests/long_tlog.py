@@ -47,7 +47,7 @@ def write(path: Path, megabytes: float) -> float:
     dated = told.copy()
     stamps = _stamps(told)
     _date(dated, stamps, 0.0)
-    at, _, _ = frames_of(dated, np.array([[0, len(dated)]]), np.zeros(3, np.int64), s.STAMP)
+    at, _, _ = frames_of(dated, np.array([[0, len(dated), 0]]), np.zeros(s.COUNTS, np.int64), s.STAMP)
     head = at[:, s.START], at[:, s.PAYLOAD], at[:, s.SIZE], s.EXTRA[at[:, s.ID]].astype(np.uint8)
     ticks = []
     for name, (field, per_ms) in TICKS.items():

@@ -8,6 +8,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from fleet.contract import COLUMNS, Item, Mission, Params, Sample
 from fleet.pretend.mavlink import Voice
 from fleet.telemetry.decode import Decoder
+from fleet.telemetry.heard import Heard
 
 T0 = 1_700_000_000.0  # fleet time at which the tests begin [s since 1970]
 PLANE, ARDU = mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA
@@ -56,7 +57,7 @@ class Ears:
         self.decoder = Decoder()
 
     def feed(self, data: bytes) -> list:
-        frames = self.decoder.feed([(T0, None, data)])
+        frames = self.decoder.feed(Heard.of([(T0, None, data)]))
         return [frames.message(i) for i in range(len(frames.at))]
 
 

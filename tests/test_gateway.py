@@ -14,6 +14,7 @@ from talker import ITEMS, T0, Aircraft, Talker
 
 from fleet.bus import MemoryBus, connect
 from fleet.contract import Account, Mission, Params, Sample, Status
+from fleet.telemetry.heard import Heard
 from fleet.telemetry.recordings import replay_messages
 from gateway.link import Batch, Udp
 from gateway.pump import Pump
@@ -107,7 +108,7 @@ class Fake:
         self.dropped, self.sent = 0, []
 
     def start(self, number, out, stop):
-        out.put(Batch(number, [], ended=True))
+        out.put(Batch(number, ended=True))
 
     def send(self, where, data):
         self.sent.append((where, data))
@@ -121,7 +122,7 @@ def test_latest_news_answer_and_only_listening_sends_nothing(listen_only):
     bus, link, talker = MemoryBus(), Fake(offset=-1), Talker()
     pump, ear = Pump([link], bus, listen_only), Ear(bus)
     data = talker.heartbeat() + talker.attitude(1.0) + talker.mission(talker.item(0)) + talker.param("A", 2.0, 0, 1)
-    pump.take(Batch(0, [(time.time(), "air", data)]))
+    pump.take(Batch(0, Heard.of([(time.time(), "air", data)])))
     pump._tick(0.0)
     pump.run(threading.Event())
     assert {type(m) for m in ear.news} == {Sample, Status, Mission, Params, Account}
@@ -138,7 +139,7 @@ def test_latest_news_answer_and_only_listening_sends_nothing(listen_only):
 def test_mission_and_parameters_are_said_again():
     bus, talker = MemoryBus(), Talker()
     pump, ear = Pump([Fake()], bus), Ear(bus)
-    pump.take(Batch(0, [(time.time(), "air", talker.heartbeat() + talker.mission(talker.item(0)))]))
+    pump.take(Batch(0, Heard.of([(time.time(), "air", talker.heartbeat() + talker.mission(talker.item(0)))])))
     for mono in (0.0, 5.0, 11.0, 12.0, 22.0):
         pump._tick(mono)
     assert len(ear.of(Mission)) == 3

@@ -7,6 +7,7 @@ from talker import T0, Talker, assert_finite, of
 
 from fleet.contract import COLUMNS, Mission, Params, Sample, Status
 from fleet.telemetry.decode import Decoder
+from fleet.telemetry.heard import Heard
 from fleet.telemetry.opening import Source
 from fleet.telemetry.recordings import Recording, replay_messages
 from fleet.telemetry.tlog import Line, Tlog, backlog_offset, boot_s, restamped
@@ -134,7 +135,7 @@ def test_a_wrong_suffix_is_seen_through(tmp_path):
 
 def heard(frames, times):
     """Frames of one sender, each with its time of arrival."""
-    return Decoder().feed([(t, None, frame) for t, frame in zip(times, frames, strict=True)])
+    return Decoder().feed(Heard.of([(t, None, frame) for t, frame in zip(times, frames, strict=True)]))
 
 
 def test_a_backlog_is_played_in_the_time_of_the_flight():

@@ -1,7 +1,7 @@
 """What a link heard, as one stretch of bytes: the seam between receiving and decoding.
 
-A receiving thread lays the datagrams (or pieces of a stream) it got at once into one buffer, says where each begins and
-ends, when it came and who sent it, and puts the whole on the queue as one `gateway.link.Batch(number, heard=Heard(...))`:
+A receiving thread lays the datagrams (or pieces of a stream) it got at once into one buffer, says where each begins
+and ends, when it came and who sent it, and puts all on the queue as one `gateway.link.Batch(number, heard=Heard(...))`:
 
     slots: (1024, 2048) uint8 as `recvmmsg` filled them, lengths: (n,), addresses: a bytes-like per slot
     buf, stop = tight(slots.ravel(), np.arange(n) * 2048, lengths)            # a copy: the slots are free again
@@ -43,6 +43,24 @@ class Heard(NamedTuple):
         buf = np.frombuffer(b"".join(data for _, _, data in pieces), np.uint8)
         start = np.concatenate([np.zeros(1, np.int64), stop])[:-1]
         return cls(buf, start, stop, np.array([t for t, _, _ in pieces], float), sender, tuple(number))
+
+
+def merged(parts: Sequence[Heard]) -> Heard:
+    """Lay what was heard at several times one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    number: dict[Hashable, int] = {}
+    buf, start, stop, sender, shift = [], [], [], [], 0
+    for part in parts:
+        renamed = np.array([number.setdefault(who, len(number)) for who in part.senders], np.int64)
+        buf.append(part.buf)
+        start.append(part.start + shift)
+        stop.append(part.stop + shift)
+        sender.append(renamed[part.sender])
+        shift += len(part.buf)
+    arrival = np.concatenate([part.arrival for part in parts])
+    told, begins, ends, who = map(np.concatenate, (buf, start, stop, sender))
+    return Heard(told, begins, ends, arrival, who, tuple(number))
 
 
 @nb.njit(cache=True, nogil=True)

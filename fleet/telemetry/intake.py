@@ -10,7 +10,8 @@ import numpy as np
 from fleet.contract import Mission, Params, Sample, Status
 from fleet.telemetry.batch import lay
 from fleet.telemetry.craft import LOST_S, Craft
-from fleet.telemetry.decode import IDS, Decoder, Frames, Piece
+from fleet.telemetry.decode import IDS, Decoder, Frames
+from fleet.telemetry.heard import Heard, merged
 from fleet.telemetry.heartbeat import is_aircraft
 from fleet.telemetry.route import MESSAGES
 from fleet.telemetry.scan import COMPONENT, EXTRA, ID, SEQ, SYSTEM
@@ -43,7 +44,7 @@ class Intake:
         self.crafts: dict[int, Craft] = {}  # by MAVLink system id
         self.decoder = Decoder()
         self._claims: Claims = {} if claims is None else claims
-        self._pieces: list[Piece] = []
+        self._heard: list[Heard] = []
         self._born: dict[int, int] = {}  # in this batch: by system, the frame of its first heartbeat
         self._rivals: set[int] = set()  # systems whose UAV id another link holds
         self._early: dict[int, list[tuple[float, Any]]] = {}  # before the first heartbeat, by system id
@@ -56,13 +57,17 @@ class Intake:
             data: any bytes
             source: who sent them, e.g. the UDP address; None on a stream with a single far end
         """
-        self._pieces.append((arrival, source, data))
+        self.listen(Heard.of([(arrival, source, data)]))
+
+    def listen(self, heard: Heard) -> None:
+        """Take many pieces of bytes; they are worked through at the next `flush`."""
+        self._heard.append(heard)
 
     def flush(self, now: float) -> list[News]:
         """Hand over what is new; `now` is fleet time [s since 1970]."""
-        if self._pieces:
-            self.digest(self.decoder.feed(self._pieces))
-            self._pieces.clear()
+        if self._heard:
+            self.digest(self.decoder.feed(merged(self._heard)))
+            self._heard.clear()
         return self.take(now)
 
     def take(self, now: float) -> list[News]:

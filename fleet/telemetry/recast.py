@@ -99,9 +99,6 @@ def seal(out, start, payload, size, extra, table):
     for i in range(len(out)):
         for k in range(len(start)):
             end = payload[k] + size[k]
-            crc = 0xFFFF
-            for at in range(start[k] + 1, end):
-                crc = crc >> 8 ^ table[(crc ^ out[i, at]) & 0xFF]
-            crc = crc >> 8 ^ table[(crc ^ extra[k]) & 0xFF]
+            crc = s.checksum(out[i], start[k] + 1, end, extra[k], table)
             out[i, end] = crc & 0xFF
             out[i, end + 1] = crc >> 8

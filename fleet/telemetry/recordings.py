@@ -16,7 +16,7 @@ from fleet.telemetry.intake import Intake, News
 from fleet.telemetry.onboard_log import OnboardLog
 from fleet.telemetry.onboard_news import UNDATED_S, craft_of, log_steps
 from fleet.telemetry.opening import COMPRESSED, Source
-from fleet.telemetry.scan import STAMP, START, STOP
+from fleet.telemetry.scan import COUNTS, STAMP, START, STOP
 from fleet.telemetry.steps import Steps
 from fleet.telemetry.tlog import Tlog
 from fleet.telemetry.ulog import UlogLog
@@ -136,7 +136,7 @@ def _by_content(head: bytes) -> str:
     if head.startswith(MAGIC):
         return ".parauav"
     buf = np.frombuffer(head, np.uint8)
-    at, _, _ = frames_of(buf, np.array([[0, len(head)]]), np.zeros(3, np.int64), STAMP)
+    at, _, _ = frames_of(buf, np.array([[0, len(head), 0]]), np.zeros(COUNTS, np.int64), STAMP)
     found = {
         ".tlog": int((at[:, STOP] - at[:, START]).sum()) + STAMP * len(at),
         ".bin": 89 * head.count(b"\xa3\x95\x80"),

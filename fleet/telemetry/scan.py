@@ -1,6 +1,8 @@
 """The compiled search for MAVLink frames, versions 1 and 2, in any bytes; nothing is raised, nothing good is lost.
 
-After a false start the search goes on one byte later, so that a good frame inside garbage is still found.
+After a false start the search goes on one byte later, so that a good frame inside garbage is still found. A frame with
+an id unknown here has no checksum that could be tested: it is passed over whole where it fills a piece, or where the
+one before ended, what follows is sound and nothing sound begins inside; else it is a false start.
 Source: MAVLink serialization guide; checksum CRC-16/MCRF4XX over everything but the magic, plus CRC_EXTRA.
 """
 
@@ -12,15 +14,23 @@ V1, V2 = 0xFE, 0xFD
 SIGNED = 0x01  # incompatibility flag of MAVLink 2
 LONGEST = 280  # bytes of the longest frame, signature included
 STAMP = 8  # bytes of time before a frame in a .tlog
-START, STOP, PAYLOAD, SIZE, ID, SYSTEM, COMPONENT, SEQ, COLUMNS = range(9)  # columns of what `scan` finds
+START, STOP, PAYLOAD, SIZE, ID, SYSTEM, COMPONENT, SEQ, PART, COLUMNS = range(10)  # columns of what `scan` finds
+MESSAGES, BAD_BYTES, BAD_FRAMES, UNKNOWN, COUNTS = range(5)  # what `scan` counts
 _EARLIEST, _LATEST = 3e14, 4e15  # believable stamps [us since 1970]
 _LONGEST_GAP = 86_400e6  # between two stamps [us]
+_u = nb.uint64
 
 
 def _crc_table() -> np.ndarray:
-    table = np.arange(256, dtype=np.uint16)
+    """Give the effect of a byte followed by k zeros on the checksum, (8, 256): so eight bytes go at once.
+
+    Source: Kounavis & Berry 2005, "slicing-by-8".
+    """
+    table = np.tile(np.arange(256, dtype=np.uint16), (8, 1))
     for _ in range(8):
-        table = np.where(table & 1, (table >> 1) ^ np.uint16(0x8408), table >> 1).astype(np.uint16)
+        table[0] = np.where(table[0] & 1, (table[0] >> 1) ^ np.uint16(0x8408), table[0] >> 1)
+    for k in range(1, 8):
+        table[k] = (table[k - 1] >> 8) ^ table[0][table[k - 1] & 0xFF]
     return table
 
 
@@ -36,7 +46,7 @@ EXTRA = _extra_table()
 """CRC_EXTRA by message id; -1: no such message here."""
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def frame_length(buf, at, end):
     """Give the length a frame starting at `at` claims [bytes]; 0: no frame, -1: header not complete yet."""
     if end < at + 3:
@@ -48,23 +58,30 @@ def frame_length(buf, at, end):
     return buf[at + 1] + 12 + (13 if buf[at + 2] & SIGNED else 0)
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _message_id(buf, at):
     if buf[at] == V1:
         return nb.int64(buf[at + 5])
     return nb.int64(buf[at + 7]) | nb.int64(buf[at + 8]) << 8 | nb.int64(buf[at + 9]) << 16
 
 
-@nb.njit(cache=True)
-def _sound(buf, at, head, size, extra, table):
-    crc = 0xFFFF
-    for i in range(at + 1, at + head + size):
-        crc = crc >> 8 ^ table[(crc ^ buf[i]) & 0xFF]
-    crc = crc >> 8 ^ table[(crc ^ extra) & 0xFF]
-    return crc == buf[at + head + size] | buf[at + head + size + 1] << 8
+@nb.njit(cache=True, nogil=True)
+def checksum(told, at, end, extra, table):
+    """Give the checksum of bytes `at` to `end`, CRC_EXTRA after them; `table` is `CRC`."""
+    crc, i, last, low = _u(0xFFFF), _u(at), _u(end), _u(0xFF)  # unsigned: no index can be negative
+    while i + _u(8) <= last:
+        a, b = _u(told[i]) ^ (crc & low), _u(told[i + _u(1)]) ^ (crc >> _u(8))
+        early = table[7, a] ^ table[6, b] ^ table[5, told[i + _u(2)]] ^ table[4, told[i + _u(3)]]
+        late = table[3, told[i + _u(4)]] ^ table[2, told[i + _u(5)]] ^ table[1, told[i + _u(6)]]
+        crc = _u(early ^ late ^ table[0, told[i + _u(7)]])
+        i += _u(8)
+    while i < last:
+        crc = crc >> _u(8) ^ _u(table[0, (crc ^ _u(told[i])) & low])
+        i += _u(1)
+    return crc >> _u(8) ^ _u(table[0, (crc ^ _u(extra)) & low])
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _stamp(buf, at):
     t = 0.0
     for i in range(STAMP):
@@ -72,93 +89,164 @@ def _stamp(buf, at):
     return t
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _timely(t, last):
     return abs(t - last) < _LONGEST_GAP if last == last else _EARLIEST < t < _LATEST
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _known(buf, at, end, extras, table):
-    """Tell whether a whole, sound frame of a message known here starts at `at`."""
-    length = frame_length(buf, at, end)
-    if length <= 0 or at + length > end:
-        return False
-    number = _message_id(buf, at)
+    """Give the end of the whole, sound frame of a message known here that starts at `at`; 0: there is none."""
+    if at + 8 > end or (buf[at] != V1 and buf[at] != V2):
+        return 0
+    head, tail, number = 6, 2, nb.int64(buf[at + 5])
+    if buf[at] == V2:
+        if at + 12 > end or buf[at + 2] & ~SIGNED:
+            return 0
+        head, tail, number = 10, 15 if buf[at + 2] & SIGNED else 2, _message_id(buf, at)
+    crc = at + head + nb.int64(buf[at + 1])
+    if crc + tail > end:
+        return 0
     extra = extras[number] if number < len(extras) else -1
-    return extra >= 0 and _sound(buf, at, 6 if buf[at] == V1 else 10, nb.int64(buf[at + 1]), extra, table)
+    if extra < 0 or checksum(buf, at + 1, crc, extra, table) != _u(buf[crc]) | _u(buf[crc + 1]) << _u(8):
+        return 0
+    return crc + tail
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
+def _leads_on(buf, at, end, extras, table):
+    """Follow frames of unknown ids from `at` on; give where that ends: soundly, or -1."""
+    while at < end:
+        if _known(buf, at, end, extras, table):
+            return at
+        length = frame_length(buf, at, end)
+        if length <= 0 or at + length > end:
+            return -1
+        number = _message_id(buf, at)
+        if number < len(extras) and extras[number] >= 0:
+            return -1
+        at += length
+    return at
+
+
+@nb.njit(cache=True, nogil=True)
+def _hides(buf, at, after, end, extras, table):
+    """Tell whether a sound frame begins between `at` and `after`."""
+    inside = at + 1
+    while inside < after and not _known(buf, inside, end, extras, table):
+        inside += 1
+    return inside < after
+
+
+@nb.njit(cache=True, nogil=True)
+def _note(buf, at, stop, found, n):
+    """Write down frame `n`: all columns but its part."""
+    second = buf[at] == V2
+    head = 10 if second else 6
+    found[n, START], found[n, STOP], found[n, PAYLOAD], found[n, SIZE] = at, stop, at + head, buf[at + 1]
+    found[n, ID] = _message_id(buf, at)
+    found[n, SYSTEM] = buf[at + 5 if second else at + 3]
+    found[n, COMPONENT] = buf[at + 6 if second else at + 4]
+    found[n, SEQ] = buf[at + 4 if second else at + 2]
+
+
+@nb.njit(cache=True, nogil=True)
+def straight(buf, begin, end, found, extras, table):
+    """Find the frames of pieces that hold nothing but sound frames of messages known here: the usual case, at speed.
+
+    Args:
+        buf, found, extras, table: as for `scan`
+        begin, end: where each piece begins and ends, (k,)
+    Returns:
+        how many were found; -1 where there is anything else, which is for `scan`
+    """
+    n = 0
+    for part in range(len(begin)):
+        at, last = begin[part], end[part]
+        while at < last:
+            if at + 12 <= last and buf[at] == V2 and not buf[at + 2] & ~SIGNED:
+                head, stop = 10, at + nb.int64(buf[at + 1]) + (25 if buf[at + 2] & SIGNED else 12)
+            elif at + 8 <= last and buf[at] == V1:
+                head, stop = 6, at + nb.int64(buf[at + 1]) + 8
+            else:
+                return -1
+            number, crc = _message_id(buf, at), at + head + nb.int64(buf[at + 1])
+            if stop > last or number >= len(extras) or extras[number] < 0:
+                return -1
+            if checksum(buf, at + 1, crc, extras[number], table) != _u(buf[crc]) | _u(buf[crc + 1]) << _u(8):
+                return -1
+            _note(buf, at, stop, found, n)
+            found[n, PART] = part
+            n += 1
+            at = stop
+    return n
+
+
+@nb.njit(cache=True, nogil=True)
 def scan(buf, parts, prefix, last_t, found, times, counts, extras, table):
     """Find every sound frame of a message known here.
 
     Args:
         buf: bytes of one or more senders, one after the other, (n,) uint8
-        parts: where each sender's bytes begin and end, (k, 2); replaced by where its search must go on, and the end
+        parts: where each piece or each sender's bytes begin, replaced by where the search must go on; where they end;
+            and 1 where they begin with something left over, 0 where a frame is due, (k, 3)
         prefix: 0, or `STAMP` in a .tlog
         last_t: newest stamp so far [us]; nan before any
-        found: filled with `COLUMNS` numbers a frame, (m, 8) int64
-        times: filled with the stamps [us], (m,)
-        counts: raised: messages, bad bytes, bad frames, (3,) int64
+        found: filled with `COLUMNS` numbers a frame, (m, 9) int64
+        times: filled with the stamps in a .tlog [us], (m,)
+        counts: raised, (COUNTS,) int64
         extras, table: `EXTRA`, `CRC`
     Returns:
         how many were found, newest stamp [us]
     """
     n = 0
     for part in range(len(parts)):
-        at, end = parts[part, 0], parts[part, 1]
+        begin, end = parts[part, 0], parts[part, 1]
+        at = begin
+        in_step, sure = parts[part, 2] == 0, at  # the one before ended here; unknown frames up to there are certain
         while at + prefix < end:
             magic = at + prefix
+            stop = _known(buf, magic, end, extras, table)
+            if stop:
+                t = _stamp(buf, at) if prefix else 0.0
+                if not prefix or _timely(t, last_t):
+                    _note(buf, magic, stop, found, n)
+                    found[n, PART] = part
+                    if prefix:
+                        times[n] = last_t = t
+                    n += 1
+                    at, in_step = stop, True
+                    continue
             length = frame_length(buf, magic, end)
             t = 0.0
             if length > 0 and prefix:
                 t = _stamp(buf, at)
                 length = length if _timely(t, last_t) else 0
-            if length == 0:
-                at += 1
-                counts[1] += 1
-                continue
-            if (length < 0 and (buf[magic] == V1 or buf[magic] == V2)) or magic + length > end:
+            if (length < 0 and (buf[magic] == V1 or buf[magic] == V2)) or (length > 0 and magic + length > end):
                 break
-            if length < 0:
+            if length <= 0:
                 at += 1
-                counts[1] += 1
+                counts[BAD_BYTES] += 1
+                in_step = False
                 continue
-            head = 6 if buf[magic] == V1 else 10
-            size, number = nb.int64(buf[magic + 1]), _message_id(buf, magic)
-            if _known(buf, magic, end, extras, table):
-                found[n, START], found[n, STOP] = magic, magic + length
-                found[n, PAYLOAD], found[n, SIZE], found[n, ID] = magic + head, size, number
-                found[n, SYSTEM] = buf[magic + (3 if head == 6 else 5)]
-                found[n, COMPONENT] = buf[magic + (4 if head == 6 else 6)]
-                found[n, SEQ] = buf[magic + (2 if head == 6 else 4)]
-                times[n] = t
-                if prefix:
-                    last_t = t
-                n += 1
-                at = magic + length
-                continue
-            counts[2] += 1
-            after = magic + length
-            if prefix:
-                whole = _known(buf, after + prefix, end, extras, table) and _timely(_stamp(buf, after), t)
+            number, after = _message_id(buf, magic), magic + length
+            strange = number >= len(extras) or extras[number] < 0
+            if strange and prefix:
+                strange = _known(buf, after + prefix, end, extras, table) > 0 and _timely(_stamp(buf, after), t)
+            elif strange and in_step and not (at == begin and after == end):
+                if at >= sure:
+                    sure = _leads_on(buf, after, end, extras, table)
+                strange = sure >= 0 and not _hides(buf, at, after, end, extras, table)
+            elif strange:
+                strange = in_step
+            if strange:
+                counts[UNKNOWN] += 1
+                at = after
             else:
-                whole = at == parts[part, 0] and after == end
-            if whole and (number >= len(extras) or extras[number] < 0):
-                at = after  # a message unknown here, sound for all one can tell
-            else:
+                counts[BAD_FRAMES] += 1
+                counts[BAD_BYTES] += 1
                 at += 1
-                counts[1] += 1
+                in_step = False
         parts[part, 0] = at
-    counts[0] += n
+    counts[MESSAGES] += n
     return n, last_t
-
-
-@nb.njit(cache=True)
-def gather(buf, starts, sizes, width):
-    """Lay payloads under each other, zeros where the sender cut them off, (n, width) uint8."""
-    out = np.zeros((len(starts), width), np.uint8)
-    for i in range(len(starts)):
-        for k in range(min(sizes[i], width)):
-            out[i, k] = buf[starts[i] + k]
-    return out

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fleet.telemetry import scan as s
+from fleet.telemetry.deal import gather
 from fleet.telemetry.decode import IDS, Decoder, Frames, frames_of
 from fleet.telemetry.opening import Source
 
@@ -42,8 +43,8 @@ class Tlog:
         offset_s = backlog_offset(self._batches(Decoder()))
         batches = self._batches(self.decoder)
         yield from batches if offset_s is None else restamped(batches, offset_s)
-        if bad := int(self.decoder.counts[1]):
-            read = int(self.decoder.counts[0])
+        if bad := int(self.decoder.counts[s.BAD_BYTES]):
+            read = int(self.decoder.counts[s.MESSAGES])
             where = f", the first near byte {self._first_bad}" if self._first_bad is not None else ""
             self.skipped.append(f"{bad} damaged bytes skipped{where}, {read} frames read")
 
@@ -56,22 +57,26 @@ class Tlog:
             while True:
                 chunk = stream.read(CHUNK) or b""
                 told = rest + chunk
-                buf, parts, before = np.frombuffer(told, np.uint8), np.array([[0, len(told)]]), int(counts[1])
+                buf, parts, before = (
+                    np.frombuffer(told, np.uint8),
+                    np.array([[0, len(told), 0]]),
+                    int(counts[s.BAD_BYTES]),
+                )
                 at, stamps, last_t = frames_of(buf, parts, counts, s.STAMP, last_t)
                 done = int(parts[0, 0])
                 if chunk and len(at) > 1:  # the last one waits: only its successor tells whether its stamp is right
                     done, last_t = int(at[-1, s.START]) - s.STAMP, stamps[-2]
                     at, stamps = at[:-1], stamps[:-1]
-                    counts[0] -= 1
-                if counts[1] > before and self._first_bad is None:
+                    counts[s.MESSAGES] -= 1
+                if counts[s.BAD_BYTES] > before and self._first_bad is None:
                     self._first_bad = place
                 place += done
                 if len(at):
                     yield Frames(buf, at, line.straight(stamps * 1e-6), np.zeros(len(at), int))
                 if not chunk:
-                    counts[1] += len(told) - done
+                    counts[s.BAD_BYTES] += len(told) - done
                     return
-                if not counts[0] and place > HOPELESS:
+                if not counts[s.MESSAGES] and place > HOPELESS:
                     return
                 rest = told[done:]
 
@@ -109,7 +114,7 @@ def boot_s(frames: Frames) -> np.ndarray:
     own = np.full(len(frames.at), np.nan)
     for number in _BOOT_FIRST:
         which = np.flatnonzero((frames.at[:, s.ID] == number) & (frames.at[:, s.SIZE] >= 4))
-        laid = s.gather(frames.buf, frames.at[which, s.PAYLOAD], frames.at[which, s.SIZE], 4)
+        laid = gather(frames.buf, frames.at[which, s.PAYLOAD], frames.at[which, s.SIZE], 4)
         own[which] = laid.view("<u4")[:, 0] * 1e-3
     return own
 

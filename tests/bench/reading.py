@@ -64,7 +64,7 @@ def _stamps(path: Path) -> list[list[tuple[int, int]]]:
 
     data = Source(path).open().read(1 << 30) or b""
     buf = np.frombuffer(data, np.uint8)
-    at, times, _ = frames_of(buf, np.array([[0, len(buf)]]), np.zeros(3, np.int64), 8)
+    at, times, _ = frames_of(buf, np.array([[0, len(buf), 0]]), np.zeros(4, np.int64), 8)
     return [[(int(start) - 8, int(t)) for start, t in zip(at[:, 0], times, strict=True)]]
 
 
