@@ -9,6 +9,7 @@
     parauav/{uav}/prediction             Prediction   worker   mean path, tube, horizon; also answers queries
     parauav/{uav}/mismatch               Mismatch     worker   where, what physics, fit before and after; queries too
     parauav/{uav}/alert                  Alert        worker   predicted conflict, fence, ground, …; answers queries
+                                                      gateway  a second sender that uses this id; answers queries
     parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; answers queries
     parauav/@gateway/{writer}            Account      gateway  counters of one gateway; answers queries
 
@@ -476,6 +477,7 @@ class AlertKind(StrEnum):
     GEOFENCE = "geofence"
     GROUND = "ground"
     NOT_ACHIEVABLE = "not_achievable"
+    SECOND_SENDER = "second_sender"
 
 
 About = tuple[AlertKind, int]

@@ -4,36 +4,60 @@ import argparse
 import contextlib
 import logging
 import sys
+from pathlib import Path
 
 from fleet.bars import shown
 from fleet.bus import ROUTER, connect
 from fleet.cli import guarded, parser_for, stop_on_signal
 from fleet.telemetry.ids import Ids
-from gateway.link import Link, Udp
+from fleet.telemetry.intake import MOST_UAVS
+from gateway.gate import gates
+from gateway.link import Link
+from gateway.links.opening import open_link
 from gateway.pump import Pump
 from gateway.recorded import Replay
-from gateway.spec import read_spec
+from gateway.spec import read_forward, read_spec
 
 DEFAULT_LINK = "udpin:127.0.0.1:14550"
 EXAMPLES = """
   gateway                                              listen on loopback, port 14550
   gateway --link udpin:0.0.0.0:14550                   listen on every network
   gateway --link "udpin:127.0.0.1:14550#offset=-1"     UAV id = system id - 1
+  gateway --link serial:/dev/ttyUSB0:57600 --link tcp:192.168.1.10:5760
+  gateway --link udpbcast:192.168.1.255:14550          call a whole network, hear whoever answers
+  gateway --forward udpin:127.0.0.1:14551              a ground station may sit beside us: QGroundControl, MAVProxy
+  gateway --forward "udpout:10.0.0.9:14550#no-messages=RAW_IMU&systems=1-20"
+  gateway --keys keys.txt --link "udpin:0.0.0.0:14550#sign=require&key=swarm"
   gateway --link "replay:flight.tlog.xz?speed=4"       play a recording four times as fast
   gateway --link "replay:flight.tlog?speed=max&copies=50"
   gateway --listen-only                                send nothing to any aircraft
+
+links:
+  udpin:HOST:PORT   udpout:HOST:PORT   udpbcast:HOST:PORT   tcpin:HOST:PORT   tcp:HOST:PORT   serial:PATH[:BAUD]
+  replay:FILE[?speed=N&copies=N&results=1]
+settings behind a #, joined by &:
+  offset=N                                UAV id = MAVLink system id + N (of aircraft only)
+  messages= systems= components=          let in only these, names or numbers: messages=ATTITUDE,30, systems=1-50
+  no-messages= no-systems= no-components= let in all but these; of --forward: what is sent there
+  sign=accept|require  key=NAME           check signatures, sign what we say; require: unsigned is refused
+
+A file of keys has lines of NAME and 64 hex digits, and only its owner may read it (chmod 600).
 """
 
 
 def run(args: argparse.Namespace) -> int:
     """Open the links, join the bus, work until told to stop or the recordings end."""
     specs = [read_spec(text, args.offset) for text in args.link or [DEFAULT_LINK]]
+    specs += [read_forward(text) for text in args.forward]
+    if args.most_uavs < 1:
+        raise ValueError(f"--most-uavs: found {args.most_uavs}, expected at least 1; write e.g. 250")
+    gated = gates(specs, args.keys)
     stop = stop_on_signal()
     with connect(args.router) as bus, contextlib.ExitStack() as held:
         links: list[Link] = []
         ids = Ids()
         for spec in specs:
-            link: Link = Udp(spec) if spec.kind == "udpin" else Replay(spec, ids)
+            link = open_link(spec, ids)
             held.callback(link.close)
             links.append(link)
             print(f"gateway: {spec.text}", flush=True)
@@ -41,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
         with shown(replays, lambda line: print(f"gateway: {line}", flush=True)):
             for replay in replays:
                 replay.look(stop)
-            Pump(links, bus, args.listen_only).run(stop)
+            settings = {"gates": gated, "stations": len(args.forward), "most": args.most_uavs}
+            Pump(links, bus, args.listen_only, **settings).run(stop)
     return 0
 
 
@@ -50,9 +75,14 @@ def main(argv: list[str] | None = None) -> int:
     logging.basicConfig(format="gateway: %(message)s")
     parser = parser_for("gateway", (__doc__ or "").strip().splitlines()[0], EXAMPLES)
     parser.add_argument(
-        "--link", action="append", metavar="LINK", help=f"udpin:HOST:PORT or replay:FILE?speed=N ({DEFAULT_LINK})"
+        "--link", action="append", metavar="LINK", help=f"where aircraft are; may be given again ({DEFAULT_LINK})"
+    )
+    parser.add_argument(
+        "--forward", action="append", default=[], metavar="LINK", help="another ground station; may be given again"
     )
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
+    parser.add_argument("--most-uavs", type=int, default=MOST_UAVS, metavar="N", help=f"no more aircraft ({MOST_UAVS})")
+    parser.add_argument("--keys", type=Path, metavar="FILE", help="keys of signed links, for its owner's eyes only")
     parser.add_argument("--router", default=ROUTER, help=f"where the bus is ({ROUTER})")
     parser.add_argument("--listen-only", action="store_true", help="send nothing at all to the aircraft")
     return guarded("gateway", run, parser.parse_args(argv))

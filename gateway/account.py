@@ -32,6 +32,8 @@ class Tally:
             uavs.update(craft.uav for craft in intake.crafts.values())
             if link.dropped:
                 refused["dropped: decoding fell behind"] += link.dropped
+            if link.unsent:
+                refused["not sent: nobody at the far end, or no room"] += link.unsent
         return Account(
             t=t,
             links=tuple(link.spec.text for link in links),

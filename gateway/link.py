@@ -1,12 +1,10 @@
-"""Where bytes come from: what a link is, and the UDP port that listens."""
+"""What a link is: where bytes come from and go to, with a thread of its own."""
 
-import contextlib
 import queue
-import socket
 import threading
 import time
 from collections.abc import Hashable, Sequence
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol
 
 from fleet.codec import Wire
 from fleet.telemetry.heard import Heard
@@ -14,7 +12,6 @@ from gateway.spec import Spec
 
 QUEUE = 20_000  # batches between receiving and decoding
 POLL_S = 0.2  # how soon a receiving thread notices the end [s]
-DATAGRAM = 65_535  # longest there is [bytes]
 _T0 = time.time() - time.monotonic()
 
 
@@ -30,6 +27,7 @@ class Batch(NamedTuple):
     heard: Heard | None = None
     news: Sequence[Any] = ()
     copies: Sequence[Wire] = ()
+    gone: Hashable = None  # a sender that took its leave: whoever comes next may have its place
     ended: bool = False
 
 
@@ -37,69 +35,44 @@ class Link(Protocol):
     """One source of bytes with a thread of its own."""
 
     spec: Spec
-    dropped: int  # datagrams lost because decoding fell behind
+    dropped: int  # datagrams, or pieces of a stream, lost because decoding fell behind
+    unsent: int  # messages not sent: nobody at the far end, or no room
+
+    @property
+    def greets(self) -> Sequence[Hashable]:
+        """Give far ends known before they spoke: many an aircraft speaks only when spoken to."""
 
     def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
         """Begin to receive; batches carry `number`."""
 
-    def send(self, where: Hashable, data: bytes) -> None:
-        """Send bytes back to a sender."""
+    def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
+        """Send bytes, whole messages, to a sender; never wait."""
 
     def close(self) -> None:
         """Wait for the thread (the stop event is set) and free what is held."""
 
 
-class Udp:
-    """A UDP port; every sender's address is learned from what it sends."""
+class Outlet:
+    """Where a link puts what it hears: it never waits, and counts what finds no room."""
 
-    def __init__(self, spec: Spec) -> None:
-        self.spec = spec
-        self.dropped = 0
-        self._socket = _bind(spec)
-        self._thread: threading.Thread | None = None
+    def __init__(self, number: int, out: "queue.Queue[Batch]", link: Link) -> None:
+        self._number, self._out, self._link = number, out, link
 
-    @property
-    def port(self) -> int:
-        """Give the port listened at."""
-        return int(self._socket.getsockname()[1])
+    def put(self, heard: Heard) -> None:
+        """Put what was heard."""
+        try:
+            self._out.put_nowait(Batch(self._number, heard))
+        except queue.Full:
+            self._link.dropped += len(heard.start)
 
-    def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
-        """Receive in a thread: stamp, queue, nothing else."""
-        self._thread = threading.Thread(target=self._receive, args=(number, out, stop), name=self.spec.text)
-        self._thread.start()
+    def piece(self, sender: Hashable, data: bytes) -> None:
+        """Put one piece of a stream that came just now."""
+        self.put(Heard.of([(wall(), sender, data)]))
 
-    def _receive(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
+    def gone(self, sender: Hashable, stop: threading.Event) -> None:
+        """Say that a sender took its leave; this may wait."""
         while not stop.is_set():
             try:
-                data, sender = self._socket.recvfrom(DATAGRAM)
-            except OSError:  # nothing for a while, or an earlier answer found nobody
-                continue
-            try:
-                out.put_nowait(Batch(number, heard=Heard.of([(wall(), sender, data)])))
+                return self._out.put(Batch(self._number, gone=sender), timeout=POLL_S)
             except queue.Full:
-                self.dropped += 1
-
-    def send(self, where: Hashable, data: bytes) -> None:
-        """Send one datagram; a full buffer or a vanished far end loses it, as radio would."""
-        with contextlib.suppress(OSError):
-            self._socket.sendto(data, cast("tuple[str, int]", where))
-
-    def close(self) -> None:
-        """Wait for the thread and free the port."""
-        if self._thread is not None:
-            self._thread.join()
-        self._socket.close()
-
-
-def _bind(spec: Spec) -> socket.socket:
-    family = socket.AF_INET6 if ":" in spec.where else socket.AF_INET
-    found = socket.socket(family, socket.SOCK_DGRAM)
-    found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
-    found.settimeout(POLL_S)
-    try:
-        found.bind((spec.where.strip("[]"), spec.port))
-    except OSError as error:
-        found.close()
-        reason = error.strerror or str(error)
-        raise OSError(f"link {spec.text}: {reason}; stop what holds the port or name another") from None
-    return found
+                continue

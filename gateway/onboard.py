@@ -3,7 +3,7 @@
 Source: MAVLink services "Parameter Protocol", "Mission Protocol", "Message interval".
 """
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Sequence
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -128,15 +128,23 @@ class Onboard:
         self._questions: dict[int, Questions] = {}
         self._beat = float("-inf")
 
-    def tick(self, now: float, crafts: Iterable[Craft]) -> list[tuple[Hashable, bytes]]:
-        """Give (where to, bytes) of what is to be sent now; `now` is fleet time [s since 1970]."""
+    def tick(
+        self, now: float, crafts: Iterable[Craft], greets: Sequence[Hashable] = ()
+    ) -> list[tuple[Hashable, bytes]]:
+        """Give (where to, bytes) of what is to be sent now.
+
+        Args:
+            now: fleet time [s since 1970]
+            crafts: the aircraft of the link
+            greets: far ends to greet even before they speak
+        """
         live = [craft for craft in crafts if craft.link is Link.LIVE and craft.source is not None]
         out: list[tuple[Hashable, bytes]] = []
         if now - self._beat >= HEARTBEAT_S:
             self._beat = now
             kind, none = dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID
             beat = dialect.MAVLink_heartbeat_message(kind, none, 0, 0, dialect.MAV_STATE_ACTIVE, 3)
-            out += [(source, self._pack(beat)) for source in dict.fromkeys(craft.source for craft in live)]
+            out += [(source, self._pack(beat)) for source in dict.fromkeys([*greets, *(c.source for c in live)])]
         for craft in live:
             asked = self._questions.get(craft.system)
             if asked is None or asked.craft is not craft:

@@ -10,10 +10,10 @@ import msgspec
 
 from fleet.bus import Answers, Bus
 from fleet.codec import Stamp, Wire
-from fleet.contract import Account, FleetState, Mission, Params, Status
+from fleet.contract import Account, Alert, AlertKind, FleetState, Mission, Params, Status
 from fleet.telemetry.fleet_news import RESULTS
 
-KEPT = (Status, Mission, Params)
+KEPT = (Status, Mission, Params, Alert)
 REPEAT_S = 10.0  # mission and parameters are said again, for those who missed them [s]
 
 
@@ -29,7 +29,7 @@ class Publisher:
         self.published = 0
         self._bus = bus
         self._lock = threading.Lock()  # answers come from a thread of the bus
-        kept = KEPT + RESULTS if results else KEPT
+        kept = tuple(dict.fromkeys(KEPT + RESULTS)) if results else KEPT
         self._latest: dict[type, dict[Hashable, tuple[Any, Stamp | None]]] = {kind: {} for kind in kept}
         self._account: Account | None = None
         self._repeated = 0.0
@@ -42,7 +42,7 @@ class Publisher:
         for message in messages:
             kind = type(message)
             stamp = None
-            if kind in RESULTS:
+            if kind in RESULTS and getattr(message, "kind", None) is not AlertKind.SECOND_SENDER:
                 message, stamp = self._claimed(message)
             self._keep(kind, (getattr(message, "uav", 0), str(getattr(message, "kind", ""))), message, stamp)
             self._bus.publish(message, stamp)

@@ -10,8 +10,11 @@ import msgspec
 from fleet.bus import Bus
 from fleet.contract import Message
 from fleet.telemetry.craft import Craft
-from fleet.telemetry.intake import Intake
+from fleet.telemetry.intake import MOST_UAVS, SINGLE, Intake
+from fleet.telemetry.scan import ID
 from gateway.account import Tally
+from gateway.forward import Forward
+from gateway.gate import Gate
 from gateway.link import QUEUE, Batch, Link, wall
 from gateway.onboard import Onboard
 from gateway.publish import Publisher
@@ -25,22 +28,41 @@ class Pump:
     """Everything one gateway does between its links and the bus.
 
     Args:
-        links: opened links
+        links: opened links, those to aircraft first
         bus: where messages go
-        listen_only: send nothing at all
+        listen_only: send nothing at all to aircraft
+        gates: what each link lets in; None: everything
+        stations: how many of the last links lead to other ground stations
+        most: UAVs at a time
     """
 
-    def __init__(self, links: Sequence[Link], bus: Bus, listen_only: bool = False) -> None:
+    def __init__(
+        self,
+        links: Sequence[Link],
+        bus: Bus,
+        listen_only: bool = False,
+        *,
+        gates: Sequence[Gate] | None = None,
+        stations: int = 0,
+        most: int = MOST_UAVS,
+    ) -> None:
         self.links = links
+        self.forward = Forward(links, stations, listen_only)
+        self._gates = [Gate(link.spec) for link in links] if gates is None else gates
+        self._heard: set[int] = set()  # links with something to forward
+        self._stations = range(len(links) - stations, len(links))
         self.tally = Tally()
         self.publisher = Publisher(bus, results=any(link.spec.results for link in links))
         claims: dict[int, Craft] = {}
-        self.intakes = [Intake(link.spec.offset, claims) for link in links]
+        self.intakes = [
+            Intake(link.spec.offset, claims, most, gate.admit) for link, gate in zip(links, self._gates, strict=True)
+        ]
         self._onboards = [Onboard() for _ in links]
         self._listen_only = listen_only
         self._queue: queue.Queue[Batch] = queue.Queue(QUEUE)
         self._open = set(range(len(links)))
-        self._live = [number for number, link in enumerate(links) if link.spec.kind != "replay"]
+        to_aircraft = links[: self._stations.start]
+        self._live = [number for number, link in enumerate(to_aircraft) if link.spec.kind != "replay"]
         self._recorded = float("-inf")  # newest recorded time [s since 1970]
         self._players: set[int] = set()  # UAV ids heard of in recordings
 
@@ -71,6 +93,11 @@ class Pump:
         if batch.heard is not None:
             self.tally.add(batch.heard)
             intake.listen(batch.heard)
+            self._heard.add(batch.link)
+        if batch.gone is not None:
+            self._pass_on()
+            intake.part(batch.gone)
+            self.forward.part(batch.link, batch.gone)
         if batch.news:
             self._recorded = max(self._recorded, *(news.t for news in batch.news))
             self._players.update(news.uav for news in batch.news if isinstance(news, Message))
@@ -87,15 +114,26 @@ class Pump:
             try:
                 self.take(self._queue.get_nowait())
             except queue.Empty:
+                self._pass_on()
                 stop.wait(min(left, NAP_S))  # waking up for every datagram would cost more than decoding it
 
+    def _pass_on(self) -> None:
+        """Forward what has been heard since the last time; without a station there is no hurry to look at it."""
+        for number in self._heard if self._stations else ():
+            frames = self.intakes[number].sort()
+            for aircraft, said in self.forward.take(number, frames) if frames is not None else ():
+                self.intakes[aircraft].digest(said.only(SINGLE[said.at[:, ID]]))  # a new mission, a forged heartbeat
+        self._heard.clear()
+
     def _tick(self, mono: float) -> None:
+        self._pass_on()
         for number in self._live:
-            intake, link, now = self.intakes[number], self.links[number], wall()
+            intake, link, gate, now = self.intakes[number], self.links[number], self._gates[number], wall()
             self.publisher.publish(intake.flush(now))
             if not self._listen_only:
-                for where, data in self._onboards[number].tick(now, intake.crafts.values()):
-                    link.send(where, data)
+                for where, data in self._onboards[number].tick(now, intake.crafts.values(), link.greets):
+                    link.send(where, gate.sign(data))
+        self.forward.tidy(wall())
         self.publisher.repeat(mono)
 
     def _tell(self) -> None:

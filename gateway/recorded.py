@@ -38,7 +38,8 @@ class Replay:
 
     def __init__(self, spec: Spec, ids: Ids | None = None) -> None:
         self.spec = spec
-        self.dropped = 0
+        self.dropped = self.unsent = 0
+        self.greets: Sequence[Hashable] = ()
         self.recording = Recording(spec.where, spec.offset)
         self.pace = Pace(spec.speed)
         self._ids = Ids() if ids is None else ids
@@ -138,7 +139,7 @@ class Replay:
         renamed = (renumbered(message, lambda uav: self._known.get(uav, uav)) for message in news)
         return [message for message in renamed if message is not None]
 
-    def send(self, where: Hashable, data: bytes) -> None:
+    def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
         """Do nothing: a recording does not answer."""
 
     def close(self) -> None:

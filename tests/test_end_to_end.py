@@ -156,7 +156,7 @@ REFUSED = {
     ("--router", "nowhere"): "--router: found 'nowhere', expected",
     ("--router", "tcp/192.0.2.1:7447"): "nobody answers and none can be opened here",
     ("--mavlink", "14550"): "--mavlink: found '14550', expected HOST:PORT",
-    ("--link", "tcp:a:1"): "--link: found 'tcp:a:1', expected udpin:HOST:PORT",
+    ("--link", "ftp:a:1"): "--link: found 'ftp:a:1', expected udpin:HOST:PORT",
 }
 
 

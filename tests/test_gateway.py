@@ -16,7 +16,8 @@ from fleet.bus import MemoryBus, connect
 from fleet.contract import Account, Mission, Params, Sample, Status
 from fleet.telemetry.heard import Heard
 from fleet.telemetry.recordings import replay_messages
-from gateway.link import Batch, Udp
+from gateway.link import Batch
+from gateway.links.udp import Udp
 from gateway.pump import Pump
 from gateway.recorded import Replay
 from gateway.spec import read_spec
@@ -55,7 +56,7 @@ def test_a_link_is_read():
     assert read_spec("udpin::14550", 3)[2:6] == ("127.0.0.1", 14550, 1.0, 3)
     assert read_spec("replay:/a b/c.tlog.xz?speed=max")[1:5] == ("replay", "/a b/c.tlog.xz", 0, float("inf"))
     assert read_spec("replay:c.tlog?speed=4").speed == 4
-    assert read_spec("replay:a%3F%23.bin?copies=50")[2:] == ("a?#.bin", 0, 1.0, 0, 50, False)
+    assert read_spec("replay:a%3F%23.bin?copies=50")[2:8] == ("a?#.bin", 0, 1.0, 0, 50, False)
     assert read_spec("replay:c.parauav?results=1").results
 
 
@@ -67,7 +68,13 @@ def test_a_link_is_read():
         "udpin:14550:x",
         "udpin:h:0",
         "udpin:h:99999",
-        "tcp:h:1",
+        "ftp:h:1",
+        "tcp::1",
+        "serial:",
+        "serial:/dev/x:0",
+        "udpin:h:1#sign=maybe",
+        "udpin:h:1#key=a",
+        "replay:x.tlog#systems=1",
         "replay:",
         "udpin:h:1#offset=x",
         "udpin:h:1#a=1",
@@ -105,12 +112,12 @@ class Fake:
 
     def __init__(self, offset=0):
         self.spec = read_spec(f"udpin:127.0.0.1:1#offset={offset}")
-        self.dropped, self.sent = 0, []
+        self.dropped, self.unsent, self.sent, self.greets = 0, 0, [], ()
 
     def start(self, number, out, stop):
         out.put(Batch(number, ended=True))
 
-    def send(self, where, data):
+    def send(self, where, data, messages=1):
         self.sent.append((where, data))
 
     def close(self):
@@ -139,7 +146,8 @@ def test_latest_news_answer_and_only_listening_sends_nothing(listen_only):
 def test_mission_and_parameters_are_said_again():
     bus, talker = MemoryBus(), Talker()
     pump, ear = Pump([Fake()], bus), Ear(bus)
-    pump.take(Batch(0, Heard.of([(time.time(), "air", talker.heartbeat() + talker.mission(talker.item(0)))])))
+    data = talker.heartbeat() + talker.mission(talker.item(0))
+    pump.take(Batch(0, Heard.of([(time.time(), "air", data)])))
     for mono in (0.0, 5.0, 11.0, 12.0, 22.0):
         pump._tick(mono)
     assert len(ear.of(Mission)) == 3

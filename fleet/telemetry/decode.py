@@ -40,6 +40,10 @@ class Frames(NamedTuple):
         except (dialect.MAVError, ValueError, IndexError):
             return None
 
+    def only(self, which: np.ndarray) -> "Frames":
+        """Give some of the frames, by number or by mask."""
+        return self._replace(at=self.at[which], arrival=self.arrival[which], sender=self.sender[which])
+
     def fields(self, which: np.ndarray, name: str) -> "Fields":
         """Give the fields of frames `which`, all of one message, as arrays."""
         kind = layout(name)
@@ -52,6 +56,24 @@ class Frames(NamedTuple):
 
 
 _PARSER = dialect.MAVLink(None)
+
+
+def joined(parts: Sequence[Frames]) -> Frames:
+    """Make one batch of several, in their order."""
+    if len(parts) == 1:
+        return parts[0]
+    ats, numbers = [], []
+    known: dict[Hashable, int] = {}
+    begin = 0
+    for part in parts:
+        at = part.at.copy()
+        at[:, [s.START, s.STOP, s.PAYLOAD]] += begin
+        ats.append(at)
+        renumbered = [known.setdefault(sender, len(known)) for sender in part.senders]
+        numbers.append(np.array(renumbered, np.int64)[part.sender])
+        begin += len(part.buf)
+    buf, arrival = np.concatenate([part.buf for part in parts]), np.concatenate([part.arrival for part in parts])
+    return Frames(buf, np.concatenate(ats), arrival, np.concatenate(numbers), tuple(known))
 
 
 class Fields:

@@ -1,33 +1,36 @@
 """Everything between the bytes of one link and contract messages: no sockets, no wall clock."""
 
 from collections import Counter
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from fleet.contract import Mission, Params, Sample, Status
+from fleet.contract import Alert, Mission, Params, Sample, Status
 from fleet.telemetry.batch import lay
+from fleet.telemetry.collision import Collision
 from fleet.telemetry.craft import LOST_S, Craft
-from fleet.telemetry.decode import IDS, Decoder, Frames
+from fleet.telemetry.decode import IDS, Decoder, Frames, joined
 from fleet.telemetry.heard import Heard, merged
 from fleet.telemetry.heartbeat import is_aircraft
 from fleet.telemetry.route import MESSAGES
 from fleet.telemetry.scan import COMPONENT, EXTRA, ID, SEQ, SYSTEM
 
-MOST_UAVS = 250
+MOST_UAVS = 2_000  # over all links
 SECOND = "second sender for a live id"
 NOT_YET = "no aircraft heartbeat yet"
 MOST_EARLY = 4096  # messages of one system kept until its first heartbeat; a recording may begin anywhere
 
-News = Sample | Status | Mission | Params
+News = Sample | Status | Mission | Params | Alert
 EARLY = MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # said once, so worth keeping; rows come again
 SINGLE = np.zeros(len(EXTRA), bool)  # by message id: heard one by one; all others are rows, or only counted
 SINGLE[[IDS[name] for name in (*EARLY, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
 SINGLE[IDS["MISSION_CURRENT"]] = True  # a row too
 Claims = dict[int, Craft]
 """Which aircraft holds a UAV id, over all links of a gateway."""
+Admit = Callable[[Frames, Counter[str]], Frames]
+"""Leaves out frames that may not come in, and counts them by reason."""
 
 
 class Intake:
@@ -36,15 +39,22 @@ class Intake:
     Args:
         offset: UAV id = MAVLink system id + offset
         claims: shared by the links of one gateway, so that an id heard on two of them is noticed
+        most: UAVs over all those links
+        admit: what may come in; None: everything
     """
 
-    def __init__(self, offset: int = 0, claims: Claims | None = None) -> None:
+    def __init__(
+        self, offset: int = 0, claims: Claims | None = None, most: int = MOST_UAVS, admit: Admit | None = None
+    ) -> None:
         self.offset = offset
         self.refused: Counter[str] = Counter()  # good frames refused, by reason
         self.crafts: dict[int, Craft] = {}  # by MAVLink system id
         self.decoder = Decoder()
         self._claims: Claims = {} if claims is None else claims
+        self._most, self._admit = most, admit
         self._heard: list[Heard] = []
+        self._sorted: list[Frames] = []  # admitted, not yet digested
+        self._collisions: dict[int, Collision] = {}  # by UAV id
         self._born: dict[int, int] = {}  # in this batch: by system, the frame of its first heartbeat
         self._rivals: set[int] = set()  # systems whose UAV id another link holds
         self._early: dict[int, list[tuple[float, Any]]] = {}  # before the first heartbeat, by system id
@@ -65,15 +75,41 @@ class Intake:
 
     def flush(self, now: float) -> list[News]:
         """Hand over what is new; `now` is fleet time [s since 1970]."""
-        if self._heard:
-            self.digest(self.decoder.feed(merged(self._heard)))
-            self._heard.clear()
+        self.sort()
+        self._digest_sorted()
         return self.take(now)
+
+    def sort(self) -> Frames | None:
+        """Find the frames in what was heard since the last time and give those admitted; None where there are none."""
+        if not self._heard:
+            return None
+        frames = self.decoder.feed(merged(self._heard))
+        self._heard.clear()
+        if self._admit is not None:
+            frames = self._admit(frames, self.refused)
+        if not len(frames.at):
+            return None
+        self._sorted.append(frames)
+        return frames
+
+    def part(self, source: Hashable) -> None:
+        """Learn that a sender took its leave: whoever speaks next for its aircraft has its place."""
+        self.sort()
+        self._digest_sorted()
+        for craft in self.crafts.values():
+            if craft.source == source:
+                craft.source = None
+
+    def _digest_sorted(self) -> None:
+        if self._sorted:
+            self.digest(joined(self._sorted))
+            self._sorted.clear()
 
     def take(self, now: float) -> list[News]:
         """Hand over what had arrived up to `now` of what was digested; `now` is fleet time [s since 1970]."""
         mine = [craft for craft in self.crafts.values() if self._claims.get(craft.uav) is craft]
-        return [news for craft in mine for news in craft.take(now)]
+        alarms = [alert for one in self._collisions.values() for alert in one.take(now)]
+        return [*alarms, *(news for craft in mine for news in craft.take(now))]
 
     def digest(self, frames: Frames) -> None:
         """Work through a batch of frames; what they say is handed over by `take`."""
@@ -128,11 +164,11 @@ class Intake:
         holder = self._claims.get(uav)
         if system == 0 or uav < 0:
             self.refused["id out of range"] += 1
-        elif len(self.crafts) >= MOST_UAVS:
-            self.refused[f"more than {MOST_UAVS} aircraft on one link"] += 1
+        elif holder is None and len(self._claims) >= self._most:
+            self.refused[f"more than {self._most} aircraft; raise --most-uavs"] += 1
         elif holder is not None and arrival - holder.heard < LOST_S:
             self._rivals.add(system)
-            self._alarm(holder, arrival)
+            self._alarm(holder, arrival, source)
         else:
             self._rivals.discard(system)
             craft = Craft(uav, system, message.get_srcComponent(), source)
@@ -149,14 +185,16 @@ class Intake:
         holder = self._claims.get(craft.uav, craft)
         if holder is craft and craft.source == source:
             return True
-        if arrival - holder.heard < LOST_S:
-            self._alarm(holder, arrival, count)
+        freed = holder is craft and craft.source is None  # its sender took its leave
+        if arrival - holder.heard < LOST_S and not freed:
+            self._alarm(holder, arrival, source, count)
             return False
         self._claims[craft.uav], craft.source = craft, source
         return True
 
-    def _alarm(self, craft: Craft, arrival: float, count: int = 1) -> None:
+    def _alarm(self, craft: Craft, arrival: float, source: Hashable, count: int = 1) -> None:
         self.refused[SECOND] += count
+        self._collisions.setdefault(craft.uav, Collision(craft.uav)).note(arrival, craft.source, source)
         words = "a second sender uses this id and was refused; give every aircraft its own MAVLink system id"
         craft.queue(arrival, partial(craft.say, words))
 

@@ -1,0 +1,52 @@
+"""What one link lets in: only frames its sieve wants, and none whose signature speaks against it."""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from fleet.telemetry.decode import Frames
+from gateway.signing import Signing, pick, read_keys
+from gateway.spec import Spec
+
+SIEVED = "left out, as the link says"
+
+
+class Gate:
+    """The gate of one link.
+
+    Args:
+        spec: the link
+        signing: its signatures; None: they are not looked at
+    """
+
+    def __init__(self, spec: Spec, signing: Signing | None = None) -> None:
+        self._sieve, self._signing = spec.sieve, signing
+
+    def admit(self, frames: Frames, refused: Counter[str]) -> Frames:
+        """Give the frames that may come in, and count the others by reason."""
+        if self._signing is not None and len(frames.at):
+            frames = frames.only(self._signing.passes(frames, refused))
+        if self._sieve.rules and len(frames.at):
+            kept = self._sieve.keep(frames.at)
+            refused[SIEVED] += int((~kept).sum())
+            frames = frames.only(kept)
+        return frames
+
+    def sign(self, message: bytes) -> bytes:
+        """Give a message of ours as it goes out."""
+        return message if self._signing is None else self._signing.sign(message)
+
+
+def gates(specs: Sequence[Spec], keys: Path | None = None) -> list[Gate]:
+    """Make the gates of all links.
+
+    Raises:
+        ValueError: when the file of keys is not safe, or lacks the key of a link.
+        OSError: when it cannot be read.
+    """
+    known = read_keys(keys) if keys is not None else {}
+    found = []
+    for number, spec in enumerate(specs):
+        signing = Signing(pick(known, spec.key, spec.text), spec.sign == "require", number) if spec.sign else None
+        found.append(Gate(spec, signing))
+    return found

@@ -1,0 +1,1 @@
+"""Endpoints: every kind of link to aircraft and ground stations, one a file."""

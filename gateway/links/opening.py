@@ -1,0 +1,24 @@
+"""A link as it was asked for -> the link."""
+
+from fleet.telemetry.ids import Ids
+from gateway.link import Link
+from gateway.links.dialled import Dialled
+from gateway.links.tcp_listener import TcpListener
+from gateway.links.udp import Udp
+from gateway.recorded import Replay
+from gateway.spec import Spec
+
+
+def open_link(spec: Spec, ids: Ids) -> Link:
+    """Open a link; what listens holds its port from now on, what calls begins with `start`.
+
+    Raises:
+        ValueError, OSError: when there is no such recording, or a port is not free.
+    """
+    if spec.kind == "replay":
+        return Replay(spec, ids)
+    if spec.kind == "tcpin":
+        return TcpListener(spec)
+    if spec.kind in ("tcp", "serial"):
+        return Dialled(spec)
+    return Udp(spec)

@@ -1,0 +1,137 @@
+"""Datagrams off a socket, as many at once as there are: `recvmmsg` on Linux, one by one elsewhere.
+
+Source: recvmmsg(2), udp(7); structures as in <sys/socket.h> of 64-bit Linux.
+"""
+
+import ctypes
+import socket
+import sys
+from collections.abc import Hashable
+from typing import Protocol
+
+import numpy as np
+
+from fleet.telemetry.heard import Heard, tight
+from gateway.link import wall
+
+MOST = 512  # datagrams taken at once
+LONGEST = 65_536  # no datagram is longer [bytes]
+_ADDRESS = 28  # bytes of an IPv6 socket address; IPv4 takes 16
+_MOST_KNOWN = 4096  # addresses whose reading is remembered
+_DONTWAIT = getattr(socket, "MSG_DONTWAIT", 0)
+
+
+class Receiver(Protocol):
+    """Takes what waits in a socket."""
+
+    def take(self) -> Heard | None:
+        """Give the datagrams that wait; None where there are none."""
+
+
+def receiver(sock: socket.socket) -> Receiver:
+    """Give the fastest way to read a socket on this machine."""
+    try:
+        return Bulk(sock)
+    except (AttributeError, OSError):  # another system, or another C library
+        return OneByOne(sock)
+
+
+class OneByOne:
+    """The portable way."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.setblocking(False)
+        self._sock = sock
+
+    def take(self) -> Heard | None:
+        """Give the datagrams that wait; None where there are none."""
+        pieces: list[tuple[float, Hashable, bytes]] = []
+        while len(pieces) < MOST:
+            try:
+                data, sender = self._sock.recvfrom(LONGEST)
+            except OSError:  # no more, or an earlier answer found nobody
+                break
+            pieces.append((wall(), sender, data))
+        return Heard.of(pieces) if pieces else None
+
+
+class _Vector(ctypes.Structure):
+    _fields_ = (("base", ctypes.c_void_p), ("size", ctypes.c_size_t))
+
+
+class _Header(ctypes.Structure):
+    _fields_ = (
+        ("name", ctypes.c_void_p),
+        ("name_size", ctypes.c_uint32),
+        ("vectors", ctypes.c_void_p),
+        ("vector_count", ctypes.c_size_t),
+        ("control", ctypes.c_void_p),
+        ("control_size", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _Message(ctypes.Structure):
+    _fields_ = (("header", _Header), ("length", ctypes.c_uint32))
+
+
+class Bulk:
+    """One call for up to `MOST` datagrams; memory nobody wrote to costs nothing."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        if not sys.platform.startswith("linux"):
+            raise AttributeError("recvmmsg: Linux only")
+        sock.setblocking(False)
+        self._sock = sock
+        self._call = ctypes.CDLL(None, use_errno=True).recvmmsg  # releases the interpreter while it works
+        self._call.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
+        self._slots = np.zeros(MOST * LONGEST, np.uint8)
+        self._names = np.zeros((MOST, _ADDRESS), np.uint8)
+        self._starts = np.arange(MOST) * LONGEST
+        self._vectors, self._messages = (_Vector * MOST)(), (_Message * MOST)()
+        for i, (vector, message) in enumerate(zip(self._vectors, self._messages, strict=True)):
+            vector.base, vector.size = self._slots.ctypes.data + i * LONGEST, LONGEST
+            message.header.name = self._names.ctypes.data + i * _ADDRESS
+            message.header.vectors, message.header.vector_count = ctypes.addressof(vector), 1
+        self._lengths = self._column(_Message.length.offset)
+        self._name_sizes = self._column(_Message.header.offset + _Header.name_size.offset)
+        self._known: dict[bytes, Hashable] = {}
+
+    def _column(self, offset: int) -> np.ndarray:
+        stride = ctypes.sizeof(_Message)
+        return np.ndarray((MOST,), np.uint32, memoryview(self._messages).cast("B"), offset, (stride,))
+
+    def take(self) -> Heard | None:
+        """Give the datagrams that wait; None where there are none."""
+        self._name_sizes[:] = _ADDRESS
+        count = self._call(self._sock.fileno(), ctypes.addressof(self._messages), MOST, _DONTWAIT, None)
+        if count <= 0:  # nothing there, or an earlier answer found nobody
+            return None
+        arrival = np.full(count, wall())
+        lengths = self._lengths[:count].astype(np.int64)
+        buf, stop = tight(self._slots, self._starts[:count], lengths)
+        sender, senders = self._senders(count)
+        return Heard(buf, stop - lengths, stop, arrival, sender, senders)
+
+    def _senders(self, count: int) -> tuple[np.ndarray, tuple[Hashable, ...]]:
+        raw, sizes = self._names[:count].tobytes(), self._name_sizes[:count].tolist()
+        names = [raw[i * _ADDRESS : i * _ADDRESS + size] for i, size in enumerate(sizes)]
+        number: dict[bytes, int] = {}
+        sender = np.array([number.setdefault(name, len(number)) for name in names], np.int64)
+        return sender, tuple(self._address(name) for name in number)
+
+    def _address(self, raw: bytes) -> Hashable:
+        if raw not in self._known:
+            if len(self._known) >= _MOST_KNOWN:
+                self._known.clear()
+            self._known[raw] = read_address(raw)
+        return self._known[raw]
+
+
+def read_address(raw: bytes) -> Hashable:
+    """Read a socket address as Python writes it: (host, port), or (host, port, flow, scope) for IPv6."""
+    family, port = int.from_bytes(raw[:2], sys.byteorder), int.from_bytes(raw[2:4], "big")
+    if family == socket.AF_INET:
+        return socket.inet_ntop(family, raw[4:8]), port
+    host = socket.inet_ntop(socket.AF_INET6, raw[8:24])
+    return host, port, int.from_bytes(raw[4:8], "big"), int.from_bytes(raw[24:28], sys.byteorder)
