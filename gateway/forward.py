@@ -58,7 +58,8 @@ class Forward:
     def _down(self, link: int, frames: Frames) -> None:
         """Bring what aircraft said to the stations."""
         owned = self._aircraft.learn(link, frames)
-        self.refused[DOUBLE] += int((~owned).sum())
+        if not owned.all():
+            self.refused[DOUBLE] += int((~owned).sum())
         frames = frames.only(owned)
         system, component = targets(frames)
         meant: dict[Port, list[int]] = {}
@@ -81,7 +82,7 @@ class Forward:
         meant: dict[Port, list[int]] = {}
         for i, (system, component) in enumerate(zip(*map(np.ndarray.tolist, targets(frames)), strict=True)):
             ports = self._aircraft.to(system, component) if system else self._everybody()
-            if not ports:
+            if system and not ports:
                 self.refused[ASTRAY] += 1
             for port in ports:
                 meant.setdefault(port, []).append(i)

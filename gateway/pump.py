@@ -139,4 +139,5 @@ class Pump:
     def _tell(self) -> None:
         now = wall() if self._live else self._recorded
         account = self.tally.account(now, self.links, self.intakes, self._players)
-        self.publisher.account(msgspec.structs.replace(account, published=self.publisher.published))
+        refused = {**account.refused, **self.forward.refused}
+        self.publisher.account(msgspec.structs.replace(account, published=self.publisher.published, refused=refused))

@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 from conftest import ROOT, unused_port
+from fake_link import FakeLink
 from talker import ITEMS, T0, Aircraft, Talker
 
 from fleet.bus import MemoryBus, connect
@@ -107,26 +108,9 @@ def test_a_busy_port_is_one_sentence():
 # ---- pump and publisher
 
 
-class Fake:
-    """A link without a thread, remembering what was sent."""
-
-    def __init__(self, offset=0):
-        self.spec = read_spec(f"udpin:127.0.0.1:1#offset={offset}")
-        self.dropped, self.unsent, self.sent, self.greets = 0, 0, [], ()
-
-    def start(self, number, out, stop):
-        out.put(Batch(number, ended=True))
-
-    def send(self, where, data, messages=1):
-        self.sent.append((where, data))
-
-    def close(self):
-        pass
-
-
 @pytest.mark.parametrize("listen_only", [False, True])
 def test_latest_news_answer_and_only_listening_sends_nothing(listen_only):
-    bus, link, talker = MemoryBus(), Fake(offset=-1), Talker()
+    bus, link, talker = MemoryBus(), FakeLink("udpin:127.0.0.1:1#offset=-1"), Talker()
     pump, ear = Pump([link], bus, listen_only), Ear(bus)
     data = talker.heartbeat() + talker.attitude(1.0) + talker.mission(talker.item(0)) + talker.param("A", 2.0, 0, 1)
     pump.take(Batch(0, Heard.of([(time.time(), "air", data)])))
@@ -145,7 +129,7 @@ def test_latest_news_answer_and_only_listening_sends_nothing(listen_only):
 
 def test_mission_and_parameters_are_said_again():
     bus, talker = MemoryBus(), Talker()
-    pump, ear = Pump([Fake()], bus), Ear(bus)
+    pump, ear = Pump([FakeLink()], bus), Ear(bus)
     data = talker.heartbeat() + talker.mission(talker.item(0))
     pump.take(Batch(0, Heard.of([(time.time(), "air", data)])))
     for mono in (0.0, 5.0, 11.0, 12.0, 22.0):

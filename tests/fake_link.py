@@ -1,0 +1,35 @@
+"""A link without a thread, for tests of what stands between links."""
+
+from collections import defaultdict
+
+from talker import Ears
+
+from gateway.link import Batch
+from gateway.spec import read_spec
+
+
+class FakeLink:
+    """It remembers what was sent, and to whom."""
+
+    def __init__(self, text: str = "udpin:127.0.0.1:1", greets: tuple = ()):
+        self.spec = read_spec(text)
+        self.dropped = self.unsent = 0
+        self.greets = greets
+        self.sent: list = []
+
+    def start(self, number, out, stop):
+        out.put(Batch(number, ended=True))
+
+    def send(self, where, data, messages=1):
+        self.sent.append((where, data))
+
+    def close(self):
+        pass
+
+    def told(self) -> dict:
+        """Names of the messages sent to each far end since the last time."""
+        names = defaultdict(list)
+        for where, data in self.sent:
+            names[where] += [message.get_type() for message in Ears().feed(data)]
+        self.sent.clear()
+        return dict(names)

@@ -1,0 +1,206 @@
+"""Other ground stations beside us: who hears whom, and what never gets through."""
+
+import time
+
+import numpy as np
+import pytest
+from fake_link import FakeLink
+from pymavlink.dialects.v20 import ardupilotmega as mav
+from talker import ITEMS, Aircraft, Ears, Talker
+
+from fleet.bus import MemoryBus
+from fleet.contract import Alert, Mission, Params
+from fleet.telemetry.decode import IDS, Decoder
+from fleet.telemetry.heard import Heard
+from gateway.forward import ASTRAY, DATAGRAM, DOUBLE
+from gateway.link import Batch
+from gateway.pump import Pump
+from gateway.targets import targets
+
+STATION = Talker(253, 190)
+ASK = mav.MAVLink_param_request_list_message
+BEAT = STATION.heartbeat(mav.MAV_TYPE_GCS, mav.MAV_AUTOPILOT_INVALID)
+
+
+class Field:
+    """A pump with links of aircraft and of stations, and a clock of its own."""
+
+    def __init__(self, air, ground, **settings):
+        self.air, self.ground, self.bus = air, ground, MemoryBus()
+        self.pump = Pump([*air, *ground], self.bus, stations=len(ground), **settings)
+        self.now = time.time()
+
+    def say(self, link, where, *frames):
+        """One far end of one link says something; forwarded at once."""
+        number = self.pump.links.index(link)
+        self.pump.take(Batch(number, Heard.of([(self.now, where, b"".join(frames))])))
+        self.pump._pass_on()
+
+
+@pytest.fixture
+def field():
+    one, two = FakeLink(), FakeLink("tcpin:127.0.0.1:1")
+    found = Field([one, two], [FakeLink("udpin:127.0.0.1:2"), FakeLink("udpout:h:1", greets=("far",))])
+    found.say(found.ground[0], "qgc", BEAT)
+    for k, (link, system) in enumerate(((one, 7), (one, 8), (two, 9))):
+        found.say(link, f"air{system}", Talker(system).heartbeat(), Talker(system).attitude(1.0 + k))
+    return found
+
+
+def test_stations_hear_every_aircraft_and_nobody_itself(field):
+    assert field.ground[0].told() == {"qgc": ["HEARTBEAT", "ATTITUDE"] * 3}
+    assert field.ground[1].told() == {"far": ["HEARTBEAT", "ATTITUDE"] * 3}
+    assert [link.told() for link in field.air] == [{}, {}]  # nor do aircraft hear each other
+    field.say(field.ground[0], "qgc", BEAT)
+    assert [link.told() for link in field.air] == [
+        {"air7": ["HEARTBEAT"], "air8": ["HEARTBEAT"]},
+        {"air9": ["HEARTBEAT"]},
+    ]
+    assert [link.told() for link in field.ground] == [{}, {}]
+
+
+def test_what_is_for_one_goes_to_where_that_one_is(field):
+    field.say(field.ground[0], "qgc", STATION.pack(ASK(8, 1)), STATION.pack(ASK(9, 0)))
+    assert [link.told() for link in field.air] == [{"air8": ["PARAM_REQUEST_LIST"]}, {"air9": ["PARAM_REQUEST_LIST"]}]
+    field.say(field.ground[0], "qgc", STATION.pack(ASK(44, 1)), STATION.pack(ASK(8, 77)))
+    assert [link.told() for link in field.air] == [{}, {}]
+    assert field.pump.forward.refused == {ASTRAY: 2}
+    field.say(field.ground[1], "far", Talker(252, 1).heartbeat(6, 8))
+    [link.told() for link in (*field.air, *field.ground)]
+    field.say(field.air[0], "air7", Talker(7).pack(mav.MAVLink_mission_ack_message(253, 190, 0)))
+    assert [link.told() for link in field.ground] == [{"qgc": ["MISSION_ACK"]}, {}]
+    field.say(field.air[0], "air7", Talker(7).pack(mav.MAVLink_mission_ack_message(255, 190, 0)))  # answers us
+    assert [link.told() for link in field.ground] == [{}, {}]
+
+
+def test_a_camera_beside_the_autopilot_is_reached_where_it_speaks(field):
+    field.say(field.air[0], "camera", Talker(7, 100).heartbeat(mav.MAV_TYPE_CAMERA, mav.MAV_AUTOPILOT_INVALID))
+    field.say(field.ground[0], "qgc", STATION.pack(mav.MAVLink_command_long_message(7, 100, 512, 0, *[0] * 7)))
+    assert field.air[0].told() == {"camera": ["COMMAND_LONG"]}
+
+
+def test_a_second_sender_is_neither_forwarded_nor_given_what_is_for_the_first(field):
+    alerts = []
+    field.bus.subscribe(Alert, lambda alert, _: alerts.append(alert))
+    [link.told() for link in field.ground]
+    field.say(field.air[1], "spoofer", Talker(7).attitude(2.0), Talker(7).heartbeat())
+    assert [link.told() for link in field.ground] == [{}, {}]
+    assert field.pump.forward.refused == {DOUBLE: 2}
+    field.say(field.ground[0], "qgc", STATION.pack(ASK(7, 1)))
+    assert [link.told() for link in field.air] == [{"air7": ["PARAM_REQUEST_LIST"]}, {}]
+    field.pump._tick(0.0)
+    ((uav, said),) = [(alert.uav, alert.sentence) for alert in alerts]
+    assert uav == 7 and "second sender (spoofer)" in said and "first (air7)" in said
+
+
+def test_a_station_that_speaks_in_an_aircraft_s_name_raises_the_alarm(field):
+    field.say(field.ground[0], "qgc", Talker(7).heartbeat())
+    field.pump._tick(0.0)
+    assert [alert.uav for alert, _ in field.bus.ask(Alert)] == [7]
+
+
+def test_listening_only_stations_hear_and_are_not_heard():
+    field = Field([FakeLink()], [FakeLink("udpin:127.0.0.1:2")], listen_only=True)
+    field.say(field.ground[0], "qgc", BEAT)
+    field.say(field.air[0], "air", Talker().heartbeat())
+    field.say(field.ground[0], "qgc", BEAT, STATION.pack(ASK(7, 1)))
+    assert field.ground[0].told() == {"qgc": ["HEARTBEAT"]}
+    assert field.air[0].told() == {}
+
+
+def test_a_station_gets_what_it_wants_and_a_link_brings_what_it_may():
+    air = FakeLink("udpin:127.0.0.1:1#no-messages=STATUSTEXT")
+    wants = FakeLink("udpout:h:1#messages=ATTITUDE,STATUSTEXT&systems=7", greets=("far",))
+    field = Field([air], [wants])
+    text = mav.MAVLink_statustext_message(6, b"hello")
+    for system in (7, 8):
+        talker = Talker(system)
+        field.say(air, f"air{system}", talker.heartbeat(), talker.attitude(1.0), talker.pack(text))
+    assert wants.told() == {"far": ["ATTITUDE"]}
+    assert field.pump.intakes[0].refused == {"left out, as the link says": 2}
+
+
+def test_bytes_go_on_as_they_came_several_to_a_datagram(field):
+    talker = Talker()
+    frames = [talker.attitude(2.0 + k * 0.01) for k in range(200)]
+    [link.told() for link in field.ground]
+    field.say(field.air[0], "air7", *frames)
+    sent = [data for _, data in field.ground[1].sent]
+    assert b"".join(sent) == b"".join(frames)
+    assert 1 < len(sent) < 10 and max(map(len, sent)) <= DATAGRAM
+
+
+def test_an_upload_by_a_station_is_seen_by_us(field):
+    plane = Aircraft(0.0, system=7)
+    field.pump._tick(0.0)
+    upload = [mav.MAVLink_mission_count_message(7, 1, 2)]
+    upload += [
+        mav.MAVLink_mission_item_int_message(7, 1, k, 3, 16, 0, 1, 0, 0, 0, 0, 470_000_000, 80_000_000 + k, 60)
+        for k in (0, 1)
+    ]
+    for message in upload:
+        field.say(field.ground[0], "qgc", STATION.pack(message))
+    field.say(field.air[0], "air7", plane.talker.pack(mav.MAVLink_mission_ack_message(253, 190, 0)))
+    field.pump._tick(1.0)
+    ((mission, _),) = field.bus.ask(Mission, 7)
+    assert [item.lon_e7 for item in mission.items] == [80_000_000, 80_000_001]
+
+
+def test_a_station_loads_parameters_and_mission_through_us_while_we_do(field, monkeypatch):
+    plane, heard = Aircraft(0.0, system=7), []
+    monkeypatch.setattr("gateway.pump.wall", lambda: field.now)
+    wanted = [
+        mav.MAVLink_mission_request_list_message(7, 1),
+        *(mav.MAVLink_mission_request_int_message(7, 1, k) for k in range(12)),
+    ]
+    asked = iter([ASK(7, 1), *wanted])
+    for step in range(600):
+        field.now += 0.02
+        if step % 10 == 0 and (question := next(asked, None)) is not None:
+            field.say(field.ground[0], "qgc", STATION.pack(question))
+        said = [plane.talker.heartbeat()] if step % 50 == 0 else []
+        for where, data in field.air[0].sent:
+            for message in Ears().feed(data) if where == "air7" else ():
+                said += plane.hear(bytes(message.get_msgbuf()), field.now)
+        field.air[0].sent.clear()
+        field.say(field.air[0], "air7", *said, *plane.stream())
+        if step % 5 == 0:
+            field.pump._tick(0.0)
+        heard += [message for where, data in field.ground[0].sent if where == "qgc" for message in Ears().feed(data)]
+        field.ground[0].sent.clear()
+    params = {message.param_id for message in heard if message.get_type() == "PARAM_VALUE"}
+    items = {message.seq for message in heard if message.get_type() == "MISSION_ITEM_INT"}
+    assert len(params) == 300 and items == set(range(12))
+    assert field.bus.ask(Mission, 7)[0][0].items == ITEMS
+    assert field.bus.ask(Params, 7)[0][0].complete
+
+
+def test_targets_are_read_off_every_message():
+    rng = np.random.default_rng(2)
+    for name, number in IDS.items():
+        kind = mav.mavlink_map[number]
+        payload = rng.bytes(kind.unpacker.size)[: max(1, int(rng.integers(kind.unpacker.size + 1)))]
+        message = _decoded(kind, payload)
+        if message is None:
+            continue
+        frames = Decoder().feed(_heard(kind, payload))
+        assert [int(t[0]) for t in targets(frames)] == [
+            getattr(message, field, 0) for field in ("target_system", "target_component")
+        ], name
+
+
+def _frame(kind, payload):
+    head = bytes([0xFD, len(payload), 0, 0, 0, 7, 1]) + kind.id.to_bytes(3, "little")
+    crc = mav.x25crc(head[1:] + payload + bytes([kind.crc_extra])).crc
+    return head + payload + crc.to_bytes(2, "little")
+
+
+def _heard(kind, payload):
+    return [(0.0, None, _frame(kind, payload))]
+
+
+def _decoded(kind, payload):
+    try:
+        return mav.MAVLink(None).decode(bytearray(_frame(kind, payload)))
+    except (mav.MAVError, ValueError):  # text that is no text
+        return None

@@ -1,0 +1,127 @@
+"""Who is a UAV, and whose: alarms for a second sender, a limit, foreign recordings, three kinds of link at once."""
+
+import itertools
+import lzma
+import os
+import pty
+import socket
+import threading
+import tty
+from pathlib import Path
+
+import pytest
+from conftest import unused_port
+from pymavlink.dialects.v20 import ardupilotmega as mav
+from talker import ARDU, PLANE, T0, Talker, of
+
+from fleet.bus import MemoryBus
+from fleet.contract import Account, Alert, AlertKind
+from fleet.telemetry.collision import QUIET_S
+from fleet.telemetry.decode import Decoder
+from fleet.telemetry.ids import Ids
+from fleet.telemetry.intake import Intake
+from gateway.links.opening import open_link
+from gateway.pump import Pump
+from gateway.spec import read_spec
+
+PATIENCE_S = 30.0
+
+
+def test_a_second_sender_raises_one_alarm_which_ends_when_it_is_silent():
+    intake, genuine, spoofer, told = Intake(), Talker(), Talker(), []
+    for step in range(400):
+        t = T0 + step * 0.1
+        intake.hear(t, genuine.heartbeat() if step % 10 == 0 else genuine.attitude(step * 0.1), ("10.0.0.2", 14550))
+        if 50 <= step < 200:
+            intake.hear(t, spoofer.attitude(900.0 + step), ("10.0.0.66", 999))
+        told += [(step, alert) for alert in of(Alert, intake.flush(t))]
+    (first, raised), (last, over) = told
+    assert (first, raised.kind, raised.active, raised.uav) == (50, AlertKind.SECOND_SENDER, True, 7)
+    assert "second sender (10.0.0.66:999)" in raised.sentence and "first (10.0.0.2:14550)" in raised.sentence
+    assert not over.active and last == pytest.approx(199 + 10 * QUIET_S, abs=2)
+    assert intake.refused == {"second sender for a live id": 150}
+
+
+def test_two_links_with_one_id_are_told_and_offsets_keep_them_apart():
+    for offset, uavs in ((0, [7]), (100, [7, 107])):
+        claims: dict = {}
+        one, two = Intake(0, claims), Intake(offset, claims)
+        one.hear(T0, Talker().heartbeat(), "a")
+        two.hear(T0 + 0.1, Talker().heartbeat(), "b")
+        news = one.flush(T0 + 0.2) + two.flush(T0 + 0.2)
+        assert sorted(claims) == uavs
+        assert bool(of(Alert, news)) is (offset == 0)
+
+
+def test_a_caller_that_took_its_leave_may_call_again_at_once():
+    intake, talker = Intake(), Talker()
+    intake.hear(T0, talker.heartbeat(), ("h", 1))
+    intake.part(("h", 1))
+    intake.hear(T0 + 0.2, talker.attitude(1.0), ("h", 2))
+    assert of(Alert, intake.flush(T0 + 0.3)) == []
+    assert (intake.crafts[7].source, intake.refused) == (("h", 2), {})
+
+
+def test_no_more_uavs_than_allowed_over_all_links():
+    claims: dict = {}
+    one, two = Intake(0, claims, most=3), Intake(1000, claims, most=3)
+    for intake in (one, two):
+        intake.hear(T0, b"".join(Talker(system).heartbeat() for system in (1, 2)), "a")
+        intake.flush(T0)
+    assert sorted(claims) == [1, 2, 1001]
+    assert two.refused == {"more than 3 aircraft; raise --most-uavs": 1}
+
+
+def test_no_message_but_an_aircraft_s_heartbeat_makes_a_uav():
+    everything = [_frame(kind) for kind in mav.mavlink_map.values() if kind.msgname != "HEARTBEAT"]
+    unknown = bytes([0xFD, 4, 0, 0, 0, 9, 1, 0xEE, 0xEE, 0x7F]) + bytes(6)
+    for system, kind in (
+        (20, mav.MAV_TYPE_GCS),
+        (21, mav.MAV_TYPE_ADSB),
+        (22, mav.MAV_TYPE_CAMERA),
+        (23, mav.MAV_TYPE_GIMBAL),
+    ):
+        everything.append(Talker(system).heartbeat(kind, mav.MAV_AUTOPILOT_INVALID))
+        everything.append(Talker(system, 100).heartbeat(kind, ARDU))
+    everything.append(Talker(24).heartbeat(PLANE, mav.MAV_AUTOPILOT_INVALID))
+    intake = Intake()
+    for frame in (*everything, unknown):
+        intake.hear(T0, frame, "a")
+        intake.flush(T0)
+    assert intake.crafts == {}
+    assert intake.decoder.counters()["messages"] == len(everything)
+
+
+def _frame(kind):
+    payload = bytes(kind.unpacker.size)
+    head = bytes([0xFD, len(payload), 0, 0, 0, 9, 1]) + kind.id.to_bytes(3, "little")
+    crc = mav.x25crc(head[1:] + payload + bytes([kind.crc_extra])).crc
+    return head + payload + crc.to_bytes(2, "little")
+
+
+# ---- recordings
+
+
+def heard(path: Path, size: int = 400_000) -> bytes:
+    """The MAVLink at the begin of a .tlog, stamps left out."""
+    opened = lzma.open if path.suffix == ".xz" else open
+    with opened(path, "rb") as file:
+        data = file.read(size)
+    frames = Decoder().feed([(T0, None, data)])
+    return b"".join(frames.buf[a:b].tobytes() for a, b in frames.at[:, :2].tolist())
+
+
+RECORDED = {
+    "real/cuav_quadplane_20161112.tlog": {1},
+    "real/alfa_20180718_155331_1_engine_failure.tlog": {1},
+    **{f"sitl/s{n:02d}_{name}.tlog.xz": {n + 1} for n, name in ((1, "nominal_calm"), (2, "nominal_light_wind"))},
+    "sitl/s10_multi3_nominal.tlog.xz": {21, 22, 23},
+}
+
+
+def test_every_recording_has_the_uavs_that_flew(recordings):
+    for name in sorted([*(recordings / "sitl").glob("*.tlog.xz"), *(recordings / "real").glob("*.tlog")]):
+        intake = Intake()
+        intake.hear(T0, heard(name), "a")
+        intake.flush(T0)
+        print(name.name, sorted(intake.crafts), dict(intake.refused))

@@ -1,0 +1,294 @@
+"""Every kind of link brings what was sent, answers, comes back after it was down, and counts what it loses."""
+
+import contextlib
+import os
+import pty
+import queue
+import socket
+import threading
+import tty
+
+import numpy as np
+import pytest
+from conftest import unused_port
+from talker import Talker
+
+from fleet.telemetry.ids import Ids
+from gateway.link import Batch
+from gateway.links import receive
+from gateway.links.opening import open_link
+from gateway.links.outbox import MOST, Outbox
+from gateway.sieve import read_sieve
+from gateway.spec import read_forward, read_spec
+
+PATIENCE_S = 20.0  # an upper bound; every wait ends with its condition
+HELLO, ANSWER = Talker().heartbeat(), Talker(255, 190).heartbeat(6, 8)
+
+
+class Line:
+    """A started link and what came through it."""
+
+    def __init__(self, text, room=0):
+        self.queue, self.stop = queue.Queue(room), threading.Event()
+        self.link = open_link(read_spec(text), Ids())
+        self.link.start(3, self.queue, self.stop)
+
+    def next(self) -> Batch:
+        batch = self.queue.get(timeout=PATIENCE_S)
+        assert batch.link == 3
+        return batch
+
+    def hear(self, size):
+        """Everything up to so many bytes: (sender, bytes) of the last piece, all bytes."""
+        told, sender = b"", None
+        while len(told) < size:
+            batch = self.next()
+            pieces = [] if batch.heard is None else list(batch.heard.pieces())
+            told += b"".join(data for _, _, data in pieces)
+            sender = pieces[-1][1] if pieces else sender
+        return sender, told
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.stop.set()
+        self.link.close()
+
+
+def udp(bound=True):
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.settimeout(PATIENCE_S)
+    if bound:
+        sock.bind(("127.0.0.1", 0))
+    return sock
+
+
+def test_udpin_answers_who_spoke():
+    with Line(f"udpin:127.0.0.1:{udp_port()}") as line, udp() as air:
+        air.sendto(HELLO, ("127.0.0.1", line.link.port))
+        sender, told = line.hear(len(HELLO))
+        assert (sender, told) == (air.getsockname(), HELLO)
+        line.link.send(sender, ANSWER)
+        assert air.recv(1000) == ANSWER
+
+
+def udp_port():
+    with udp() as sock:
+        return port_of(sock)
+
+
+def test_udpout_speaks_first_and_hears_only_the_far_end():
+    with udp() as air, udp() as stranger, Line(f"udpout:127.0.0.1:{port_of(air)}") as line:
+        assert until(lambda: line.link.greets) == (air.getsockname(),)
+        line.link.send(line.link.greets[0], ANSWER)
+        greeting, gateway = air.recvfrom(1000)
+        assert greeting == ANSWER
+        stranger.sendto(b"x" * 50, gateway)
+        air.sendto(HELLO, gateway)
+        assert line.hear(len(HELLO)) == (air.getsockname(), HELLO)
+
+
+def port_of(sock):
+    return sock.getsockname()[1]
+
+
+def until(condition):
+    """Wait for a condition, looking every few milliseconds."""
+    event, waited = threading.Event(), 0.0
+    while not (found := condition()):
+        event.wait(0.005)
+        waited += 0.005
+        assert waited < PATIENCE_S, "waited in vain"
+    return found
+
+
+def test_udpout_to_a_name_nobody_knows_yet_tries_again(monkeypatch):
+    tries, real = [], socket.getaddrinfo
+
+    def lookup(*given, **named):
+        tries.append(given)
+        if len(tries) < 2:
+            raise socket.gaierror(-2, "Name or service not known")
+        return real("127.0.0.1", *given[1:], **named)
+
+    monkeypatch.setattr(socket, "getaddrinfo", lookup)
+    with udp() as air, Line(f"udpout:plane.invalid:{port_of(air)}") as line:
+        line.link.send("anywhere", HELLO, 2)
+        line.link.send(until(lambda: line.link.greets)[0], ANSWER)
+        assert air.recv(1000) == ANSWER
+        assert (line.link.unsent, len(tries)) == (2, 2)
+
+
+def test_udpbcast_calls_all_and_hears_whoever_answers():
+    port = udp_port()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as air, Line(f"udpbcast:127.255.255.255:{port}") as line:
+        air.settimeout(PATIENCE_S)
+        air.bind(("", port))
+        line.link.send(until(lambda: line.link.greets)[0], ANSWER)
+        greeting, gateway = air.recvfrom(1000)
+        assert greeting == ANSWER
+        air.sendto(HELLO, ("127.0.0.1", gateway[1]))
+        sender, told = line.hear(len(HELLO))
+        assert told == HELLO
+        assert sender[1] == port
+
+
+def test_tcpin_has_many_callers_and_says_who_left():
+    with Line(f"tcpin:127.0.0.1:{unused_port()}") as line:
+        where = ("127.0.0.1", line.link.port)
+        with socket.create_connection(where, PATIENCE_S) as one, socket.create_connection(where, PATIENCE_S) as two:
+            until(lambda: len(line.link.greets) == 2)
+            one.sendall(HELLO[:7])
+            one.sendall(HELLO[7:])
+            sender, told = line.hear(len(HELLO))
+            assert (sender, told) == (one.getsockname(), HELLO)
+            line.link.send(two.getsockname(), ANSWER)
+            assert two.recv(1000) == ANSWER
+            left = one.getsockname()
+        assert {line.next().gone, line.next().gone} >= {left}
+        line.link.send(left, ANSWER, 5)
+        assert line.link.unsent == 5
+
+
+def test_tcp_calls_again_when_the_far_end_goes_and_counts_what_it_could_not_send():
+    port = unused_port()
+    with Line(f"tcp:127.0.0.1:{port}") as line:
+        (where,) = line.link.greets
+        line.link.send(where, ANSWER, 3)
+        assert line.link.unsent == 3
+        for _ in range(2):  # it comes, goes, and comes again
+            with socket.create_server(("127.0.0.1", port)) as server:
+                server.settimeout(PATIENCE_S)
+                with server.accept()[0] as air:
+                    air.sendall(HELLO)
+                    assert line.hear(len(HELLO)) == (where, HELLO)
+                    line.link.send(where, ANSWER)
+                    assert air.recv(1000) == ANSWER
+            until(lambda: line.link._stream is None)
+        line.link.send(where, ANSWER)
+        assert line.link.unsent == 4
+
+
+@contextlib.contextmanager
+def modem():
+    """The far end of a serial line, and the name of the near one."""
+    far, near = pty.openpty()
+    try:
+        tty.setraw(near)
+        yield far, os.ttyname(near)
+    finally:
+        os.close(far)
+        with contextlib.suppress(OSError):
+            os.close(near)
+
+
+def test_a_serial_line_is_read_written_and_missed():
+    with modem() as (far, name), Line(f"serial:{name}:57600") as line:
+        (where,) = line.link.greets
+        until(lambda: line.link._stream)
+        os.write(far, HELLO)
+        assert line.hear(len(HELLO)) == (where, HELLO)
+        line.link.send(where, ANSWER)
+        assert os.read(far, 1000) == ANSWER
+    with Line("serial:/dev/no-such-line") as line:
+        line.link.send(where, ANSWER)
+        assert line.link.unsent == 1
+
+
+def test_a_slow_stream_takes_whole_messages_or_none():
+    taken, room = bytearray(), [10]
+
+    def write(data):
+        n = min(room[0], len(data))
+        room[0] -= n
+        taken.extend(data[:n])
+        return n
+
+    box = Outbox(write)
+    frames = [Talker().attitude(k * 0.1) for k in range(2000)]
+    fits = sum(box.put(frame, 1) for frame in frames)
+    assert 0 < fits < 2000 and fits * len(frames[0]) <= MOST + 10
+    room[0] = 10**9
+    box.flush()
+    assert bytes(taken) == b"".join(frames)[: len(taken)] and len(taken) == fits * len(frames[0])
+    room[0] = 0
+    assert box.put(frames[0], 4) and box.close() == 4 and not box.put(frames[0], 1)
+
+
+# ---- datagrams
+
+
+@pytest.mark.parametrize("family", [socket.AF_INET, socket.AF_INET6])
+def test_many_datagrams_at_once_are_what_one_by_one_are(family):
+    rng, host = np.random.default_rng(3), "127.0.0.1" if family == socket.AF_INET else "::1"
+    sent = [rng.bytes(int(n)) for n in (*rng.integers(1, 300, 200), 0, 9000, 65_000)]
+    told = []
+    for kind in (receive.Bulk, receive.OneByOne):
+        with contextlib.ExitStack() as held:
+            far, *near = (held.enter_context(socket.socket(family, socket.SOCK_DGRAM)) for _ in range(3))
+            for sock in (far, *near):
+                sock.bind((host, 0))
+            reader = kind(far)
+            assert reader.take() is None
+            pieces = []
+            for i, data in enumerate(sent):
+                near[i % 2].sendto(data, far.getsockname())
+                if i % 50 == 49 or i >= 200:  # within what any system's buffer holds
+                    pieces += list(reader.take().pieces())
+            assert [data for _, _, data in pieces] == sent
+            assert [near[i % 2].getsockname() for i in range(len(sent))] == [sender for _, sender, _ in pieces]
+            told.append([data for _, _, data in pieces])
+    assert told[0] == told[1]
+
+
+def test_on_another_system_datagrams_come_one_by_one(monkeypatch):
+    monkeypatch.setattr(receive.sys, "platform", "darwin")
+    with udp() as sock:
+        assert isinstance(receive.receiver(sock), receive.OneByOne)
+
+
+def test_what_a_full_queue_cannot_take_is_counted():
+    with Line(f"udpin:127.0.0.1:{udp_port()}", room=1) as line, udp() as air:
+        for _ in range(50):
+            air.sendto(HELLO, ("127.0.0.1", line.link.port))
+        until(lambda: line.link.dropped + (line.queue.queue[0].heard.start.size if line.queue.queue else 0) == 50)
+
+
+# ---- arguments
+
+
+def test_links_are_read():
+    assert read_spec("tcp:10.0.0.1:5760")[1:4] == ("tcp", "10.0.0.1", 5760)
+    assert read_spec("serial:/dev/ttyUSB0:115200")[1:4] == ("serial", "/dev/ttyUSB0", 115_200)
+    assert read_spec("serial:/dev/serial/by-path/pci-0:1:1.0-port0")[2:4] == (
+        "/dev/serial/by-path/pci-0:1:1.0-port0",
+        57_600,
+    )
+    assert read_spec("udpin:[::1]:14550#sign=require&key=k")[2:4] == ("::1", 14550)
+    assert read_forward("udpin::14551#no-messages=RAW_IMU").sieve.rules
+
+
+@pytest.mark.parametrize("text", ["replay:a.tlog", "udpin:h:1#offset=2"])
+def test_a_forward_is_no_recording_and_has_no_offset(text):
+    with pytest.raises(ValueError, match=r"--forward: found .*, expected a link to a ground station"):
+        read_forward(text)
+
+
+def test_a_sieve_keeps_by_message_system_and_component():
+    at = np.zeros((6, 8), np.int64)
+    at[:, 4], at[:, 5], at[:, 6] = (0, 30, 30, 253, 30, 27), (1, 1, 2, 1, 3, 1), (1, 1, 1, 1, 1, 154)
+    assert read_sieve({}).keep(at).all()
+    for settings, kept in (
+        ({"messages": "ATTITUDE,0"}, [1, 1, 1, 0, 1, 0]),
+        ({"no-messages": "statustext"}, [1, 1, 1, 0, 1, 1]),
+        ({"systems": "2-3"}, [0, 0, 1, 0, 1, 0]),
+        ({"no-components": "154", "systems": "1"}, [1, 1, 0, 1, 0, 0]),
+    ):
+        assert read_sieve(dict(settings)).keep(at).tolist() == list(map(bool, kept))
+
+
+@pytest.mark.parametrize("settings", [{"messages": "ATITUDE"}, {"systems": "256"}, {"components": "5-2"}])
+def test_what_is_no_sieve_says_so(settings):
+    with pytest.raises(ValueError, match=r"found '.*', expected .*numbers up to"):
+        read_sieve(settings)
