@@ -1,11 +1,14 @@
-"""A link without a thread, for tests of what stands between links."""
+"""A link without a thread, for tests of what stands between links; and patience for those that have one."""
 
+import threading
 from collections import defaultdict
 
 from talker import Ears
 
 from gateway.link import Batch
 from gateway.spec import read_spec
+
+PATIENCE_S = 20.0  # an upper bound; every wait ends with its condition
 
 
 class FakeLink:
@@ -33,3 +36,13 @@ class FakeLink:
             names[where] += [message.get_type() for message in Ears().feed(data)]
         self.sent.clear()
         return dict(names)
+
+
+def until(condition):
+    """Wait for a condition, looking every few milliseconds."""
+    event, waited = threading.Event(), 0.0
+    while not (found := condition()):
+        event.wait(0.005)
+        waited += 0.005
+        assert waited < PATIENCE_S, "waited in vain"
+    return found

@@ -1,6 +1,6 @@
 """Who is a UAV, and whose: alarms for a second sender, a limit, foreign recordings, three kinds of link at once."""
 
-import itertools
+import json
 import lzma
 import os
 import pty
@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 from conftest import unused_port
+from fake_link import PATIENCE_S, until
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import ARDU, PLANE, T0, Talker, of
 
 from fleet.bus import MemoryBus
-from fleet.contract import Account, Alert, AlertKind
+from fleet.contract import Account, Alert, AlertKind, Status
 from fleet.telemetry.collision import QUIET_S
 from fleet.telemetry.decode import Decoder
 from fleet.telemetry.ids import Ids
@@ -23,8 +24,6 @@ from fleet.telemetry.intake import Intake
 from gateway.links.opening import open_link
 from gateway.pump import Pump
 from gateway.spec import read_spec
-
-PATIENCE_S = 30.0
 
 
 def test_a_second_sender_raises_one_alarm_which_ends_when_it_is_silent():
@@ -111,17 +110,54 @@ def heard(path: Path, size: int = 400_000) -> bytes:
     return b"".join(frames.buf[a:b].tobytes() for a, b in frames.at[:, :2].tolist())
 
 
-RECORDED = {
-    "real/cuav_quadplane_20161112.tlog": {1},
-    "real/alfa_20180718_155331_1_engine_failure.tlog": {1},
-    **{f"sitl/s{n:02d}_{name}.tlog.xz": {n + 1} for n, name in ((1, "nominal_calm"), (2, "nominal_light_wind"))},
-    "sitl/s10_multi3_nominal.tlog.xz": {21, 22, 23},
-}
+SWARM = ("sitl/s10_multi3_nominal.tlog.xz", "real/cuav_quadplane_20161112.tlog", "sitl/s09_quadplane_nominal.tlog.xz")
 
 
 def test_every_recording_has_the_uavs_that_flew(recordings):
-    for name in sorted([*(recordings / "sitl").glob("*.tlog.xz"), *(recordings / "real").glob("*.tlog")]):
+    flights = json.loads((recordings / "sitl" / "manifest.json").read_text())["flights"]
+    flown = {f"sitl/{one['name']}.tlog.xz": {v["sysid"] for v in one["vehicles"]} for one in flights}
+    flown |= {"real/cuav_quadplane_20161112.tlog": {2}, "real/alfa_20180718_155331_1_engine_failure.tlog": {1}}
+    assert len(flown) == 12
+    for name, systems in flown.items():
         intake = Intake()
-        intake.hear(T0, heard(name), "a")
-        intake.flush(T0)
-        print(name.name, sorted(intake.crafts), dict(intake.refused))
+        intake.hear(T0, heard(recordings / name), "a")
+        assert {status.uav for status in of(Status, intake.flush(T0))} == systems, name
+
+
+def test_a_mixed_swarm_over_three_kinds_of_link_has_the_right_uavs(recordings):
+    """Three flight-stack aircraft by UDP, a real quadplane by TCP, a simulated one by a serial line, all at once."""
+    told = [heard(recordings / name, 100_000) for name in SWARM]
+    far, near = pty.openpty()
+    tty.setraw(near)
+    texts = ("udpin:127.0.0.1:{}", "tcpin:127.0.0.1:{}", f"serial:{os.ttyname(near)}#offset=100")
+    links = [open_link(read_spec(text.format(unused_port())), Ids()) for text in texts]
+    bus, stop, done = MemoryBus(), threading.Event(), threading.Event()
+    accounts: list[Account] = []
+
+    def hear(account, _):
+        accounts.append(account)
+        if len(account.uavs) == 5 and account.bytes_in == sum(map(len, told)):
+            done.set()
+
+    bus.subscribe(Account, hear)
+    pump = threading.Thread(target=Pump(links, bus, listen_only=True).run, args=(stop,))
+    pump.start()
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+            for start in range(0, len(told[0]), 1000):
+                udp.sendto(told[0][start : start + 1000], ("127.0.0.1", links[0].port))
+            with socket.create_connection(("127.0.0.1", links[1].port)) as tcp:
+                tcp.sendall(told[1])
+                until(lambda: links[2]._stream)  # what lies there before it is opened is not for us
+                line = memoryview(told[2])
+                while line:
+                    line = line[os.write(far, line) :]
+                assert done.wait(PATIENCE_S), accounts[-1]
+    finally:
+        stop.set()
+        pump.join(PATIENCE_S)
+        os.close(far)
+        os.close(near)
+    assert accounts[-1].uavs == (2, 21, 22, 23, 109)
+    assert (accounts[-1].bad_bytes, accounts[-1].bad_frames) == (0, 0)
+    assert accounts[-1].messages == sum(len(Decoder().feed([(T0, None, data)]).at) for data in told)

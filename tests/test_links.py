@@ -11,6 +11,7 @@ import tty
 import numpy as np
 import pytest
 from conftest import unused_port
+from fake_link import PATIENCE_S, until
 from talker import Talker
 
 from fleet.telemetry.ids import Ids
@@ -21,7 +22,6 @@ from gateway.links.outbox import MOST, Outbox
 from gateway.sieve import read_sieve
 from gateway.spec import read_forward, read_spec
 
-PATIENCE_S = 20.0  # an upper bound; every wait ends with its condition
 HELLO, ANSWER = Talker().heartbeat(), Talker(255, 190).heartbeat(6, 8)
 
 
@@ -91,16 +91,6 @@ def test_udpout_speaks_first_and_hears_only_the_far_end():
 
 def port_of(sock):
     return sock.getsockname()[1]
-
-
-def until(condition):
-    """Wait for a condition, looking every few milliseconds."""
-    event, waited = threading.Event(), 0.0
-    while not (found := condition()):
-        event.wait(0.005)
-        waited += 0.005
-        assert waited < PATIENCE_S, "waited in vain"
-    return found
 
 
 def test_udpout_to_a_name_nobody_knows_yet_tries_again(monkeypatch):
