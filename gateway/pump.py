@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import msgspec
 
 from fleet.bus import Bus
+from fleet.codec import Wire
 from fleet.contract import Message
 from fleet.telemetry.craft import Craft
 from fleet.telemetry.intake import MOST_UAVS, SINGLE, Intake
@@ -129,7 +130,9 @@ class Pump:
         self._pass_on()
         for number in self._live:
             intake, link, gate, now = self.intakes[number], self.links[number], self._gates[number], wall()
-            self.publisher.publish(intake.flush(now))
+            news = intake.pack(now)
+            self.publisher.put([one for one in news if isinstance(one, Wire)])
+            self.publisher.publish([one for one in news if not isinstance(one, Wire)])
             if not self._listen_only:
                 for where, data in self._onboards[number].tick(now, intake.crafts.values(), link.greets):
                     link.send(where, gate.sign(data))

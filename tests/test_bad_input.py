@@ -10,8 +10,8 @@ from talker import T0, Talker, of
 
 from fleet.contract import MAX_ITEMS, Mission, Params, Sample, Status
 from fleet.telemetry.decode import MOST_SENDERS
+from fleet.telemetry.flock.pack import MOST_ROWS
 from fleet.telemetry.intake import Intake
-from fleet.telemetry.shelf import MOST_ROWS
 
 DO_JUMP, LAND = 177, 21
 NAN = math.nan

@@ -1,60 +1,89 @@
-"""A batch of MAVLink frames through THE TABLE: all frames of one message at once, then to each aircraft its rows."""
+"""A batch of MAVLink frames through THE TABLE: all frames of one message at once, for all aircraft at once."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from fleet.contract import COLUMNS
-from fleet.telemetry.craft import Craft, Laid
-from fleet.telemetry.decode import IDS, Fields, Frames
+from fleet.telemetry.craft import Craft
+from fleet.telemetry.decode import Dealt, Fields, Frames
 from fleet.telemetry.dialects.mavlink import TABLE, own_seconds
 from fleet.telemetry.dialects.row import Row, believable
-from fleet.telemetry.scan import ID
+from fleet.telemetry.flock.flock import Flock, Laid
+from fleet.telemetry.flock.rows import WIDEST
+from fleet.telemetry.settle import FIELDS, NO_FIELD
 
-_WIDEST = max(map(len, COLUMNS.values()))
+_TICK = np.array([row.tick for row in TABLE])
+_FIELD = np.array([FIELDS.index(row.field) for row in TABLE])
+_RANK = np.array([row.rank for row in TABLE])
+_GIVEN = np.array([FIELDS.index(row.given) if row.given else NO_FIELD for row in TABLE])
 
 
-def lay(frames: Frames, owner: np.ndarray, crafts: Sequence[Craft]) -> None:
+def lay(frames: Frames, owner: np.ndarray, crafts: Sequence[Craft], flock: Flock) -> None:
     """Give every aircraft its rows.
 
     Args:
         frames: what was heard
         owner: number in `crafts` of each frame's aircraft, -1 for nobody's, (n,)
         crafts: the aircraft on this link
+        flock: what is remembered of them
     """
-    heard = [(number, *found) for number, row in enumerate(TABLE) if (found := _rows(row, frames, owner, crafts))]
-    which = np.concatenate([found[1] for found in heard]) if heard else np.empty(0, int)
-    if not len(which):
+    dealt, said = Dealt(frames), Said(frames, owner, crafts)
+    names = set(dealt.names())
+    rows = ((number, row) for number, row in enumerate(TABLE) if row.message in names)
+    heard = [(number, *found) for number, row in rows if (found := said.rows(row, *dealt.fields(row.message)))]
+    if not heard:
         return
-    number = np.concatenate([np.full(len(found[1]), found[0]) for found in heard])
-    raw_s, values = (np.concatenate([found[k] for found in heard]) for k in (2, 3))
-    order = np.lexsort((number, which, owner[which]))
-    mine = owner[which[order]]
-    for part in np.split(order, np.flatnonzero(np.diff(mine)) + 1):
-        laid = Laid(frames.arrival[which[part]], number[part], raw_s[part], values[part], TABLE)
-        crafts[owner[which[part[0]]]].lay(laid)
+    which, raw_s, values = (np.concatenate([found[k] for found in heard]) for k in (1, 2, 3))
+    order = np.argsort(which, kind="stable")
+    number, which = np.repeat([found[0] for found in heard], [len(found[1]) for found in heard])[order], which[order]
+    codes = (_TICK[number], _FIELD[number], _RANK[number], _GIVEN[number])
+    judged = flock.judge(Laid(owner[which], frames.arrival[which], raw_s[order], values[order], *codes))
+    for k in np.flatnonzero(~np.isnan(judged.jumped)).tolist():
+        crafts[k].jumped(float(judged.jumped[k]))
+    for k in np.flatnonzero(judged.refused).tolist():
+        crafts[k].doubted(float(judged.newest[k]), int(judged.refused[k]))
 
 
-def _rows(
-    row: Row, frames: Frames, owner: np.ndarray, crafts: Sequence[Craft]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Read one row of the table off every frame it fits: frame numbers (n,), own times (n,) [s], values (n, 8)."""
-    which = np.flatnonzero((frames.at[:, ID] == IDS[row.message]) & (owner >= 0))
-    if row.autopilots and len(which):
-        fits = np.array([craft.autopilot in row.autopilots for craft in crafts])
-        which = which[fits[owner[which]]]
-    if not len(which):
-        return None
-    fields = frames.fields(which, row.message)
-    if row.when is not None:
-        meant = row.when(fields)
-        which, fields = which[meant], Fields(fields.rows[meant])
-    values = np.zeros((len(which), _WIDEST))
-    with np.errstate(all="ignore"):  # not a number in, not a number out: refused below
-        for k, column in enumerate(row.columns(fields)):
-            values[:, k] = column
-        good = believable(row.field, values[:, : len(COLUMNS[row.field])])
-    for number in np.unique(owner[which[~good]]).tolist():
-        mine = which[~good][owner[which[~good]] == number]
-        crafts[number].queue(float(frames.arrival[mine[-1]]), crafts[number].refuse, row.message, len(mine))
-    return which[good], np.broadcast_to(own_seconds(row, fields), len(which))[good], values[good]
+class Said:
+    """What a batch of frames says, by the rows of the table."""
+
+    def __init__(self, frames: Frames, owner: np.ndarray, crafts: Sequence[Craft]) -> None:
+        self._frames, self._owner, self._crafts = frames, owner, crafts
+        self._autopilot = np.array([craft.autopilot for craft in crafts])
+
+    def rows(self, row: Row, which: np.ndarray, fields: Fields) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Read one row of the table: frame numbers (n,), own times (n,) [s], values (n, 8); None where there is none.
+
+        Args:
+            row: of the table
+            which: numbers of the frames of its message, (m,)
+            fields: of those frames
+        """
+        meant = self._owner[which] >= 0
+        if row.autopilots and meant.any():
+            meant[meant] = np.isin(self._autopilot, row.autopilots)[self._owner[which[meant]]]
+        if row.when is not None:
+            with np.errstate(all="ignore"):
+                meant &= row.when(fields)
+        if not meant.all():
+            which, fields = which[meant], Fields(fields.rows[meant])
+        if not len(which):
+            return None
+        values = np.zeros((len(which), WIDEST))
+        with np.errstate(all="ignore"):  # not a number in, not a number out: refused below
+            for k, column in enumerate(row.columns(fields)):
+                values[:, k] = column
+            good = believable(row.field, values[:, : len(COLUMNS[row.field])])
+        raw_s = np.broadcast_to(own_seconds(row, fields), len(which))
+        if good.all():
+            return which, raw_s, values
+        self._refuse(row.message, which[~good])
+        return which[good], raw_s[good], values[good]
+
+    def _refuse(self, message: str, which: np.ndarray) -> None:
+        """Tell aircraft that frames of theirs hold what cannot be."""
+        owner = self._owner[which]
+        for number in np.unique(owner).tolist():
+            mine, craft = which[owner == number], self._crafts[number]
+            craft.queue(float(self._frames.arrival[mine[-1]]), craft.refuse, message, len(mine))

@@ -28,10 +28,6 @@ class Frames(NamedTuple):
     sender: np.ndarray  # number of the sender in `senders`, (n,)
     senders: tuple[Hashable, ...] = (None,)
 
-    def names(self, which: np.ndarray) -> list[str]:
-        """Give the MAVLink names of frames `which`."""
-        return [_NAMES[number] for number in self.at[which, s.ID].tolist()]
-
     def message(self, i: int) -> Any | None:
         """Give frame `i` as pymavlink would; None where it cannot be one, e.g. text that is no text."""
         frame = bytearray(self.buf[self.at[i, s.START] : self.at[i, s.STOP]].tobytes())
@@ -108,6 +104,15 @@ _KINDS = np.zeros(len(s.EXTRA), np.int64)
 _KINDS[[IDS[name] for name in _ORDER]] = list(_ORDER.values())
 _LAYOUTS = [layout(name) for name in _ORDER]
 _WIDTHS = np.array([kind.itemsize for kind in _LAYOUTS])
+
+
+KINDS = tuple(_ORDER)
+"""Names of all messages known here, by number."""
+
+
+def kinds(frames: Frames) -> np.ndarray:
+    """Number the frames' messages as `KINDS` does, (n,)."""
+    return _KINDS[frames.at[:, s.ID]]
 
 
 class Dealt:

@@ -7,15 +7,18 @@ from typing import Any
 
 import numpy as np
 
+from fleet.codec import Wire
 from fleet.contract import Alert, Mission, Params, Sample, Status
 from fleet.telemetry.batch import lay
 from fleet.telemetry.collision import Collision
 from fleet.telemetry.craft import LOST_S, Craft
-from fleet.telemetry.decode import IDS, Decoder, Frames, joined
+from fleet.telemetry.decode import IDS, KINDS, Decoder, Frames, joined, kinds
+from fleet.telemetry.flock.counts import HEARD
+from fleet.telemetry.flock.flock import Flock
 from fleet.telemetry.heard import Heard, merged
 from fleet.telemetry.heartbeat import is_aircraft
 from fleet.telemetry.route import MESSAGES
-from fleet.telemetry.scan import COMPONENT, EXTRA, ID, SEQ, SYSTEM
+from fleet.telemetry.scan import COMPONENT, EXTRA, ID, PAYLOAD, SEQ, SIZE, SYSTEM
 
 MOST_UAVS = 2_000  # over all links
 SECOND = "second sender for a live id"
@@ -27,6 +30,9 @@ EARLY = MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # said once, so worth keepi
 SINGLE = np.zeros(len(EXTRA), bool)  # by message id: heard one by one; all others are rows, or only counted
 SINGLE[[IDS[name] for name in (*EARLY, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
 SINGLE[IDS["MISSION_CURRENT"]] = True  # a row too
+OFTEN = np.zeros(len(EXTRA), bool)  # of those: said again and again, and mostly the same
+OFTEN[[IDS["HEARTBEAT"], IDS["MISSION_CURRENT"]]] = True
+MOST_OFTEN = 4096  # messages of that kind remembered
 Claims = dict[int, Craft]
 """Which aircraft holds a UAV id, over all links of a gateway."""
 Admit = Callable[[Frames, Counter[str]], Frames]
@@ -50,7 +56,10 @@ class Intake:
         self.refused: Counter[str] = Counter()  # good frames refused, by reason
         self.crafts: dict[int, Craft] = {}  # by MAVLink system id
         self.decoder = Decoder()
+        self.flock = Flock(KINDS)
         self._claims: Claims = {} if claims is None else claims
+        self._speakers = np.full(1 << 16, -1)  # number of the aircraft by system and component
+        self._often: dict[tuple[Any, ...], Any] = {}
         self._most, self._admit = most, admit
         self._heard: list[Heard] = []
         self._sorted: list[Frames] = []  # admitted, not yet digested
@@ -75,9 +84,13 @@ class Intake:
 
     def flush(self, now: float) -> list[News]:
         """Hand over what is new; `now` is fleet time [s since 1970]."""
+        return unpacked(self.pack(now))
+
+    def pack(self, now: float) -> list[News | Wire]:
+        """Hand over what is new, samples packed as they go out; `now` is fleet time [s since 1970]."""
         self.sort()
         self._digest_sorted()
-        return self.take(now)
+        return self._take(now)
 
     def sort(self) -> Frames | None:
         """Find the frames in what was heard since the last time and give those admitted; None where there are none."""
@@ -107,29 +120,64 @@ class Intake:
 
     def take(self, now: float) -> list[News]:
         """Hand over what had arrived up to `now` of what was digested; `now` is fleet time [s since 1970]."""
-        mine = [craft for craft in self.crafts.values() if self._claims.get(craft.uav) is craft]
-        alarms = [alert for one in self._collisions.values() for alert in one.take(now)]
-        return [*alarms, *(news for craft in mine for news in craft.take(now))]
+        return unpacked(self._take(now))
+
+    def _take(self, now: float) -> list[News | Wire]:
+        news: list[News | Wire] = [alert for one in self._collisions.values() for alert in one.take(now)]
+        samples = self.flock.take(now)
+        for craft in self.crafts.values():
+            if self._claims.get(craft.uav) is craft:
+                if craft.number in samples:
+                    news.append(samples[craft.number])
+                news += craft.take(now)
+        return news
 
     def digest(self, frames: Frames) -> None:
         """Work through a batch of frames; what they say is handed over by `take`."""
         if not len(frames.at):
             return
         for i in np.flatnonzero(SINGLE[frames.at[:, ID]]).tolist():
-            message = frames.message(i)
+            message = self._single(frames, i)
             if message is not None:
                 self._route(i, float(frames.arrival[i]), message, frames.senders[frames.sender[i]])
-        owner = np.full(len(frames.at), -1)
+        owner = self._owners(frames)
+        self._born.clear()
+        mine = np.flatnonzero(owner >= 0)
+        if len(mine):
+            self.flock.counts.note(owner[mine], kinds(frames)[mine], frames.arrival[mine], frames.at[mine, SEQ])
+            lay(frames, owner, list(self.crafts.values()), self.flock)
+
+    def _single(self, frames: Frames, i: int) -> Any | None:
+        """Give frame `i` as pymavlink would; what is said over and over is read once."""
+        payload, size, number = frames.at[i, [PAYLOAD, SIZE, ID]].tolist()
+        if not OFTEN[number]:
+            return frames.message(i)
+        said = (*frames.at[i, [SYSTEM, COMPONENT]].tolist(), number, frames.buf[payload : payload + size].tobytes())
+        if said not in self._often:
+            if len(self._often) >= MOST_OFTEN:
+                self._often.clear()
+            self._often[said] = frames.message(i)
+        return self._often[said]
+
+    def _owners(self, frames: Frames) -> np.ndarray:
+        """Tell whose each frame is: number of the aircraft, -1: nobody's, (n,)."""
         crafts = list(self.crafts.values())
-        for which in _by_speaker(frames):
+        number = {sender: k for k, sender in enumerate(frames.senders)}
+        rightful = [self._claims.get(craft.uav, craft) is craft for craft in crafts]
+        pairs = zip(crafts, rightful, strict=True)
+        expected = np.array([number.get(craft.source, -1) if holds else -1 for craft, holds in pairs] + [-1])
+        owner = self._speakers[(frames.at[:, SYSTEM] << 8) + frames.at[:, COMPONENT]]
+        owner[(owner >= 0) & (expected[owner] != frames.sender)] = -1
+        heard, known = self.flock.counts.state, np.flatnonzero(owner >= 0)
+        heard[owner[known], HEARD] = frames.arrival[known]
+        for which in _by_speaker(frames, np.flatnonzero(owner < 0)):
             craft = self._speaker(frames, which)
             if craft is not None:
-                which = which[which >= self._born.get(craft.system, 0)]
-                if len(which):
-                    craft.note(frames.arrival[which], frames.names(which), frames.at[which, SEQ])
-                    owner[which] = crafts.index(craft)
-        self._born.clear()
-        lay(frames, owner, crafts)
+                owner[which] = craft.number
+                heard[craft.number, HEARD] = frames.arrival[which[-1]]
+        for system, i in self._born.items():
+            owner[:i][frames.at[:i, SYSTEM] == system] = -1
+        return owner
 
     def counters(self) -> Counter[str]:
         """Give messages, bad_bytes and bad_frames over all senders."""
@@ -171,8 +219,9 @@ class Intake:
             self._alarm(holder, arrival, source)
         else:
             self._rivals.discard(system)
-            craft = Craft(uav, system, message.get_srcComponent(), source)
+            craft = Craft(self.flock, uav, system, message.get_srcComponent(), source)
             self.crafts[system] = self._claims[uav] = craft
+            self._speakers[(system << 8) + craft.component] = craft.number
             self._born[system] = i
             craft.meet(message)
             for early_arrival, early in self._early.pop(system, ()):
@@ -222,8 +271,16 @@ class Intake:
             self.refused[NOT_YET] += 1
 
 
-def _by_speaker(frames: Frames) -> list[np.ndarray]:
+def unpacked(news: list[News | Wire]) -> list[News]:
+    """Give what was packed as messages again."""
+    return [one.message() if isinstance(one, Wire) else one for one in news]
+
+
+def _by_speaker(frames: Frames, which: np.ndarray) -> list[np.ndarray]:
     """Sort frames by sender, system and component: the numbers of each one's frames, in order."""
-    key = (frames.sender << 16) + (frames.at[:, SYSTEM] << 8) + frames.at[:, COMPONENT]
+    if not len(which):
+        return []
+    at = frames.at[which]
+    key = (frames.sender[which] << 16) + (at[:, SYSTEM] << 8) + at[:, COMPONENT]
     order = np.argsort(key, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(key[order])) + 1)
+    return np.split(which[order], np.flatnonzero(np.diff(key[order])) + 1)

@@ -1,10 +1,12 @@
 """An onboard log as news of its aircraft, in the same steps as a telemetry recording."""
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from fleet.telemetry.craft import Craft
+from fleet.telemetry.flock.flock import Flock
 from fleet.telemetry.intake import News
 from fleet.telemetry.onboard_log import Chunk, OnboardLog
 from fleet.telemetry.steps import Steps
@@ -15,7 +17,7 @@ UNDATED_S = 946_684_800.0  # 2000-01-01, where a log never heard of the date [s 
 
 def craft_of(log: OnboardLog, offset: int) -> Craft:
     """Make the aircraft that wrote this log; UAV id = its MAVLink system id + `offset`."""
-    craft = Craft(log.system + offset, log.system, 1)
+    craft = Craft(Flock(), log.system + offset, log.system, 1)
     craft.autopilot, craft.vehicle, craft.firmware = log.autopilot, log.vehicle, log.firmware
     return craft
 
@@ -23,7 +25,7 @@ def craft_of(log: OnboardLog, offset: int) -> Craft:
 def log_steps(log: OnboardLog, craft: Craft) -> Iterator[tuple[float, list[News]]]:
     """Read a log in steps of 0.1 s: (end of the step [s since 1970], news)."""
     epoch_s = UNDATED_S if log.epoch_s is None else log.epoch_s
-    steps = Steps(craft.take)
+    steps = Steps(partial(_take, craft))
     newest: dict[str, float] = {}
     leg: np.ndarray | None = None  # the mission item in force, (1,)
     for chunk in log.chunks():
@@ -33,6 +35,12 @@ def log_steps(log: OnboardLog, craft: Craft) -> Iterator[tuple[float, list[News]
             _digest(chunk, craft, epoch_s, newest)
             yield from steps.upto(np.sort(np.array(times)) + epoch_s)
     yield from steps.last()
+
+
+def _take(craft: Craft, now: float) -> list[News]:
+    """Hand over what was heard up to `now` [s since 1970]."""
+    samples = [wire.message() for wire in craft.flock.take(now).values()]
+    return [*samples, *craft.take(now)]
 
 
 def _leg_said_again(chunk: Chunk, leg: np.ndarray | None) -> tuple[Chunk, np.ndarray | None]:
@@ -66,7 +74,7 @@ def _digest(chunk: Chunk, craft: Craft, epoch_s: float, newest: dict[str, float]
         fresh = t > newest.get(field, -np.inf)
         if fresh.any():
             newest[field] = float(t[-1])
-            craft.shelf.lay(field, t[fresh] + epoch_s, t[fresh] + epoch_s, x[fresh])
+            craft.flock.lay(craft.number, field, t[fresh] + epoch_s, x[fresh])
     for said in chunk.said:
         craft.queue(said.t + epoch_s, craft.told, said)
 
@@ -81,4 +89,6 @@ def _note(chunk: Chunk, craft: Craft, epoch_s: float) -> None:
     if len(arrival):
         names = np.repeat(np.array(list(times)), [len(t) for t in times.values()])
         order = np.argsort(arrival, kind="stable")
-        craft.note(arrival[order] + epoch_s, names[order].tolist())
+        counts = craft.flock.counts
+        kinds = counts.numbers(names[order].tolist())
+        counts.note(np.full(len(order), craft.number), kinds, arrival[order] + epoch_s, None)

@@ -1,4 +1,4 @@
-"""The compiled judge of one aircraft's rows: each gets its fleet time; late, repeated and second-best ones go."""
+"""The compiled judge of aircraft's rows: each gets its fleet time; late, repeated and second-best ones go."""
 
 from math import inf, isnan
 
@@ -18,42 +18,43 @@ NO_FIELD = -1
 KEPT, PASSED_OVER, REFUSED = range(3)
 
 
-class Memory:
-    """What has to be remembered of one aircraft between two batches."""
-
-    def __init__(self) -> None:
-        self.clocks = c.new_clocks()
-        self.fields = np.tile([-inf] * (1 + RANKS) + [inf] * RANKS, (len(FIELDS), 1))
+def new_memory() -> np.ndarray:
+    """Make what has to be remembered of one aircraft between two batches, (fields, EVERY + RANKS)."""
+    return np.tile([-inf] * (1 + RANKS) + [inf] * RANKS, (len(FIELDS), 1))
 
 
-@nb.njit(cache=True)
-def settle(clocks, fields, ticks, raw_s, arrival, field, rank, given, t, fate):
+@nb.njit(cache=True, nogil=True)
+def settle(clocks, memory, owner, ticks, raw_s, arrival, field, rank, given, t, fate, jumped):
     """Judge rows in the order they were heard.
 
     Args:
-        clocks, fields: of the aircraft's `Memory`, changed in place
+        clocks, memory: of all aircraft, changed in place, (m, 3, LENGTH) and (m, fields, EVERY + RANKS)
+        owner: number of the aircraft, (n,)
         ticks: clock each time comes from, (n,)
         raw_s: own times [s], arrival: fleet times [s since 1970], (n,)
         field: numbers in `FIELDS`, rank: of the source, (n,)
         given: number in `FIELDS` of what must flow for the row to count, or NO_FIELD, (n,)
         t: filled with fleet times, nan while a jump is suspected [s since 1970]
         fate: filled with KEPT, PASSED_OVER or REFUSED
-    Returns:
-        index after the last row at which a jump of the clock was noticed, 0 for none
+        jumped: arrival of the last row at which a jump of the clock was noticed, by aircraft, (m,) [s since 1970]
     """
-    jumped = 0
-    known = clocks[:, c.JUMPS].max()
     for i in range(len(t)):
-        t[i] = c.tell(clocks, ticks[i], raw_s[i], arrival[i])
-        if clocks[:, c.JUMPS].max() != known:
-            known, jumped = clocks[:, c.JUMPS].max(), i + 1
+        mine, fields = clocks[owner[i]], memory[owner[i]]
+        known = _jumps(mine)
+        t[i] = c.tell(mine, ticks[i], raw_s[i], arrival[i])
+        if _jumps(mine) != known:
+            jumped[owner[i]] = arrival[i]
         if isnan(t[i]):
             fate[i] = REFUSED
         elif given[i] != NO_FIELD and t[i] > fields[given[i], LAST] + YIELD_S:
             fate[i] = PASSED_OVER
         else:
             fate[i] = _judge(fields[field[i]], rank[i], t[i], ticks[i] == c.NONE)
-    return jumped
+
+
+@nb.njit(cache=True, nogil=True)
+def _jumps(clocks):
+    return max(clocks[c.BOOT, c.JUMPS], clocks[c.USEC, c.JUMPS], clocks[c.USEC32, c.JUMPS])
 
 
 @nb.njit(cache=True)

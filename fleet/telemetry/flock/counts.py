@@ -1,0 +1,94 @@
+"""Messages of many aircraft, counted as far as time has come: how many of each kind, how many missed. Compiled."""
+
+from collections.abc import Sequence
+
+import numba as nb
+import numpy as np
+
+NOBODY = -1.0  # sequence number before any message
+
+HEARD, SPOKE, RECEIVED, MISSED, MISSING, SEQ, COLUMNS = range(7)
+"""Per aircraft: arrival of the newest message; of the newest counted; messages counted; missed up to there; missed up
+to the newest; its sequence number."""
+
+
+class Counts:
+    """Counters of many aircraft.
+
+    Args:
+        names: of the kinds of messages
+    """
+
+    def __init__(self, names: Sequence[str] = ()) -> None:
+        self.state = np.empty((0, COLUMNS))  # a row per aircraft
+        self._kinds = np.empty((0, len(names)), np.int64)  # since the last `measured`
+        self._number = {name: k for k, name in enumerate(names)}
+        self._waiting = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0))
+
+    def add(self) -> None:
+        """Make room for one more aircraft."""
+        new = np.array([[-np.inf, -np.inf, 0.0, 0.0, 0.0, NOBODY]])
+        self.state = np.concatenate([self.state, new])
+        self._kinds = np.concatenate([self._kinds, np.zeros((1, len(self._number)), np.int64)])
+
+    def numbers(self, names: Sequence[str]) -> np.ndarray:
+        """Number kinds by name, new ones too, (n,)."""
+        found = np.array([self._number.setdefault(name, len(self._number)) for name in names], np.int64)
+        more = len(self._number) - self._kinds.shape[1]
+        self._kinds = np.pad(self._kinds, ((0, 0), (0, more)))
+        return found
+
+    def note(self, owner: np.ndarray, kind: np.ndarray, arrival: np.ndarray, seq: np.ndarray | None) -> None:
+        """Take note of messages in the order they came.
+
+        Args:
+            owner: number of the aircraft, (n,)
+            kind: number of the name, (n,)
+            arrival: fleet times, never falling, (n,) [s since 1970]
+            seq: sequence numbers, (n,); None where there are none, so that none can be missed
+        """
+        missing = np.empty(len(owner))
+        _gaps(self.state, owner, arrival, np.empty(0, np.int64) if seq is None else seq, missing)
+        new = owner, kind, arrival, missing
+        self._waiting = tuple(map(np.concatenate, zip(self._waiting, new, strict=True)))  # type: ignore[assignment]
+
+    def upto(self, now: float) -> None:
+        """Count what had arrived up to `now` [s since 1970]."""
+        if len(self._waiting[0]) and (done := _count(self.state, self._kinds, *self._waiting, now)):
+            self._waiting = tuple(one[done:] for one in self._waiting)  # type: ignore[assignment]
+
+    def measured(self, number: int) -> dict[str, int]:
+        """Give how many messages of each kind were counted since this was last asked for one aircraft."""
+        row = self._kinds[number]
+        found = np.flatnonzero(row)
+        names = list(self._number) if len(found) else []
+        counts = {names[k]: n for k, n in zip(found.tolist(), row[found].tolist(), strict=True)}
+        row[found] = 0
+        return counts
+
+
+@nb.njit(cache=True, nogil=True)
+def _gaps(state, owner, arrival, seq, missing):
+    """Fill `missing` with the messages missed up to each one."""
+    for i in range(len(owner)):
+        mine = state[owner[i]]
+        if len(seq):
+            gap = (seq[i] - nb.int64(mine[SEQ]) - 1) & 0xFF if mine[SEQ] >= 0 else 0
+            if gap < 128:  # else a late message, not a loss
+                mine[MISSING] += gap
+            mine[SEQ] = seq[i]
+        mine[HEARD] = arrival[i]
+        missing[i] = mine[MISSING]
+
+
+@nb.njit(cache=True, nogil=True)
+def _count(state, kinds, owner, kind, arrival, missing, now):
+    """Count messages up to `now`; gives how many."""
+    i = 0
+    while i < len(owner) and arrival[i] <= now:
+        mine = state[owner[i]]
+        mine[RECEIVED] += 1
+        mine[SPOKE], mine[MISSED] = arrival[i], missing[i]
+        kinds[owner[i], kind[i]] += 1
+        i += 1
+    return i
