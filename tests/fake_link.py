@@ -46,3 +46,11 @@ def until(condition):
         waited += 0.005
         assert waited < PATIENCE_S, "waited in vain"
     return found
+
+
+def pieces(heard) -> list:
+    """Give what was heard piece by piece: arrival, sender, bytes."""
+    cut = zip(heard.start.tolist(), heard.stop.tolist(), strict=True)
+    return [
+        (heard.arrival[i], heard.senders[heard.sender[i]], heard.buf[a:b].tobytes()) for i, (a, b) in enumerate(cut)
+    ]

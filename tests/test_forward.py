@@ -5,12 +5,13 @@ import time
 import numpy as np
 import pytest
 from fake_link import FakeLink
+from oracle import framed, ours
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import ITEMS, Aircraft, Ears, Talker
 
 from fleet.bus import MemoryBus
 from fleet.contract import Alert, Mission, Params
-from fleet.telemetry.decode import IDS, Decoder
+from fleet.telemetry.decode import IDS
 from fleet.telemetry.heard import Heard
 from gateway.forward import ASTRAY, DATAGRAM, DOUBLE
 from gateway.link import Batch
@@ -183,24 +184,14 @@ def test_targets_are_read_off_every_message():
         message = _decoded(kind, payload)
         if message is None:
             continue
-        frames = Decoder().feed(_heard(kind, payload))
+        frames = ours([framed(number, payload, kind.crc_extra)])
         assert [int(t[0]) for t in targets(frames)] == [
             getattr(message, field, 0) for field in ("target_system", "target_component")
         ], name
 
 
-def _frame(kind, payload):
-    head = bytes([0xFD, len(payload), 0, 0, 0, 7, 1]) + kind.id.to_bytes(3, "little")
-    crc = mav.x25crc(head[1:] + payload + bytes([kind.crc_extra])).crc
-    return head + payload + crc.to_bytes(2, "little")
-
-
-def _heard(kind, payload):
-    return [(0.0, None, _frame(kind, payload))]
-
-
 def _decoded(kind, payload):
     try:
-        return mav.MAVLink(None).decode(bytearray(_frame(kind, payload)))
+        return mav.MAVLink(None).decode(bytearray(framed(kind.id, payload, kind.crc_extra)))
     except (mav.MAVError, ValueError):  # text that is no text
         return None

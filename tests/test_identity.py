@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 from conftest import unused_port
 from fake_link import PATIENCE_S, until
+from oracle import framed, ours, raw
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import ARDU, PLANE, T0, Talker, of
 
 from fleet.bus import MemoryBus
 from fleet.contract import Account, Alert, AlertKind, Status
 from fleet.telemetry.collision import QUIET_S
-from fleet.telemetry.decode import Decoder
 from fleet.telemetry.ids import Ids
 from fleet.telemetry.intake import Intake
 from gateway.links.opening import open_link
@@ -72,7 +72,11 @@ def test_no_more_uavs_than_allowed_over_all_links():
 
 
 def test_no_message_but_an_aircraft_s_heartbeat_makes_a_uav():
-    everything = [_frame(kind) for kind in mav.mavlink_map.values() if kind.msgname != "HEARTBEAT"]
+    everything = [
+        framed(kind.id, bytes(kind.unpacker.size), kind.crc_extra)
+        for kind in mav.mavlink_map.values()
+        if kind.msgname != "HEARTBEAT"
+    ]
     unknown = bytes([0xFD, 4, 0, 0, 0, 9, 1, 0xEE, 0xEE, 0x7F]) + bytes(6)
     for system, kind in (
         (20, mav.MAV_TYPE_GCS),
@@ -91,13 +95,6 @@ def test_no_message_but_an_aircraft_s_heartbeat_makes_a_uav():
     assert intake.decoder.counters()["messages"] == len(everything)
 
 
-def _frame(kind):
-    payload = bytes(kind.unpacker.size)
-    head = bytes([0xFD, len(payload), 0, 0, 0, 9, 1]) + kind.id.to_bytes(3, "little")
-    crc = mav.x25crc(head[1:] + payload + bytes([kind.crc_extra])).crc
-    return head + payload + crc.to_bytes(2, "little")
-
-
 # ---- recordings
 
 
@@ -106,8 +103,7 @@ def heard(path: Path, size: int = 400_000) -> bytes:
     opened = lzma.open if path.suffix == ".xz" else open
     with opened(path, "rb") as file:
         data = file.read(size)
-    frames = Decoder().feed([(T0, None, data)])
-    return b"".join(frames.buf[a:b].tobytes() for a, b in frames.at[:, :2].tolist())
+    return b"".join(raw(ours([data])))
 
 
 SWARM = ("sitl/s10_multi3_nominal.tlog.xz", "real/cuav_quadplane_20161112.tlog", "sitl/s09_quadplane_nominal.tlog.xz")
@@ -160,4 +156,4 @@ def test_a_mixed_swarm_over_three_kinds_of_link_has_the_right_uavs(recordings):
         os.close(near)
     assert accounts[-1].uavs == (2, 21, 22, 23, 109)
     assert (accounts[-1].bad_bytes, accounts[-1].bad_frames) == (0, 0)
-    assert accounts[-1].messages == sum(len(Decoder().feed([(T0, None, data)]).at) for data in told)
+    assert accounts[-1].messages == sum(len(ours([data]).at) for data in told)

@@ -36,6 +36,7 @@ class Station:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
+            start_new_session=True,  # it would take the terminal
             env=os.environ | {"PYTHONUNBUFFERED": "1"},
         )
         self._said: queue.Queue[str] = queue.Queue()
