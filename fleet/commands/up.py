@@ -26,6 +26,7 @@ EXAMPLES = """
   fleet up --uavs 4 --autopilot px4 --aircraft c172p
   fleet up --uavs 4 --fault drag_increase,dCD=0.04,at=120 --fault-uav 2      and see whether its twin finds out
   fleet up --link udpin:0.0.0.0:14550
+  fleet up --link serial:/dev/ttyUSB0:57600 --forward udpin:127.0.0.1:14551      QGroundControl beside us, at 14551
   fleet up --replay flight.tlog.xz log7.bin --speed 4
   fleet up --replay monday.parauav --results
   fleet up --uavs 8 --for 240 --no-viewer --summary summary.json
@@ -43,6 +44,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     fault_arguments(parser)
     parser.add_argument("--mavlink", default=_MAVLINK, metavar="HOST:PORT", help=f"where they send UDP ({_MAVLINK})")
     parser.add_argument("--link", action="append", default=[], help="real aircraft instead, e.g. udpin:0.0.0.0:14550")
+    parser.add_argument("--forward", action="append", default=[], help="another ground station, as in gateway --help")
+    parser.add_argument("--keys", metavar="FILE", help="keys of links that are signed, as in gateway --help")
     parser.add_argument(
         "--replay", action="extend", nargs="+", default=[], metavar="FILE", help="recordings of any kind instead"
     )
@@ -121,12 +124,13 @@ def _start(children: Children, args: argparse.Namespace) -> None:
         ids = "0-999999" if args.replay else "0-249"
         base = [f"--baseline={text}" for text in args.baseline]
         children.start("twin worker", "twin_worker", "--uavs", ids, *base, *router)
+    passed = [f"--forward={text}" for text in args.forward] + ([f"--keys={args.keys}"] if args.keys else []) + router
     links = [f"--link={text}" for text in args.link]
     links += [f"--link={link(file, args)}" for file in args.replay]
     if links:
-        children.start("gateway", "gateway", *links, *router)
+        children.start("gateway", "gateway", *links, *passed)
     else:
-        children.start("gateway", "gateway", f"--link=udpin:{args.mavlink}", "--offset=-1", *router)
+        children.start("gateway", "gateway", f"--link=udpin:{args.mavlink}", "--offset=-1", *passed)
         aircraft = ["--uavs", f"0-{args.uavs - 1}", "--to", args.mavlink, "--seed", str(args.seed)]
         aircraft += ["--autopilot", args.autopilot, "--aircraft", args.aircraft]
         aircraft += [f"--fault={text}" for text in args.fault]
