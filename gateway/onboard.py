@@ -11,7 +11,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from fleet.contract import Link
 from fleet.telemetry.craft import Craft
 
-SYSTEM, COMPONENT = 255, dialect.MAV_COMP_ID_MISSIONPLANNER  # how ground stations call themselves
+# Other ground stations are 255: answers to us are not for them, and an aircraft that has lost them must notice.
+SYSTEM, COMPONENT = 254, dialect.MAV_COMP_ID_MISSIONPLANNER
 HEARTBEAT_S = 1.0
 RETRY_S = 0.5  # for one item or a handful of parameters [s]
 ITEM_TRIES = 20  # in vain, then the list is asked for again: it may have become shorter

@@ -11,8 +11,7 @@ from fleet.bus import Bus
 from fleet.codec import Wire
 from fleet.contract import Message
 from fleet.telemetry.craft import Craft
-from fleet.telemetry.intake import MOST_UAVS, SINGLE, Intake
-from fleet.telemetry.scan import ID
+from fleet.telemetry.intake import MOST_UAVS, Intake
 from gateway.account import Tally
 from gateway.forward import Forward
 from gateway.gate import Gate
@@ -121,9 +120,9 @@ class Pump:
     def _pass_on(self) -> None:
         """Forward what has been heard since the last time; without a station there is no hurry to look at it."""
         for number in self._heard if self._stations else ():
-            frames = self.intakes[number].sort()
+            frames = self.intakes[number].sort(keep=number not in self._stations)
             for aircraft, said in self.forward.take(number, frames) if frames is not None else ():
-                self.intakes[aircraft].digest(said.only(SINGLE[said.at[:, ID]]))  # a new mission, a forged heartbeat
+                self.intakes[aircraft].overhear(said)  # it may be a new mission
         self._heard.clear()
 
     def _tick(self, mono: float) -> None:
@@ -136,11 +135,11 @@ class Pump:
             if not self._listen_only:
                 for where, data in self._onboards[number].tick(now, intake.crafts.values(), link.greets):
                     link.send(where, gate.sign(data))
-        self.forward.tidy(wall())
         self.publisher.repeat(mono)
 
     def _tell(self) -> None:
         now = wall() if self._live else self._recorded
+        self.forward.tidy(wall())
         account = self.tally.account(now, self.links, self.intakes, self._players)
         refused = {**account.refused, **self.forward.refused}
         self.publisher.account(msgspec.structs.replace(account, published=self.publisher.published, refused=refused))

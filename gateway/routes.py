@@ -9,8 +9,7 @@ from fleet.telemetry.craft import LOST_S
 from fleet.telemetry.decode import Frames
 from fleet.telemetry.scan import COMPONENT, SYSTEM
 
-FORGET_S = 60.0  # silence after which a far end is forgotten [s]
-MOST = 8192  # far ends remembered
+FORGET_S = 60.0  # silence after which a component is forgotten [s]
 
 
 class Port(NamedTuple):
@@ -24,9 +23,7 @@ class Routes:
     """Routes learned from what is heard; the first to speak for a component keeps it until it is silent."""
 
     def __init__(self) -> None:
-        self._of: dict[tuple[int, int], Port] = {}
-        self._heard: dict[tuple[int, int], float] = {}  # fleet time [s since 1970]
-        self._ports: dict[Port, float] = {}
+        self._of: dict[tuple[int, int], tuple[Port, float]] = {}  # and when it spoke last, fleet time [s since 1970]
 
     def learn(self, link: int, frames: Frames) -> np.ndarray:
         """Learn from frames of one link; tells of each whether its sender speaks for its component, (n,) bool."""
@@ -40,32 +37,26 @@ class Routes:
         return np.array(owns, bool)[number[::-1]]
 
     def _owns(self, port: Port, who: tuple[int, int], arrival: float) -> bool:
-        self._ports[port] = arrival
-        holder = self._of.get(who)
-        if holder is not None and holder != port and arrival - self._heard[who] < LOST_S:
+        holder, heard = self._of.get(who, (port, arrival))
+        if holder != port and arrival - heard < LOST_S:
             return False
-        self._of[who], self._heard[who] = port, arrival
+        self._of[who] = port, arrival
         return True
 
     def to(self, system: int, component: int) -> list[Port]:
         """Give where a component is, all of a system's for component 0."""
         if component:
-            found = self._of.get((system, component))
-            return [] if found is None else [found]
-        return list(dict.fromkeys(port for (one, _), port in self._of.items() if one == system))
+            return [self._of[system, component][0]] if (system, component) in self._of else []
+        return list(dict.fromkeys(port for (one, _), (port, _) in self._of.items() if one == system))
 
     def ports(self, link: int) -> list[Hashable]:
         """Give the far ends of one link that speak."""
-        return [port.where for port in self._ports if port.link == link]
+        return list(dict.fromkeys(port.where for port, _ in self._of.values() if port.link == link))
 
     def part(self, link: int, where: Hashable) -> None:
         """Forget a far end that took its leave."""
-        gone = Port(link, where)
-        self._ports.pop(gone, None)
-        self._of = {who: port for who, port in self._of.items() if port != gone}
+        self._of = {who: held for who, held in self._of.items() if held[0] != Port(link, where)}
 
     def forget(self, now: float) -> None:
         """Forget who has been silent for long; `now` is fleet time [s since 1970]."""
-        old = sorted(self._ports.items(), key=lambda item: -item[1])
-        for port, _ in old[MOST:] + [item for item in old[:MOST] if now - item[1] > FORGET_S]:
-            self.part(*port)
+        self._of = {who: held for who, held in self._of.items() if now - held[1] <= FORGET_S}

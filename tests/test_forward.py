@@ -100,6 +100,14 @@ def test_a_station_that_speaks_in_an_aircraft_s_name_raises_the_alarm(field):
     assert [alert.uav for alert, _ in field.bus.ask(Alert)] == [7]
 
 
+def test_a_station_makes_no_uav_and_is_not_kept(field):
+    for _ in range(3):
+        field.say(field.ground[0], "qgc", BEAT, Talker(99).heartbeat(), Talker(99).attitude(1.0))
+    field.pump._tick(0.0)
+    assert [sorted(intake.crafts) for intake in field.pump.intakes] == [[7, 8], [9], [], []]
+    assert [intake._sorted for intake in field.pump.intakes] == [[], [], [], []]
+
+
 def test_listening_only_stations_hear_and_are_not_heard():
     field = Field([FakeLink()], [FakeLink("udpin:127.0.0.1:2")], listen_only=True)
     field.say(field.ground[0], "qgc", BEAT)

@@ -14,14 +14,19 @@ from conftest import unused_port
 from fake_link import PATIENCE_S, pieces, until
 from talker import Talker
 
+from fleet.bus import MemoryBus
+from fleet.contract import Account
+from fleet.telemetry.heard import Heard
 from fleet.telemetry.ids import Ids
-from gateway.link import Batch
+from gateway.link import Batch, wall
 from gateway.links import receive
 from gateway.links.opening import open_link
 from gateway.links.outbox import MOST, Outbox
-from gateway.sieve import read_sieve
-from gateway.spec import read_forward, read_spec
+from gateway.onboard import Onboard
+from gateway.pump import Pump
+from gateway.spec import read_spec
 
+DROPPED = "dropped: decoding fell behind"
 HELLO, ANSWER = Talker().heartbeat(), Talker(255, 190).heartbeat(6, 8)
 
 
@@ -245,40 +250,47 @@ def test_what_a_full_queue_cannot_take_is_counted():
         until(lambda: line.link.dropped + (line.queue.queue[0].heard.start.size if line.queue.queue else 0) == 50)
 
 
-# ---- arguments
+# ---- nothing is lost silently
 
 
-def test_links_are_read():
-    assert read_spec("tcp:10.0.0.1:5760")[1:4] == ("tcp", "10.0.0.1", 5760)
-    assert read_spec("serial:/dev/ttyUSB0:115200")[1:4] == ("serial", "/dev/ttyUSB0", 115_200)
-    assert read_spec("serial:/dev/serial/by-path/pci-0:1:1.0-port0")[2:4] == (
-        "/dev/serial/by-path/pci-0:1:1.0-port0",
-        57_600,
-    )
-    assert read_spec("udpin:[::1]:14550#sign=require&key=k")[2:4] == ("::1", 14550)
-    assert read_forward("udpin::14551#no-messages=RAW_IMU").sieve.rules
+def test_what_was_sent_is_what_was_counted_however_far_decoding_falls_behind(monkeypatch):
+    monkeypatch.setattr("gateway.pump.QUEUE", 2)
+    link, bus = open_link(read_spec(f"udpin:127.0.0.1:{udp_port()}"), Ids()), MemoryBus()
+    stop, done = threading.Event(), threading.Event()
+    talker, sent, accounts = Talker(), 3000, []
+
+    def hear(account, _):
+        accounts.append(account)
+        if account.datagrams + account.refused.get(DROPPED, 0) == sent:
+            done.set()
+
+    bus.subscribe(Account, hear)
+    pump = Pump([link], bus, listen_only=True)
+    busy, take = threading.Event(), pump.take
+    monkeypatch.setattr(pump, "take", lambda batch: (busy.wait(0.05), take(batch)))
+    thread = threading.Thread(target=pump.run, args=(stop,))
+    thread.start()
+    with udp() as air:
+        for k in range(sent):
+            air.sendto(talker.attitude(k * 0.01), ("127.0.0.1", link.port))
+            if k % 100 == 99:
+                busy.wait(0.005)  # within what any system's buffer holds
+    try:
+        assert done.wait(PATIENCE_S), accounts[-1]
+    finally:
+        stop.set()
+        thread.join(PATIENCE_S)
+    assert accounts[-1].refused[DROPPED] > 0
+    assert accounts[-1].messages == accounts[-1].datagrams < sent
 
 
-@pytest.mark.parametrize("text", ["replay:a.tlog", "udpin:h:1#offset=2"])
-def test_a_forward_is_no_recording_and_has_no_offset(text):
-    with pytest.raises(ValueError, match=r"--forward: found .*, expected a link to a ground station"):
-        read_forward(text)
-
-
-def test_a_sieve_keeps_by_message_system_and_component():
-    at = np.zeros((6, 8), np.int64)
-    at[:, 4], at[:, 5], at[:, 6] = (0, 30, 30, 253, 30, 27), (1, 1, 2, 1, 3, 1), (1, 1, 1, 1, 1, 154)
-    assert read_sieve({}).keep(at).all()
-    for settings, kept in (
-        ({"messages": "ATTITUDE,0"}, [1, 1, 1, 0, 1, 0]),
-        ({"no-messages": "statustext"}, [1, 1, 1, 0, 1, 1]),
-        ({"systems": "2-3"}, [0, 0, 1, 0, 1, 0]),
-        ({"no-components": "154", "systems": "1"}, [1, 1, 0, 1, 0, 0]),
-    ):
-        assert read_sieve(dict(settings)).keep(at).tolist() == list(map(bool, kept))
-
-
-@pytest.mark.parametrize("settings", [{"messages": "ATITUDE"}, {"systems": "256"}, {"components": "5-2"}])
-def test_what_is_no_sieve_says_so(settings):
-    with pytest.raises(ValueError, match=r"found '.*', expected .*numbers up to"):
-        read_sieve(settings)
+def test_messages_to_a_link_that_is_down_are_counted_every_one():
+    bus, link = MemoryBus(), open_link(read_spec(f"tcp:127.0.0.1:{unused_port()}"), Ids())
+    pump, accounts = Pump([link], bus), []
+    bus.subscribe(Account, lambda account, _: accounts.append(account))
+    pump.take(Batch(0, Heard.of([(wall(), link.spec.text, HELLO)])))
+    pump._tick(0.0)
+    questions = Onboard().tick(wall(), pump.intakes[0].crafts.values(), link.greets)
+    pump._tell()
+    assert len(questions) > 1
+    assert accounts[-1].refused == {"not sent: nobody at the far end, or no room": len(questions)}

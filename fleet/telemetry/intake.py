@@ -92,8 +92,12 @@ class Intake:
         self._digest_sorted()
         return self._take(now)
 
-    def sort(self) -> Frames | None:
-        """Find the frames in what was heard since the last time and give those admitted; None where there are none."""
+    def sort(self, keep: bool = True) -> Frames | None:
+        """Find the frames in what was heard since the last time and give those admitted; None where there are none.
+
+        Args:
+            keep: digest them at the next `flush`
+        """
         if not self._heard:
             return None
         frames = self.decoder.feed(merged(self._heard))
@@ -102,8 +106,21 @@ class Intake:
             frames = self._admit(frames, self.refused)
         if not len(frames.at):
             return None
-        self._sorted.append(frames)
+        if keep:
+            self._sorted.append(frames)
         return frames
+
+    def overhear(self, frames: Frames) -> None:
+        """Take what ground stations said to the aircraft of this link; nobody is met here, and nobody taken over."""
+        for i in np.flatnonzero(SINGLE[frames.at[:, ID]]).tolist():
+            system, component = frames.at[i, (SYSTEM, COMPONENT)].tolist()
+            craft, arrival, message = self.crafts.get(system), float(frames.arrival[i]), frames.message(i)
+            if craft is not None and craft.component == component:
+                self._alarm(craft, arrival, frames.senders[frames.sender[i]])
+            elif message is not None and message.get_type() in MESSAGES:
+                target = self.crafts.get(getattr(message, "target_system", 0))
+                if target is not None:
+                    target.queue(arrival, target.overhear, message)
 
     def part(self, source: Hashable) -> None:
         """Learn that a sender took its leave: whoever speaks next for its aircraft has its place."""

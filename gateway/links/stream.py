@@ -2,6 +2,7 @@
 
 import os
 import socket
+import termios
 from typing import Any
 
 import serial
@@ -54,7 +55,10 @@ class Serial:
     """A serial line; `serial.SerialException` is an OSError."""
 
     def __init__(self, path: str, baud: int) -> None:
-        self._line = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
+        try:
+            self._line = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
+        except (ValueError, termios.error) as error:  # a rate this device does not know
+            raise OSError(str(error)) from None
         self.outbox = Outbox(self._write)
 
     def fileno(self) -> int:

@@ -22,7 +22,7 @@ from fleet.bus import Bus, connect, open_router
 from fleet.children import Children
 from fleet.contract import Account, Mission, Params
 
-PATIENCE_S = 180.0  # for each step [s]
+PATIENCE_S = 600.0  # for each step [s]
 
 
 class Station:
