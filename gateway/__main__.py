@@ -11,7 +11,7 @@ from fleet.bus import ROUTER, connect
 from fleet.cli import guarded, parser_for, stop_on_signal
 from fleet.telemetry.ids import Ids
 from fleet.telemetry.intake import MOST_UAVS
-from gateway.gate import gates
+from gateway.gate import gates_of
 from gateway.link import Link
 from gateway.links.opening import open_link
 from gateway.pump import Pump
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     specs += [read_forward(text) for text in args.forward]
     if args.most_uavs < 1:
         raise ValueError(f"--most-uavs: found {args.most_uavs}, expected at least 1; write e.g. 250")
-    gated = gates(specs, args.keys)
+    gates = gates_of(specs, len(args.forward), args.keys)
     stop = stop_on_signal()
     with connect(args.router) as bus, contextlib.ExitStack() as held:
         links: list[Link] = []
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         with shown(replays, lambda line: print(f"gateway: {line}", flush=True)):
             for replay in replays:
                 replay.look(stop)
-            settings = {"gates": gated, "stations": len(args.forward), "most": args.most_uavs}
+            settings = {"gates": gates, "stations": len(args.forward), "most": args.most_uavs}
             Pump(links, bus, args.listen_only, **settings).run(stop)
     return 0
 

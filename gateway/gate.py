@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fleet.telemetry.decode import Frames
+from gateway.sieve import Sieve
 from gateway.signing import Signing, pick, read_keys
 from gateway.spec import Spec
 
@@ -15,12 +16,12 @@ class Gate:
     """The gate of one link.
 
     Args:
-        spec: the link
+        sieve: which frames it wants
         signing: its signatures; None: they are not looked at
     """
 
-    def __init__(self, spec: Spec, signing: Signing | None = None) -> None:
-        self._sieve, self._signing = spec.sieve, signing
+    def __init__(self, sieve: Sieve, signing: Signing | None = None) -> None:
+        self._sieve, self._signing = sieve, signing
 
     def admit(self, frames: Frames, refused: Counter[str]) -> Frames:
         """Give the frames that may come in, and count the others by reason."""
@@ -37,9 +38,13 @@ class Gate:
         return message if self._signing is None else self._signing.sign(message)
 
 
-def gates(specs: Sequence[Spec], keys: Path | None = None) -> list[Gate]:
-    """Make the gates of all links.
+def gates_of(specs: Sequence[Spec], stations: int = 0, keys: Path | None = None) -> list[Gate]:
+    """Make the gates of all links; the sieve of a station's link is for what is sent there, not for what it says.
 
+    Args:
+        specs: the links
+        stations: how many of the last ones lead to ground stations
+        keys: file of keys
     Raises:
         ValueError: when the file of keys is not safe, or lacks the key of a link.
         OSError: when it cannot be read.
@@ -48,5 +53,5 @@ def gates(specs: Sequence[Spec], keys: Path | None = None) -> list[Gate]:
     found = []
     for number, spec in enumerate(specs):
         signing = Signing(pick(known, spec.key, spec.text), spec.sign == "require", number) if spec.sign else None
-        found.append(Gate(spec, signing))
+        found.append(Gate(spec.sieve if number < len(specs) - stations else Sieve(), signing))
     return found

@@ -14,7 +14,7 @@ from fleet.telemetry.craft import Craft
 from fleet.telemetry.intake import MOST_UAVS, Intake
 from gateway.account import Tally
 from gateway.forward import Forward
-from gateway.gate import Gate
+from gateway.gate import Gate, gates_of
 from gateway.link import QUEUE, Batch, Link, wall
 from gateway.onboard import Onboard
 from gateway.publish import Publisher
@@ -31,7 +31,7 @@ class Pump:
         links: opened links, those to aircraft first
         bus: where messages go
         listen_only: send nothing at all to aircraft
-        gates: what each link lets in; None: everything
+        gates: what each link lets in; None: whatever its sieve does, signed or not
         stations: how many of the last links lead to other ground stations
         most: UAVs at a time
     """
@@ -48,7 +48,7 @@ class Pump:
     ) -> None:
         self.links = links
         self.forward = Forward(links, stations, listen_only)
-        self._gates = [Gate(link.spec) for link in links] if gates is None else gates
+        self._gates = gates_of([link.spec for link in links], stations) if gates is None else gates
         self._heard: set[int] = set()  # links with something to forward
         self._stations = range(len(links) - stations, len(links))
         self.tally = Tally()

@@ -8,7 +8,7 @@ from talker import Ears
 from gateway.link import Batch
 from gateway.spec import read_spec
 
-PATIENCE_S = 20.0  # an upper bound; every wait ends with its condition
+PATIENCE_S = 60.0  # an upper bound; every wait ends with its condition
 
 
 class FakeLink:

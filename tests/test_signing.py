@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Ears, Talker
 
 from fleet.telemetry.intake import Intake
-from gateway.gate import Gate, gates
+from gateway.gate import Gate, gates_of
 from gateway.signing import FORGED, REPLAYED, STALE, UNSIGNED, Signing, pick, read_keys, stamp_now
 from gateway.spec import read_spec
 
@@ -119,7 +119,7 @@ def test_no_changed_byte_of_a_signed_frame_passes(at, by):
 
 def test_a_link_that_requires_signatures_knows_no_unsigned_aircraft():
     spec = read_spec("udpin:127.0.0.1:14550#sign=require")
-    intake = Intake(admit=Gate(spec, Signing(KEY, require=True)).admit)
+    intake = Intake(admit=Gate(spec.sieve, Signing(KEY, require=True)).admit)
     intake.hear(
         T0, Talker(6).heartbeat() + Signer(OTHER, stamp_now(), 8).heartbeat() + Signer(KEY, stamp_now()).heartbeat()
     )
@@ -131,7 +131,7 @@ def test_a_link_that_requires_signatures_knows_no_unsigned_aircraft():
 def test_our_own_words_are_signed_where_a_link_has_a_key(tmp_path):
     file = keys(tmp_path, f"a {KEY.hex()}\nb {OTHER.hex()} # of the others\n\n")
     specs = [read_spec(f"udpin:h:1#{text}") for text in ("", "sign=accept&key=a", "sign=require&key=b")]
-    found, frame = gates(specs, file), Talker(255).heartbeat()
+    found, frame = gates_of(specs, 0, file), Talker(255).heartbeat()
     assert [gate.sign(frame)[2] & 1 for gate in found] == [0, 1, 1]
     assert passed(Signing(OTHER, require=True), found[2].sign(frame))[0] == [True]
     (heard,) = Ears().feed(found[1].sign(frame))

@@ -112,7 +112,10 @@ class Intake:
 
     def overhear(self, frames: Frames) -> None:
         """Take what ground stations said to the aircraft of this link; nobody is met here, and nobody taken over."""
-        for i in np.flatnonzero(SINGLE[frames.at[:, ID]]).tolist():
+        which = np.flatnonzero(SINGLE[frames.at[:, ID]]).tolist()
+        if which:
+            self._digest_sorted()  # who is spoken to may just have been heard for the first time
+        for i in which:
             system, component = frames.at[i, (SYSTEM, COMPONENT)].tolist()
             craft, arrival, message = self.crafts.get(system), float(frames.arrival[i]), frames.message(i)
             if craft is not None and craft.component == component:
