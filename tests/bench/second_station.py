@@ -104,20 +104,18 @@ def measure(program: str) -> dict[str, object]:
             mission, params = ours(bus, 7)
             station = Station(program, ground, folder)
             try:
-                loaded = station.wait("Received ")
-                station.ask(f"wp list {folder}/mission.txt")
-                listed = station.wait(f"to {folder}/mission.txt")
-                station.ask(f"param save {folder}/all.parm")
-                station.wait(f"{folder}/all.parm")
+                loaded = station.wait("parameters to ")  # it asks by itself, and writes them down
+                station.ask("wp list")
+                listed = station.wait("waypoints to ")
             finally:
                 station.close()
-            items = [line.split("\t") for line in (folder / "mission.txt").read_text().splitlines()[1:]]
+            items = [line.split("\t") for line in (folder / "way_7.txt").read_text().splitlines()[1:]]
             theirs = {
-                line.split()[0]: float(line.split()[1]) for line in (folder / "all.parm").read_text().splitlines()
+                line.split()[0]: float(line.split()[1]) for line in (folder / "mav_7_1.parm").read_text().splitlines()
             }
     finally:
         router.close()
-    pairs = list(zip(items, mission.items, strict=len(items) == len(mission.items)))
+    pairs = zip(items, mission.items, strict=False)
     return {
         "parameters": {"ours": len(params.values), "theirs": len(theirs), "seconds": round(loaded, 1)},
         "same parameters": sum(alike(params.values.get(name), value) for name, value in theirs.items()),
