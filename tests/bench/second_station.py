@@ -20,7 +20,7 @@ from pathlib import Path
 
 from fleet.bus import Bus, connect, open_router
 from fleet.children import Children
-from fleet.contract import Account, Mission, Params
+from fleet.contract import Account, Item, Mission, Params
 
 PATIENCE_S = 600.0  # for each step [s]
 
@@ -120,9 +120,15 @@ def measure(program: str) -> dict[str, object]:
         "parameters": {"ours": len(params.values), "theirs": len(theirs), "seconds": round(loaded, 1)},
         "same parameters": sum(alike(params.values.get(name), value) for name, value in theirs.items()),
         "mission": {"ours": len(mission.items), "theirs": len(items), "seconds": round(listed, 1)},
-        "same places": sum(abs(float(row[8]) * 1e7 - item.lat_e7) < 2 for row, item in pairs),
+        "same items": sum(same_item(row, item) for row, item in pairs),
         "refused": accounts[-1].refused,
     }
+
+
+def same_item(row: list[str], item: Item) -> bool:
+    """Tell whether a line of a waypoint file, six digits after the point, is this item."""
+    near = all(abs(float(row[k]) * 1e7 - degrees) <= 6 for k, degrees in ((8, item.lat_e7), (9, item.lon_e7)))
+    return near and int(row[3]) == item.command and abs(float(row[10]) - item.alt_m) < 1e-3
 
 
 def alike(one: float | None, other: float) -> bool:
