@@ -1,0 +1,116 @@
+"""Bytes of many senders cut into `.tlog` records: 8 bytes of big-endian us since 1970, one frame. Compiled."""
+
+import numba as nb
+import numpy as np
+
+from fleet.telemetry.heard import Heard
+from fleet.telemetry.scan import CRC, EXTRA, STAMP, V1, V2, frame_length
+from fleet.telemetry.scan import _known as sound
+from fleet.telemetry.scan import _message_id as message_id
+
+CARRY = 300  # the longest frame is 293 [bytes]
+FRAMES, NOISE = range(2)  # what `cut` counts: frames found, bytes that belong to none
+
+
+@nb.njit(cache=True, nogil=True)
+def _judge(data, at, end, extras, table):
+    """Tell how long the frame at `at` is [bytes]; 0: none, -1: it goes on beyond `end`."""
+    length = frame_length(data, at, end)
+    if length == 0 or (length < 0 and data[at] != V1 and data[at] != V2):
+        return 0
+    if length < 0 or at + length > end:
+        return -1
+    number = message_id(data, at)
+    if number < len(extras) and extras[number] >= 0:
+        return length if sound(data, at, end, extras, table) else 0
+    after = at + length  # a message unknown here has no checksum to test: what follows must look like the next frame
+    return length if after == end or data[after] == V1 or data[after] == V2 else 0
+
+
+@nb.njit(cache=True, nogil=True)
+def _copy(source, start, length, target, at):
+    for k in range(length):
+        target[at + k] = source[start + k]
+
+
+@nb.njit(cache=True, nogil=True)
+def _search(data, end, us, work, counts, extras, table):
+    """Copy every frame of `data[:end]`, stamped; gives where `work` ends now and where the search must go on."""
+    out, n = work
+    at = 0
+    while at < end:
+        length = _judge(data, at, end, extras, table)
+        if length < 0:
+            break
+        if length == 0:
+            at += 1
+            counts[NOISE] += 1
+            continue
+        for k in range(STAMP):
+            out[n + k] = us >> (8 * (STAMP - 1 - k)) & 0xFF
+        _copy(data, at, length, out, n + STAMP)
+        n, at = n + STAMP + length, at + length
+        counts[FRAMES] += 1
+    return n, at
+
+
+@nb.njit(cache=True, nogil=True)
+def cut(heard, us, carry, held, counts, extras, table):
+    """Cut pieces into records.
+
+    Args:
+        heard: buf (b,) uint8; start, stop, slot of each piece, (n,): where it lies, whose it is
+        us: arrival of each piece, (n,) int64 [us since 1970]
+        carry, held: by slot what was cut off before, (m * CARRY,) uint8, and how much of it there is, (m,)
+        counts: raised: frames, bytes of no frame, (2,) int64
+        extras, table: `EXTRA`, `CRC`
+    Returns:
+        the records, (k,) uint8
+    """
+    buf, start, stop, slot = heard
+    longest, total = 0, 0
+    for i in range(len(start)):
+        longest, total = max(longest, stop[i] - start[i]), total + stop[i] - start[i] + held[slot[i]]
+    out, scratch, n = np.empty(2 * total, np.uint8), np.empty(CARRY + longest, np.uint8), 0  # no frame is below 8 bytes
+    for i in range(len(start)):
+        mine, size = slot[i], stop[i] - start[i]
+        before = held[mine]
+        _copy(carry, mine * CARRY, before, scratch, 0)
+        _copy(buf, start[i], size, scratch, before)
+        end = before + size
+        n, at = _search(scratch, end, us[i], (out, n), counts, extras, table)
+        held[mine] = end - at
+        _copy(scratch, at, end - at, carry, mine * CARRY)
+    return out[:n]
+
+
+class Cutter:
+    """The cutting of one link: remembers of every sender what a piece cut off."""
+
+    def __init__(self, most: int = 4096) -> None:
+        self.counts = np.zeros(2, np.int64)
+        self._slots: dict[object, int] = {}
+        self._carry, self._held = np.empty(most * CARRY, np.uint8), np.zeros(most, np.int64)
+
+    @property
+    def held(self) -> int:
+        """Tell how many bytes wait for the rest of their frame."""
+        return int(self._held.sum())
+
+    def feed(self, heard: Heard) -> bytes:
+        """Give the records completed by these pieces."""
+        slots = np.array([self._slot(sender) for sender in heard.senders], np.int64)
+        pieces = (heard.buf, heard.start, heard.stop, slots[heard.sender])
+        us = np.round(heard.arrival * 1e6).astype(np.int64)
+        return cut(pieces, us, self._carry, self._held, self.counts, EXTRA, CRC).tobytes()
+
+    def _slot(self, sender: object) -> int:
+        """Give the place of a sender's rest; who was met first makes room, the rest counts as noise then."""
+        if sender not in self._slots:
+            free = len(self._slots)
+            if free == len(self._held):
+                free = self._slots.pop(next(iter(self._slots)))
+                self.counts[NOISE] += self._held[free]
+                self._held[free] = 0
+            self._slots[sender] = free
+        return self._slots[sender]

@@ -1,0 +1,132 @@
+"""The thread that records: takes what links heard off their hands at once, writes it when the disk can."""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from typing import NamedTuple
+
+from fleet.telemetry.heard import Heard
+from fleet.telemetry.scan import STAMP
+from gateway.link import Batch
+from gateway.record.cut import FRAMES, Cutter
+from gateway.record.tape import Budget, Tape
+
+MOST = 64 << 20  # bytes waiting for the disk; beyond, they are dropped and counted
+WRITE_S = 0.25  # between two writes: what a crash may cost [s]
+
+_log = logging.getLogger(__name__)
+
+
+class Taped(NamedTuple):
+    """What became of the bytes of one link: `heard` is the sum of the five after it, stamps of the file left out."""
+
+    heard: int = 0  # bytes
+    recorded: int = 0  # in frames, on disk
+    noise: int = 0  # part of no frame, so not recorded
+    lost: int = 0  # the disk did not take them
+    dropped: int = 0  # the disk was too slow, and the queue full
+    waiting: int = 0  # for the disk, or for the rest of their frame
+    frames: int = 0  # recorded or lost
+    trouble: str = ""
+
+
+class _Reel:
+    """One link: its tape and its counters [bytes]."""
+
+    def __init__(self, tape: Tape) -> None:
+        self.tape, self.cutter = tape, Cutter()
+        self.heard = self.recorded = self.lost = self.dropped = 0
+
+    def write(self, pieces: Sequence[Heard]) -> None:
+        before = int(self.cutter.counts[FRAMES])
+        records = b"".join(map(self.cutter.feed, pieces))
+        size = len(records) - STAMP * (int(self.cutter.counts[FRAMES]) - before)
+        if self.tape.write(records, time.monotonic()):
+            self.lost += size
+        else:
+            self.recorded += size
+
+    def account(self) -> Taped:
+        frames, noise = self.cutter.counts.tolist()
+        known = (self.recorded, noise, self.lost, self.dropped)
+        return Taped(self.heard, *known, self.heard - sum(known), frames, self.tape.trouble)
+
+
+class Recorder(AbstractContextManager):
+    """Record links as `.tlog`.
+
+    Args:
+        budget: of the folder
+        names: of the links
+    """
+
+    def __init__(self, budget: Budget, names: Sequence[str]) -> None:
+        self.budget = budget
+        self._reels = [_Reel(Tape(name, budget, len(names))) for name in names]
+        self._lock = threading.Lock()
+        self._waiting: list[tuple[int, Heard]] = []
+        self._size = 0  # bytes waiting
+        self._said: set[str] = set()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="recorder")
+        self._thread.start()
+
+    def hear(self, link: int, heard: Heard) -> None:
+        """Take pieces of one link, on any thread; never waits for the disk."""
+        size = int((heard.stop - heard.start).sum())
+        with self._lock:
+            self._reels[link].heard += size
+            if self._size + size > MOST:
+                self._reels[link].dropped += size
+            else:
+                self._waiting.append((link, heard))
+                self._size += size
+
+    def account(self) -> list[Taped]:
+        """Tell what became of the bytes of each link."""
+        with self._lock:
+            return [reel.account() for reel in self._reels]
+
+    def close(self) -> None:
+        """Write what waits and close the files."""
+        self._over.set()
+        self._thread.join()
+        for reel in self._reels:
+            reel.tape.close()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        over = False
+        while not over:
+            over = self._over.wait(WRITE_S)
+            self.write()
+
+    def write(self) -> None:
+        """Write what waits."""
+        with self._lock:
+            waiting, self._waiting, self._size = self._waiting, [], 0
+        for number, reel in enumerate(self._reels):
+            if pieces := [heard for link, heard in waiting if link == number]:
+                reel.write(pieces)
+            if (trouble := reel.tape.trouble) and trouble not in self._said:
+                self._said.add(trouble)
+                _log.warning("%s", trouble)
+
+
+class Tapped(queue.Queue[Batch]):
+    """The queue between receiving and decoding, recorded on its way in, what does not fit included."""
+
+    def __init__(self, most: int, recorder: Recorder | None) -> None:
+        super().__init__(most)
+        self._recorder = recorder
+
+    def put(self, item: Batch, block: bool = True, timeout: float | None = None) -> None:
+        """Record what was heard, then queue it."""
+        if self._recorder is not None and len(item.heard):
+            self._recorder.hear(item.link, item.heard if isinstance(item.heard, Heard) else Heard.of(item.heard))
+        super().put(item, block, timeout)

@@ -1,0 +1,26 @@
+"""Sizes as people write them: 500M, 10G."""
+
+import re
+
+_UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
+
+
+def read_size(text: str) -> int:
+    """Read `500M` or `10G` [bytes].
+
+    Raises:
+        ValueError: when it is neither.
+    """
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)([kMGT]?)B?", text.strip())
+    if found is None or float(found[1]) <= 0:
+        raise ValueError(f"--record-budget: found {text!r}, expected a size such as 500M or 10G; correct it")
+    return round(float(found[1]) * _UNITS[found[2]])
+
+
+def in_words(size: float) -> str:
+    """Say `size` [bytes] in at most four figures."""
+    for unit in ("", "k", "M", "G"):
+        if size < 1000:
+            return f"{size:.0f} {unit}B" if size >= 100 or not unit else f"{size:.1f} {unit}B"
+        size /= 1000
+    return f"{size:.1f} TB"

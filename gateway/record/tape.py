@@ -1,0 +1,145 @@
+"""One link's recording on disk: files that follow each other, and a budget that all recordings share."""
+
+import contextlib
+import os
+import re
+import time
+from pathlib import Path
+from typing import IO
+
+from gateway.record.size import in_words
+
+OURS = re.compile(r".+_\d{8}T\d{6}Z(-\d+)?\.tlog$")
+LONGEST_S = 3600.0  # of one file
+LARGEST, SMALLEST = 256 << 20, 64 << 10  # of one file [bytes]
+PIECES = 4  # a link's newest file is at most one of so many equal parts of its share of the budget
+AGAIN_S = 2.0  # after a failure [s]
+
+
+class Budget:
+    """What recordings may take up in a folder; the oldest of our own make room.
+
+    Args:
+        folder: theirs alone, made here if need be
+        most: bytes, earlier runs' recordings included; other files are not counted and never touched
+    Raises:
+        OSError: when the folder cannot be made or written to.
+    """
+
+    def __init__(self, folder: Path, most: int) -> None:
+        self.folder, self.most = folder, most
+        self.removed = 0  # files
+        self._open: set[Path] = set()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OSError(f"--record: {str(folder)!r} cannot be made ({error.strerror}); name another folder") from None
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise OSError(f"--record: {str(folder)!r} may not be written to; name another folder")
+        self._sizes = {
+            path: path.stat().st_size for path in sorted(folder.iterdir(), key=_age) if OURS.match(path.name)
+        }
+
+    @property
+    def used(self) -> int:
+        """Tell how many bytes our recordings take up."""
+        return sum(self._sizes.values())
+
+    def grow(self, path: Path, size: int) -> None:
+        """Note that a file being written has reached `size` bytes; the oldest that are not being written make room."""
+        self._sizes[path] = size
+        self._open.add(path)
+        for oldest in [path for path in self._sizes if path not in self._open]:
+            if self.used <= self.most:
+                return
+            del self._sizes[oldest]
+            self.removed += 1
+            with contextlib.suppress(OSError):  # somebody else was tidier
+                oldest.unlink()
+
+    def shut(self, path: Path) -> None:
+        """Note that a file is not written to any more."""
+        self._open.discard(path)
+
+
+class Tape(contextlib.AbstractContextManager):
+    """The recording of one link; what cannot be written is counted, and later the next file is tried.
+
+    Args:
+        name: of the link, as it is told
+        budget: of all of them
+        links: how many share it
+    """
+
+    def __init__(self, name: str, budget: Budget, links: int = 1) -> None:
+        self.written = 0  # bytes
+        self.lost = 0  # bytes the disk did not take
+        self.trouble = ""  # a sentence while the disk does not take any
+        self._slug = re.sub(r"[^\w.-]+", "-", name).strip("-")
+        self._budget = budget
+        self._largest = max(SMALLEST, min(LARGEST, budget.most // (PIECES * links)))
+        self._file: IO[bytes] | None = None
+        self._path = Path()
+        self._size, self._begun, self._again = 0, 0.0, float("-inf")
+
+    def write(self, records: bytes, now: float) -> int:
+        """Write whole records; `now` is any clock that only goes forward [s]. Gives the bytes lost."""
+        if not records:
+            return 0
+        if self._file is None and now < self._again:
+            self.lost += len(records)
+            return len(records)
+        try:
+            self._turn(len(records), now)
+            self._put(records)
+        except OSError as error:
+            self._fail(error, now)
+            self.lost += len(records)
+            return len(records)
+        self.trouble = ""
+        return 0
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()
+        self._budget.shut(self._path)
+        self._file = None
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _turn(self, more: int, now: float) -> None:
+        if self._file is not None and (self._size + more > self._largest or now - self._begun > LONGEST_S):
+            self.close()
+        if self._file is None:
+            stem = f"{self._slug}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+            names = [f"{stem}.tlog", *(f"{stem}-{k}.tlog" for k in range(2, 1000))]
+            self._path = next(p for name in names if not (p := self._budget.folder / name).exists())
+            self._file, self._size, self._begun = self._path.open("xb", buffering=0), 0, now
+
+    def _put(self, records: bytes) -> None:
+        assert self._file is not None
+        left = memoryview(records)
+        while left:
+            left = left[self._file.write(left) :]
+        self._size += len(records)
+        self.written += len(records)
+        self._budget.grow(self._path, self._size)
+
+    def _fail(self, error: OSError, now: float) -> None:
+        """Leave the file as it was before this write, and let it be for a while."""
+        self.trouble = (
+            f"recording of {self._slug} stopped ({error.strerror or error}), the gateway goes on; "
+            f"make room in {self._budget.folder} (ours take {in_words(self._budget.used)})"
+        )
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._size)
+        self.close()
+        self._again = now + AGAIN_S
+
+
+def _age(path: Path) -> tuple[float, str]:
+    return path.stat().st_mtime, path.name
