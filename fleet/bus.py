@@ -40,6 +40,10 @@ class Bus(AbstractContextManager, Protocol):
 
     writer: int  # random id of this process on the bus
 
+    @property
+    def router(self) -> str:
+        """Name who is there to pass on what is published; empty: nobody, and it is looked for again and again."""
+
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
         """Send one message to whoever listens."""
 
@@ -101,6 +105,8 @@ def asked_for(uav: int | None, answers: Answers) -> list[tuple[Any, Stamp | None
 
 class MemoryBus(AbstractContextManager):
     """The bus within one process, synchronous; every message still goes through its bytes."""
+
+    router = "this process"
 
     def __init__(self) -> None:
         self.writer = secrets.randbits(63)
@@ -182,6 +188,11 @@ class ZenohBus(AbstractContextManager):
         self._declared: list[Any] = []
         self._publishers: dict[str, Any] = {}
         self._lock = threading.Lock()
+
+    @property
+    def router(self) -> str:
+        """Name the router by its id, which is another after a restart; empty: none is there."""
+        return " ".join(map(str, self._session.info.routers_zid()))
 
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
         """Send one message to whoever listens."""
@@ -312,7 +323,7 @@ def _config(mode: str, *, connect: list[str], listen: list[str]) -> zenoh.Config
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
-        "connect/timeout_ms": -1 if mode == "client" else 0,
+        "connect/timeout_ms": 0 if mode == "router" else -1,
         "connect/exit_on_failure": False,
         "transport/link/tx/lease": 1000,
         "transport/link/tx/keep_alive": 4,
@@ -349,17 +360,19 @@ def _family(router: str) -> socket.AddressFamily:
     return socket.AF_INET6 if ":" in endpoint(router)[0] else socket.AF_INET
 
 
-def connect(router: str = ROUTER) -> ZenohBus:
-    """Join the bus through a router.
+def connect(router: str = ROUTER, *, patient: bool = False) -> ZenohBus:
+    """Join the bus through a router; `patient` begins also without one and joins it when it comes.
 
     Raises:
         ConnectionError: when nobody answers there; start `zenohd` or `fleet up`.
     """
-    if not reachable(router):
+    if reachable(router):
+        return ZenohBus(zenoh.open(_config("client", connect=[router], listen=[])))
+    if not patient:
         raise ConnectionError(
             f"router {router}: nobody answers; start `zenohd` or `fleet up`, or name another --router"
         )
-    return ZenohBus(zenoh.open(_config("client", connect=[router], listen=[])))
+    return ZenohBus(zenoh.open(_config("peer", connect=[router], listen=[])))  # a client would wait in `open`
 
 
 def open_router(router: str = ROUTER) -> zenoh.Session:

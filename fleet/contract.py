@@ -5,6 +5,7 @@
     parauav/{uav}/status                 Status       gateway  link, mode, rates, losses (1 Hz and on change)
     parauav/{uav}/mission                Mission      gateway  the route on board and the item in force
     parauav/{uav}/params                 Params       gateway  autopilot parameters
+    parauav/{uav}/history                History      gateway  only answers: the last minute of one aircraft
     parauav/{uav}/model                  Model        worker   identified model with its verdict
     parauav/{uav}/prediction             Prediction   worker   mean path, tube, horizon; also answers queries
     parauav/{uav}/mismatch               Mismatch     worker   where, what physics, fit before and after; queries too
@@ -150,6 +151,20 @@ class Status(Message, frozen=True, kw_only=True):
     rejected: Annotated[int, Meta(description="messages or fields refused (not finite, out of range, stale)")] = 0
     clock_offset_s: Annotated[float, Meta(description="fleet time minus the aircraft's boot time [s]")] = 0.0
     clock_jumps: Annotated[int, Meta(description="times the aircraft's clock jumped")] = 0
+    clock_drift: Annotated[
+        float | None, Meta(description="what the aircraft's clock loses on the fleet clock [s/s]; null: not known yet")
+    ] = None
+    latency_s: Annotated[
+        float, Meta(description="how much later than the quickest of the last half minute messages come, mean [s]")
+    ] = 0.0
+    latency_worst_s: Annotated[float, Meta(description="the same, the latest since the status before [s]")] = 0.0
+    round_trip_s: Annotated[
+        float | None, Meta(description="to the aircraft and back, the quickest lately (TIMESYNC) [s]; null: no answer")
+    ] = None
+    gps_offset_s: Annotated[
+        float | None,
+        Meta(description="fleet time minus satellite time of the same instant (SYSTEM_TIME) [s]; null: not told"),
+    ] = None
     sentence: Annotated[str, Meta(description="what an operator should know, or empty")] = ""
 
 
@@ -187,6 +202,16 @@ class Params(Message, frozen=True, kw_only=True):
     values: dict[str, float] = {}
     complete: bool = False
     sentence: str = ""
+
+
+class History(Message, frozen=True, kw_only=True):
+    """What one aircraft said lately, oldest first; `?seconds=20` asks for less of it."""
+
+    topic: ClassVar[str] = "history"
+
+    since: Annotated[float, Meta(description="fleet time from which on nothing is left out [s since 1970]")] = 0.0
+    samples: tuple[Sample, ...] = ()
+    statuses: tuple[Status, ...] = ()
 
 
 class Outcome(StrEnum):
@@ -537,6 +562,32 @@ class FleetState(msgspec.Struct, frozen=True, kw_only=True):
     sentence: Annotated[str, Meta(description="e.g. compiling the twin's physics, once")] = ""
 
 
+class LinkAccount(msgspec.Struct, frozen=True, kw_only=True):
+    """Counters of one link, since the gateway began unless a unit says otherwise."""
+
+    link: Annotated[str, Meta(description="as it was given")]
+    datagrams: int = 0
+    bytes_in: int = 0
+    messages: int = 0
+    bad_bytes: Annotated[int, Meta(description="bytes that were no MAVLink frame")] = 0
+    bad_frames: Annotated[int, Meta(description="frames with a wrong checksum or an unknown message id")] = 0
+    dropped: Annotated[int, Meta(description="datagrams received and dropped because decoding fell behind")] = 0
+    overrun: Annotated[
+        int | None, Meta(description="datagrams the system dropped before we received them; null: not told")
+    ] = None
+    sent: Annotated[int, Meta(description="datagrams sent by the gateway itself")] = 0
+    bytes_out: int = 0
+    unsent: Annotated[int, Meta(description="messages not sent or forwarded: nobody at the far end, or no room")] = 0
+    bytes_s: Annotated[float, Meta(description="received of late [bytes/s]")] = 0.0
+    messages_hz: Annotated[float, Meta(description="received of late [Hz]")] = 0.0
+    recorded: Annotated[int, Meta(description="bytes of frames written to the .tlog, stamps left out")] = 0
+    noise: Annotated[int, Meta(description="bytes not recorded because they belong to no frame")] = 0
+    unrecorded: Annotated[int, Meta(description="bytes the disk did not take, or not in time")] = 0
+    unwritten: Annotated[int, Meta(description="bytes that wait for the disk or for the rest of their frame")] = 0
+    share: Annotated[float, Meta(description="asked for of the rates wanted, for the sake of the budget, 0..1")] = 1.0
+    sentence: Annotated[str, Meta(description="what an operator should know, or empty")] = ""
+
+
 class Account(msgspec.Struct, frozen=True, kw_only=True):
     """Counters of one gateway."""
 
@@ -552,11 +603,17 @@ class Account(msgspec.Struct, frozen=True, kw_only=True):
     bad_bytes: Annotated[int, Meta(description="bytes that were no MAVLink frame")] = 0
     bad_frames: Annotated[int, Meta(description="frames with a wrong checksum or an unknown message id")] = 0
     refused: Annotated[dict[str, int], Meta(description="good frames refused, by reason")] = {}
-    published: int = 0
+    published: Annotated[int, Meta(description="messages given to a router that was there")] = 0
     sentence: str = ""
+    per_link: tuple[LinkAccount, ...] = ()
+    router: Annotated[bool, Meta(description="a router is there")] = True
+    unsent: Annotated[int, Meta(description="messages nobody got, as no router was there")] = 0
+    unsure: Annotated[int, Meta(description="published in the second before a router was missed")] = 0
+    removed: Annotated[int, Meta(description="recordings removed to stay within the budget")] = 0
+    history_bytes: Annotated[int, Meta(description="kept for late joiners")] = 0
 
 
-PER_UAV: tuple[type[Message], ...] = (Sample, Status, Mission, Params, Model, Prediction, Mismatch, Alert)
+PER_UAV: tuple[type[Message], ...] = (Sample, Status, Mission, Params, History, Model, Prediction, Mismatch, Alert)
 CONTROL: tuple[type, ...] = (FleetState, Account)
 QUERIES: dict[type, type] = {Prediction: WhatIf}  # what a query on a key may carry
 TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}  # type: ignore[attr-defined]

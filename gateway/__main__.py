@@ -15,6 +15,9 @@ from gateway.gate import gates_of
 from gateway.link import Link
 from gateway.links.opening import open_link
 from gateway.pump import Pump
+from gateway.record.recorder import Recorder
+from gateway.record.size import read_size
+from gateway.record.tape import Budget
 from gateway.recorded import Replay
 from gateway.spec import read_forward, read_spec
 
@@ -31,6 +34,7 @@ EXAMPLES = """
   gateway --link "replay:flight.tlog.xz?speed=4"       play a recording four times as fast
   gateway --link "replay:flight.tlog?speed=max&copies=50"
   gateway --listen-only                                send nothing to any aircraft
+  gateway --record flights --record-budget 20G         and keep what was heard, the router there or not
 
 links:
   udpin:HOST:PORT   udpout:HOST:PORT   udpbcast:HOST:PORT   tcpin:HOST:PORT   tcp:HOST:PORT   serial:PATH[:BAUD]
@@ -52,8 +56,9 @@ def run(args: argparse.Namespace) -> int:
     if args.most_uavs < 1:
         raise ValueError(f"--most-uavs: found {args.most_uavs}, expected at least 1; write e.g. 250")
     gates = gates_of(specs, len(args.forward), args.keys)
+    budget = Budget(args.record, read_size(args.record_budget)) if args.record is not None else None
     stop = stop_on_signal()
-    with connect(args.router) as bus, contextlib.ExitStack() as held:
+    with connect(args.router, patient=budget is not None) as bus, contextlib.ExitStack() as held:
         links: list[Link] = []
         ids = Ids()
         for spec in specs:
@@ -65,7 +70,8 @@ def run(args: argparse.Namespace) -> int:
         with shown(replays, lambda line: print(f"gateway: {line}", flush=True)):
             for replay in replays:
                 replay.look(stop)
-            settings = {"gates": gates, "stations": len(args.forward), "most": args.most_uavs}
+            recorder = None if budget is None else held.enter_context(Recorder(budget, [spec.text for spec in specs]))
+            settings = {"gates": gates, "stations": len(args.forward), "most": args.most_uavs, "recorder": recorder}
             Pump(links, bus, args.listen_only, **settings).run(stop)
     return 0
 
@@ -85,6 +91,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--keys", type=Path, metavar="FILE", help="keys of signed links, for its owner's eyes only")
     parser.add_argument("--router", default=ROUTER, help=f"where the bus is ({ROUTER})")
     parser.add_argument("--listen-only", action="store_true", help="send nothing at all to the aircraft")
+    parser.add_argument("--record", type=Path, metavar="DIR", help="write a .tlog of each link into this folder")
+    parser.add_argument(
+        "--record-budget", default="10G", metavar="SIZE", help="what its .tlog may take up; the oldest go (10G)"
+    )
     return guarded("gateway", run, parser.parse_args(argv))
 
 

@@ -9,12 +9,21 @@ from typing import Any
 import msgspec
 
 from fleet.bus import Answers, Bus
-from fleet.codec import Stamp, Wire
-from fleet.contract import Account, Alert, AlertKind, FleetState, Mission, Params, Status
+from fleet.codec import Stamp, Wire, encode
+from fleet.contract import PER_UAV, Account, Alert, AlertKind, FleetState, History, Mission, Params, Status
 from fleet.telemetry.fleet_news import RESULTS
+from gateway.history import KINDS, Keeper
+from gateway.router import Way
 
 KEPT = (Status, Mission, Params, Alert)
 REPEAT_S = 10.0  # mission and parameters are said again, for those who missed them [s]
+
+
+class _When(msgspec.Struct):
+    t: float
+
+
+_WHEN = msgspec.msgpack.Decoder(_When)
 
 
 class Publisher:
@@ -26,16 +35,17 @@ class Publisher:
     """
 
     def __init__(self, bus: Bus, results: bool = False) -> None:
-        self.published = 0
+        self.way, self.history = Way(bus), Keeper()
         self._bus = bus
         self._lock = threading.Lock()  # answers come from a thread of the bus
         kept = tuple(dict.fromkeys(KEPT + RESULTS)) if results else KEPT
         self._latest: dict[type, dict[Hashable, tuple[Any, Stamp | None]]] = {kind: {} for kind in kept}
-        self._account: Account | None = None
+        self.told: Account | None = None  # the newest counters
         self._repeated = 0.0
         for kind in kept:
             bus.answer(kind, partial(self._answers, kind))
         bus.answer(Account, self._account_answer)
+        bus.answer(History, self.history.answer)
 
     def publish(self, messages: Iterable[Any]) -> None:
         """Put messages on the bus."""
@@ -45,24 +55,31 @@ class Publisher:
             if kind in RESULTS and getattr(message, "kind", None) is not AlertKind.SECOND_SENDER:
                 message, stamp = self._claimed(message)
             self._keep(kind, (getattr(message, "uav", 0), str(getattr(message, "kind", ""))), message, stamp)
-            self._bus.publish(message, stamp)
-            self.published += 1
+            wire = Wire(kind, message.uav if kind in PER_UAV else -1, encode(message))
+            self.history.keep(wire, message.t)
+            self.way.send(wire, stamp)
 
     def put(self, wires: Iterable[Wire]) -> None:
         """Put messages on the bus that are packed already; results of workers are never among them."""
         for wire in wires:
             self._keep(wire.kind, (wire.uav, ""), wire, None)
-            self._bus.put(wire)
-            self.published += 1
+            if wire.kind in KINDS:
+                self.history.keep(wire, _WHEN.decode(wire.payload).t)
+            self.way.send(wire)
 
     def account(self, account: Account) -> None:
         """Put the counters on the bus."""
-        self._account = account
-        self._bus.publish(account)
+        self.told = account
+        self.way.send(Wire(Account, -1, encode(account)))
+
+    def statuses(self) -> list[Status]:
+        """Give the newest of every aircraft, by id."""
+        return [status for status, _ in sorted(self._answers(Status, None, {}, b""), key=lambda pair: pair[0].uav)]
 
     def repeat(self, mono: float) -> None:
         """Say missions and parameters again when it is time; `mono` is any clock that only goes forward [s]."""
-        if mono - self._repeated < REPEAT_S:
+        came = self.way.look()
+        if mono - self._repeated < REPEAT_S and not came:
             return
         self._repeated = mono
         for kind in (Mission, Params):
@@ -91,4 +108,4 @@ class Publisher:
 
     def _account_answer(self, uav: int | None, settings: dict[str, str], payload: bytes) -> Answers:
         del uav, settings, payload
-        return [] if self._account is None else [(self._account, None)]
+        return [] if self.told is None else [(self.told, None)]

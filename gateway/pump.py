@@ -3,7 +3,7 @@
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import msgspec
 
@@ -11,6 +11,7 @@ from fleet.bus import Bus
 from fleet.codec import Wire
 from fleet.contract import Message
 from fleet.telemetry.craft import Craft
+from fleet.telemetry.heard import Heard
 from fleet.telemetry.intake import MOST_UAVS, Intake
 from gateway.account import Tally
 from gateway.forward import Forward
@@ -18,6 +19,7 @@ from gateway.gate import Gate, gates_of
 from gateway.link import QUEUE, Batch, Link, wall
 from gateway.onboard import Onboard
 from gateway.publish import Publisher
+from gateway.record.recorder import Recorder, Tapped
 
 TICK_S = 0.1  # between two publications of a live link [s]
 NAP_S = 0.02  # at an empty queue [s]
@@ -34,6 +36,7 @@ class Pump:
         gates: what each link lets in; None: whatever its sieve does, signed or not
         stations: how many of the last links lead to other ground stations
         most: UAVs at a time
+        recorder: takes everything heard, and what the gateway itself says; closed by whoever made it
     """
 
     def __init__(
@@ -45,13 +48,14 @@ class Pump:
         gates: Sequence[Gate] | None = None,
         stations: int = 0,
         most: int = MOST_UAVS,
+        recorder: Recorder | None = None,
     ) -> None:
         self.links = links
         self.forward = Forward(links, stations, listen_only)
         self._gates = gates_of([link.spec for link in links], stations) if gates is None else gates
         self._heard: set[int] = set()  # links with something to forward
         self._stations = range(len(links) - stations, len(links))
-        self.tally = Tally()
+        self.tally = Tally(links, recorder)
         self.publisher = Publisher(bus, results=any(link.spec.results for link in links))
         claims: dict[int, Craft] = {}
         self.intakes = [
@@ -59,7 +63,8 @@ class Pump:
         ]
         self._onboards = [Onboard() for _ in links]
         self._listen_only = listen_only
-        self._queue: queue.Queue[Batch] = queue.Queue(QUEUE)
+        self._recorder = recorder
+        self._queue: queue.Queue[Batch] = Tapped(QUEUE, recorder)
         self._open = set(range(len(links)))
         to_aircraft = links[: self._stations.start]
         self._live = [number for number, link in enumerate(to_aircraft) if link.spec.kind != "replay"]
@@ -91,7 +96,7 @@ class Pump:
         """Work through one batch."""
         intake = self.intakes[batch.link]
         if batch.heard is not None:
-            self.tally.add(batch.heard)
+            self.tally.add(batch.link, batch.heard)
             intake.listen(batch.heard)
             self._heard.add(batch.link)
         if batch.gone is not None:
@@ -134,12 +139,18 @@ class Pump:
             self.publisher.publish([one for one in news if not isinstance(one, Wire)])
             if not self._listen_only:
                 for where, data in self._onboards[number].tick(now, intake.crafts.values(), link.greets):
-                    link.send(where, gate.sign(data))
+                    self._say(number, where, gate.sign(data))
         self.publisher.repeat(mono)
+
+    def _say(self, number: int, where: Hashable, data: bytes) -> None:
+        self.links[number].send(where, data)
+        self.tally.sent(number, len(data))
+        if self._recorder is not None:
+            self._recorder.hear(number, Heard.of([(wall(), ("sent", where), data)]))
 
     def _tell(self) -> None:
         now = wall() if self._live else self._recorded
         self.forward.tidy(wall())
-        account = self.tally.account(now, self.links, self.intakes, self._players)
-        refused = {**account.refused, **self.forward.refused}
-        self.publisher.account(msgspec.structs.replace(account, published=self.publisher.published, refused=refused))
+        account = self.tally.account(now, self.intakes, self._players, self.publisher.way)
+        refused, kept = {**account.refused, **self.forward.refused}, self.publisher.history.size
+        self.publisher.account(msgspec.structs.replace(account, refused=refused, history_bytes=kept))

@@ -179,9 +179,9 @@ def test_a_disk_too_slow_costs_counted_bytes_and_no_memory(tmp_path, monkeypatch
 def test_what_no_longer_fits_into_the_queue_is_recorded_all_the_same(tmp_path):
     with Recorder(Budget(tmp_path, MORE), ["a"]) as recorder:
         tapped = Tapped(1, recorder)
-        tapped.put_nowait(Batch(0, [(T0, "air", frames(1)[0])]))
+        tapped.put_nowait(Batch(0, Heard.of([(T0, "air", frames(1)[0])])))
         with pytest.raises(module.queue.Full):
-            tapped.put_nowait(Batch(0, [(T0, "air", frames(2)[1])]))
+            tapped.put_nowait(Batch(0, Heard.of([(T0, "air", frames(2)[1])])))
     assert recorder.account()[0].frames == 2 and tapped.qsize() == 1
 
 

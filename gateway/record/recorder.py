@@ -127,6 +127,6 @@ class Tapped(queue.Queue[Batch]):
 
     def put(self, item: Batch, block: bool = True, timeout: float | None = None) -> None:
         """Record what was heard, then queue it."""
-        if self._recorder is not None and len(item.heard):
-            self._recorder.hear(item.link, item.heard if isinstance(item.heard, Heard) else Heard.of(item.heard))
+        if self._recorder is not None and item.heard is not None:
+            self._recorder.hear(item.link, item.heard)
         super().put(item, block, timeout)
