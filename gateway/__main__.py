@@ -6,14 +6,18 @@ import logging
 import sys
 from pathlib import Path
 
+from rich.console import Console
+
 from fleet.bars import shown
 from fleet.bus import ROUTER, connect
 from fleet.cli import guarded, parser_for, stop_on_signal
 from fleet.telemetry.ids import Ids
 from fleet.telemetry.intake import MOST_UAVS
+from gateway.board import posted
 from gateway.gate import gates_of
 from gateway.link import Link
 from gateway.links.opening import open_link
+from gateway.metrics import served
 from gateway.pump import Pump
 from gateway.record.recorder import Recorder
 from gateway.record.size import read_size
@@ -34,6 +38,7 @@ EXAMPLES = """
   gateway --link "replay:flight.tlog.xz?speed=4"       play a recording four times as fast
   gateway --link "replay:flight.tlog?speed=max&copies=50"
   gateway --listen-only                                send nothing to any aircraft
+  gateway --metrics 127.0.0.1:9100                     counters for Prometheus, at http://127.0.0.1:9100/metrics
   gateway --record flights --record-budget 20G         and keep what was heard, the router there or not
 
 links:
@@ -65,15 +70,25 @@ def run(args: argparse.Namespace) -> int:
             link = open_link(spec, ids)
             held.callback(link.close)
             links.append(link)
-            print(f"gateway: {spec.text}", flush=True)
+            _say(spec.text)
         replays = [link for link in links if isinstance(link, Replay)]
-        with shown(replays, lambda line: print(f"gateway: {line}", flush=True)):
+        with shown(replays, _say):
             for replay in replays:
                 replay.look(stop)
             recorder = None if budget is None else held.enter_context(Recorder(budget, [spec.text for spec in specs]))
             settings = {"gates": gates, "stations": len(args.forward), "most": args.most_uavs, "recorder": recorder}
-            Pump(links, bus, args.listen_only, **settings).run(stop)
+            pump = Pump(links, bus, args.listen_only, **settings)
+            if len(replays) < len(links):
+                console = Console() if sys.stdout.isatty() and not replays else None
+                held.enter_context(posted(pump.publisher.newest, _say, console))
+            if args.metrics:
+                _say(f"counters at {held.enter_context(served(args.metrics, pump.publisher.newest))}")
+            pump.run(stop)
     return 0
+
+
+def _say(line: str) -> None:
+    print(f"gateway: {line}", flush=True)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -95,6 +110,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--record-budget", default="10G", metavar="SIZE", help="what its .tlog may take up; the oldest go (10G)"
     )
+    parser.add_argument("--metrics", metavar="HOST:PORT", help="counters for Prometheus, e.g. 127.0.0.1:9100")
     return guarded("gateway", run, parser.parse_args(argv))
 
 

@@ -19,6 +19,9 @@ KEPT = (Status, Mission, Params, Alert)
 REPEAT_S = 10.0  # mission and parameters are said again, for those who missed them [s]
 
 
+Told = tuple[Account | None, list[Status]]
+
+
 class _When(msgspec.Struct):
     t: float
 
@@ -72,9 +75,9 @@ class Publisher:
         self.told = account
         self.way.send(Wire(Account, -1, encode(account)))
 
-    def statuses(self) -> list[Status]:
-        """Give the newest of every aircraft, by id."""
-        return [status for status, _ in sorted(self._answers(Status, None, {}, b""), key=lambda pair: pair[0].uav)]
+    def newest(self) -> Told:
+        """Give the newest counters, and the newest status of every aircraft by id."""
+        return self.told, [s for s, _ in sorted(self._answers(Status, None, {}, b""), key=lambda pair: pair[0].uav)]
 
     def repeat(self, mono: float) -> None:
         """Say missions and parameters again when it is time; `mono` is any clock that only goes forward [s]."""
