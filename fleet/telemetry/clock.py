@@ -16,6 +16,7 @@ LEAP_S = 2.0  # getting ahead of arrival further than this is a jump [s]
 CONFIRM = 3  # messages in a row that must agree on a jump
 WARM_UP_S = 1.0  # the offset may still step [s]
 BUCKET_S = 15.0  # the minimum is over one to two of these [s]
+LATELY = 0.01  # weight of the newest delay in the mean
 SLEW = 2e-3  # drift the offset may follow [s/s]
 SLEW_FAST = 0.1  # when the offset is plainly too late [s/s]
 PLAIN_S = 0.25  # what is plainly [s]
@@ -32,8 +33,10 @@ PLAIN_S = 0.25  # what is plainly [s]
     LEAST,  # least delay of this bucket [s]
     LEAST_BEFORE,  # and of the one before [s]
     BUCKET,  # arrival at which this bucket began
+    DELAY,  # of late, mean: arrival minus fleet time given out [s]
+    WORST,  # largest since it was last taken [s]
     LENGTH,
-) = range(12)
+) = range(14)
 BOOT, USEC, USEC32, NONE = range(4)
 """Where the time of a message comes from: time_boot_ms, time_usec, time_usec cut to 32 bit, nowhere."""
 
@@ -74,6 +77,9 @@ def read(clock, raw_s, arrival, latest):
     if step > 0:
         _follow(clock, arrival - own, arrival, passed)
         clock[NEWEST], clock[ARRIVAL] = own, arrival
+        delay = max(arrival - own - clock[OFFSET], 0.0)
+        clock[DELAY] += LATELY * (delay - clock[DELAY])
+        clock[WORST] = max(clock[WORST], delay)
     return _at(clock, own)
 
 

@@ -11,6 +11,7 @@ from fleet.telemetry.flock.flock import Flock
 from fleet.telemetry.onboard_log import Said
 from fleet.telemetry.params import ParamBook
 from fleet.telemetry.route import MESSAGES, RouteBook
+from fleet.telemetry.timing import Timing
 
 LOST_S = 3.0  # silence after which the link is called lost [s]
 STATUS_S = 0.95  # between two messages; a little under the second, for it is asked every 0.1 s [s]
@@ -39,6 +40,7 @@ class Craft:
         self.texts: deque[tuple[float, int, str]] = deque(maxlen=MOST_TEXTS)  # fleet time, severity, words
         self.params, self.route = ParamBook(uav), RouteBook(uav)
         self.rates: dict[str, float] = {}
+        self.timing = Timing(lambda: flock.clocks[self.number])
         self._waiting: list[tuple[float, Callable[..., None], tuple[Any, ...]]] = []
         self._done = 0  # of those waiting
         self._refused = 0
@@ -169,7 +171,7 @@ class Craft:
             received=int(counted[RECEIVED]),
             missed=int(counted[MISSED]),
             rejected=self._rejected(),
-            clock_offset_s=float(self.flock.clocks[self.number, clock.BOOT, clock.OFFSET]),
+            **self.timing.told(now),
             clock_jumps=self._jumps,
             sentence=self._words(now),
         )

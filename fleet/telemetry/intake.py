@@ -19,6 +19,7 @@ from fleet.telemetry.heard import Heard, merged
 from fleet.telemetry.heartbeat import is_aircraft
 from fleet.telemetry.route import MESSAGES
 from fleet.telemetry.scan import COMPONENT, EXTRA, ID, PAYLOAD, SEQ, SIZE, SYSTEM
+from fleet.telemetry.timing import time
 
 MOST_UAVS = 2_000  # over all links
 SECOND = "second sender for a live id"
@@ -166,6 +167,7 @@ class Intake:
         if len(mine):
             self.flock.counts.note(owner[mine], kinds(frames)[mine], frames.arrival[mine], frames.at[mine, SEQ])
             lay(frames, owner, list(self.crafts.values()), self.flock)
+            time(frames, owner, [craft.timing for craft in self.crafts.values()])
 
     def _single(self, frames: Frames, i: int) -> Any | None:
         """Give frame `i` as pymavlink would; what is said over and over is read once."""
