@@ -18,6 +18,8 @@ from gateway.gate import gates_of
 from gateway.link import Link
 from gateway.links.opening import open_link
 from gateway.metrics import served
+from gateway.onboard.cache import Cache
+from gateway.onboard.rates import BUDGET
 from gateway.pump import Pump
 from gateway.record.recorder import Recorder
 from gateway.record.size import read_size
@@ -61,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     if args.most_uavs < 1:
         raise ValueError(f"--most-uavs: found {args.most_uavs}, expected at least 1; write e.g. 250")
     gates = gates_of(specs, len(args.forward), args.keys)
-    budget = Budget(args.record, read_size(args.record_budget)) if args.record is not None else None
+    budget = Budget(args.record, read_size(args.record_budget, "--record-budget")) if args.record is not None else None
     stop = stop_on_signal()
     with connect(args.router, patient=budget is not None) as bus, contextlib.ExitStack() as held:
         links: list[Link] = []
@@ -77,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
                 replay.look(stop)
             recorder = None if budget is None else held.enter_context(Recorder(budget, [spec.text for spec in specs]))
             settings = {"gates": gates, "stations": len(args.forward), "most": args.most_uavs, "recorder": recorder}
+            settings |= {"budget": args.budget, "cache": None if args.listen_only else Cache()}
             pump = Pump(links, bus, args.listen_only, **settings)
             if len(replays) < len(links):
                 console = Console() if sys.stdout.isatty() and not replays else None
@@ -106,6 +109,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--keys", type=Path, metavar="FILE", help="keys of signed links, for its owner's eyes only")
     parser.add_argument("--router", default=ROUTER, help=f"where the bus is ({ROUTER})")
     parser.add_argument("--listen-only", action="store_true", help="send nothing at all to the aircraft")
+    parser.add_argument(
+        "--budget",
+        default="",
+        metavar="SIZE",
+        help=f"bytes/s aircraft may send on a link ({BUDGET}; serial: 70 %% of baud)",
+    )
     parser.add_argument("--record", type=Path, metavar="DIR", help="write a .tlog of each link into this folder")
     parser.add_argument(
         "--record-budget", default="10G", metavar="SIZE", help="what its .tlog may take up; the oldest go (10G)"

@@ -8,6 +8,7 @@ from fleet.contract import Account, LinkAccount
 from fleet.telemetry.heard import Heard
 from fleet.telemetry.intake import Intake
 from gateway.link import Link
+from gateway.onboard.rates import Share
 from gateway.record.recorder import Recorder, Taped
 from gateway.router import Way
 
@@ -52,10 +53,12 @@ class Tally:
         flow.sent += 1
         flow.bytes_out += size
 
-    def account(self, t: float, intakes: Sequence[Intake], players: set[int], way: Way) -> Account:
+    def account(
+        self, t: float, intakes: Sequence[Intake], players: set[int], way: Way, shares: Sequence[Share]
+    ) -> Account:
         """Make the message; `t` is fleet time [s since 1970], `players` the UAV ids of recordings."""
         taped = self._recorder.account() if self._recorder is not None else [Taped() for _ in self._links]
-        told = tuple(self._link(t, k, intake, taped[k]) for k, intake in enumerate(intakes))
+        told = tuple(self._link(t, k, intakes[k], taped[k], share) for k, share in enumerate(shares))
         refused: Counter[str] = Counter()
         uavs = set(players)
         for intake in intakes:
@@ -84,7 +87,7 @@ class Tally:
             removed=self._recorder.budget.removed if self._recorder is not None else 0,
         )
 
-    def _link(self, t: float, number: int, intake: Intake, taped: Taped) -> LinkAccount:
+    def _link(self, t: float, number: int, intake: Intake, taped: Taped, share: Share) -> LinkAccount:
         flow, link, counts = self._flows[number], self._links[number], intake.counters()
         flow.measure(t, counts["messages"])
         return LinkAccount(
@@ -105,7 +108,8 @@ class Tally:
             noise=taped.noise,
             unrecorded=taped.lost + taped.dropped,
             unwritten=taped.waiting,
-            sentence=taped.trouble,
+            share=share.now,
+            sentence="; ".join(filter(None, (taped.trouble, share.sentence))),
         )
 
 

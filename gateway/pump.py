@@ -18,6 +18,8 @@ from gateway.forward import Forward
 from gateway.gate import Gate, gates_of
 from gateway.link import QUEUE, Batch, Link, wall
 from gateway.onboard import Onboard
+from gateway.onboard.cache import Cache
+from gateway.onboard.rates import budget_of
 from gateway.publish import Publisher
 from gateway.record.recorder import Recorder, Tapped
 
@@ -37,6 +39,8 @@ class Pump:
         stations: how many of the last links lead to other ground stations
         most: UAVs at a time
         recorder: takes everything heard, and what the gateway itself says; closed by whoever made it
+        budget: what the aircraft of one link may send together, as on the command line; empty: what suits the link
+        cache: what aircraft told before; None: nothing is kept
     """
 
     def __init__(
@@ -49,6 +53,8 @@ class Pump:
         stations: int = 0,
         most: int = MOST_UAVS,
         recorder: Recorder | None = None,
+        budget: str = "",
+        cache: Cache | None = None,
     ) -> None:
         self.links = links
         self.forward = Forward(links, stations, listen_only)
@@ -61,7 +67,7 @@ class Pump:
         self.intakes = [
             Intake(link.spec.offset, claims, most, gate.admit) for link, gate in zip(links, self._gates, strict=True)
         ]
-        self._onboards = [Onboard() for _ in links]
+        self._onboards = [Onboard(budget_of(link.spec, budget), cache) for link in links]
         self._listen_only = listen_only
         self._recorder = recorder
         self._queue: queue.Queue[Batch] = Tapped(QUEUE, recorder)
@@ -151,6 +157,7 @@ class Pump:
     def _tell(self) -> None:
         now = wall() if self._live else self._recorded
         self.forward.tidy(wall())
-        account = self.tally.account(now, self.intakes, self._players, self.publisher.way)
+        shares = [onboard.share for onboard in self._onboards]
+        account = self.tally.account(now, self.intakes, self._players, self.publisher.way, shares)
         refused, kept = {**account.refused, **self.forward.refused}, self.publisher.history.size
         self.publisher.account(msgspec.structs.replace(account, refused=refused, history_bytes=kept))

@@ -4,6 +4,7 @@ import copy
 import os
 import shutil
 import socket
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -72,6 +73,7 @@ def router() -> Iterator[str]:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[LONG_FILES] = []
+    os.environ.setdefault("PARAUAV_ONBOARD", tempfile.mkdtemp(prefix="parauav-onboard-"))  # not the user's own
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:

@@ -187,13 +187,13 @@ def test_what_no_longer_fits_into_the_queue_is_recorded_all_the_same(tmp_path):
 
 @pytest.mark.parametrize(("text", "size"), [("500M", 5e8), ("10G", 1e10), ("1.5k", 1500), ("7", 7), ("2GB", 2e9)])
 def test_a_size_is_read(text, size):
-    assert read_size(text) == size
+    assert read_size(text, "--record-budget") == size
 
 
 @pytest.mark.parametrize("text", ["", "0", "-1G", "ten", "1X"])
 def test_what_is_no_size_stops_at_start(text):
     with pytest.raises(ValueError, match=r"^--record-budget: found .*, expected .*; correct it$"):
-        read_size(text)
+        read_size(text, "--record-budget")
 
 
 def test_sizes_in_words():

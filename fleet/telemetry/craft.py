@@ -37,6 +37,7 @@ class Craft:
         self.link = Link.LIVE
         self.autopilot, self.vehicle, self.mode, self.armed = "generic", heartbeat.UNKNOWN, "", False
         self.firmware = ""
+        self.board = ""  # the autopilot's own number and version; empty: not told
         self.texts: deque[tuple[float, int, str]] = deque(maxlen=MOST_TEXTS)  # fleet time, severity, words
         self.params, self.route = ParamBook(uav), RouteBook(uav)
         self.rates: dict[str, float] = {}
@@ -103,8 +104,10 @@ class Craft:
             self.route.place_home(message.altitude * 1e-3)
         elif name == "STATUSTEXT":
             self._read(message.severity, str(message.text).strip(), now)
-        elif name == "AUTOPILOT_VERSION" and message.flight_sw_version:
-            self.firmware = self.firmware or heartbeat.firmware(message)
+        elif name == "AUTOPILOT_VERSION":
+            self.board = heartbeat.board(message)
+            if message.flight_sw_version:
+                self.firmware = self.firmware or heartbeat.firmware(message)
 
     def overhear(self, message: Any, now: float) -> None:
         """Take one message of the mission protocol that a ground station sent to this aircraft."""

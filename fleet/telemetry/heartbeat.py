@@ -64,6 +64,12 @@ def firmware(version: Any) -> str:
     return f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}"
 
 
+def board(version: Any) -> str:
+    """Read which board with which firmware AUTOPILOT_VERSION comes from; empty where it does not say."""
+    number = bytes(version.uid2).hex().strip("0") or (f"{version.uid:x}" if version.uid else "")
+    return f"{number}-{version.flight_sw_version:08x}" if number else ""
+
+
 def names_firmware(words: str) -> bool:
     """Tell whether a text names autopilot and version, e.g. ArduPlane V4.7.0-dev (d55cb382)."""
     return words.startswith(("ArduPlane V", "ArduCopter V", "APM:", "PX4 v", "Blimp V", "ArduRover V"))

@@ -7,6 +7,7 @@ from typing import Any
 from fleet.contract import Params
 
 UNSOLICITED = 65535  # index of a value nobody asked for
+HASH = "_HASH_CHECK"  # no parameter: the hash over all of them
 MOST = 5_000  # parameters accepted from one aircraft
 PAUSE_S = 1.0  # least time between two publications [s]
 _AS_INTEGER = {1: "<Bxxx", 2: "<bxxx", 3: "<Hxx", 4: "<hxx", 5: "<I", 6: "<i"}  # MAV_PARAM_TYPE
@@ -20,7 +21,8 @@ class ParamBook:
         self.values: dict[str, float] = {}
         self.rejected = 0
         self.heard = float("-inf")  # when the last one came
-        self._count = 0
+        self.count = 0  # as the aircraft tells it, 0 before
+        self.hash: float | None = None  # over all of them, as PX4 tells it
         self._indices: set[int] = set()
         self._refused: dict[str, None] = {}
         self._changed = False
@@ -30,11 +32,16 @@ class ParamBook:
         """Take one PARAM_VALUE."""
         name, value = message.param_id, as_number(message, autopilot)
         self.heard = now
+        if name == HASH:
+            self.hash = value
+            return
+        if 0 < message.param_count <= MOST and not self.count:
+            self.count = message.param_count
         if message.param_index != UNSOLICITED and message.param_count <= MOST:
-            if message.param_count != self._count:
-                self._count = message.param_count
+            if message.param_count != self.count:
+                self.count = message.param_count
                 self._changed = True
-            if message.param_index < self._count:
+            if message.param_index < self.count:
                 self._indices.add(message.param_index)
         self.put(name, value)
 
@@ -52,16 +59,20 @@ class ParamBook:
             self._refused.pop(name, None)
             self._changed = True
 
+    def adopt(self, values: dict[str, float], count: int) -> None:
+        """Take all parameters as they were told before, found still to hold."""
+        self.values, self.count, self._indices, self._changed = dict(values), count, set(range(count)), True
+
     @property
     def complete(self) -> bool:
         """Tell whether every index was heard."""
-        return self._count > 0 and len(self._indices) >= self._count
+        return self.count > 0 and len(self._indices) >= self.count
 
     def missing(self) -> list[int] | None:
         """Give the indices not heard yet; None when not even their number is known."""
-        if not self._count:
+        if not self.count:
             return None
-        return [index for index in range(self._count) if index not in self._indices]
+        return [index for index in range(self.count) if index not in self._indices]
 
     def take(self, now: float) -> Params | None:
         """Give the parameters when there is news, at most once a second."""

@@ -12,6 +12,7 @@ NOTHING = 0  # no MAV_CMD; stands for an item that cannot be flown
 NAV_LAST = 95  # MAV_CMD_NAV_LAST: commands above it are no place to fly to
 DO_JUMP = 177
 WAYPOINT = 16
+SPOT, FIRST = 10, 3  # of a mission recalled, the first three of every ten items are asked for before it is believed
 ACCEPT_S = 3.0  # an upload without an acknowledgement is believed after this silence [s]
 SETTLE_S = 2.0  # an incomplete list is shown after this silence [s]
 
@@ -29,6 +30,7 @@ class _Draft:
         self.count = count
         self.items: dict[int, Item] = {}
         self.notes: dict[int, str] = {}
+        self.guessed: set[int] = set()  # filled in from what was there before
         self.heard = now
 
     def whole(self) -> bool:
@@ -46,6 +48,8 @@ class RouteBook:
         self.seq = -1
         self.count: int | None = None  # of the download on its way
         self.rejected = 0
+        self.unproven: set[int] = set()  # items believed since a few others are as they were before
+        self._recalled: tuple[Item, ...] = ()
         self._home_m: float | None = None
         self._sentence = ""
         self._drafts: dict[bool, _Draft | None] = {False: None, True: None}
@@ -72,6 +76,10 @@ class RouteBook:
         draft = _Draft(len(items), 0.0)
         draft.items = dict(enumerate(items))
         self._adopt(draft)
+
+    def recall(self, items: tuple[Item, ...]) -> None:
+        """Learn what the mission was before: so it is again where the count and a few items are the same."""
+        self._recalled = items
 
     def place_home(self, altitude_m: float) -> None:
         """Learn how high home is above sea level [m], for a mission that does not hold home (PX4)."""
@@ -118,11 +126,16 @@ class RouteBook:
         draft = self._drafts[up]
         if draft is None or draft.count != count:
             draft = self._drafts[up] = _Draft(count, now)
+            if not up and count == len(self._recalled):
+                draft.items = {item.seq: item for item in self._recalled if item.seq % SPOT >= FIRST}
+                draft.guessed = set(draft.items)
         if count == 0 and not up:
             self._adopt(draft)
 
     def _write(self, message: Any, up: bool, now: float) -> None:
         draft = self._drafts[up]
+        if draft is None and not up and self.complete and message.get_type() == "MISSION_ITEM_INT":
+            return self._compare(message)
         if draft is None:
             draft = self._drafts[up] = _Draft(None, now)
         limit = MAX_ITEMS if draft.count is None else draft.count
@@ -131,12 +144,24 @@ class RouteBook:
             return
         item, note = read_item(message)
         self.rejected += bool(note)
+        if draft.guessed and item != self._recalled[item.seq]:
+            draft.items = {seq: known for seq, known in draft.items.items() if seq not in draft.guessed}
+            draft.guessed, self._recalled = set(), ()
+        draft.guessed.discard(item.seq)
         draft.items[item.seq], draft.heard = item, now
         draft.notes.pop(item.seq, None)
         if note:
             draft.notes[item.seq] = note
         if not up and draft.whole():
             self._adopt(draft)
+
+    def _compare(self, message: Any) -> None:
+        """Notice by one item of a mission that is known whole that there is another on board."""
+        known = self.items[message.seq : message.seq + 1]
+        if known == (read_item(message)[0],):
+            self.unproven.discard(message.seq)
+        elif known:
+            self.stale = True
 
     def _settle(self, accepted: bool) -> None:
         draft, self._drafts[True] = self._drafts[True], None
@@ -153,7 +178,7 @@ class RouteBook:
             self.items, self.complete, self._sentence = items, True, sentence
             self._changed = True
         self._drafts[False] = self._drafts[True] = None
-        self.stale = False
+        self.stale, self.unproven, self._recalled = False, draft.guessed, ()
 
     def _show_part(self, draft: _Draft) -> None:
         items = tuple(draft.items[seq] for seq in sorted(draft.items))

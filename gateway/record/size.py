@@ -5,15 +5,15 @@ import re
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
 
-def read_size(text: str) -> int:
-    """Read `500M` or `10G` [bytes].
+def read_size(text: str, option: str) -> int:
+    """Read `500M` or `10G` [bytes], the value of a command line's `option`.
 
     Raises:
         ValueError: when it is neither.
     """
     found = re.fullmatch(r"(\d+(?:\.\d+)?)([kMGT]?)B?", text.strip())
     if found is None or float(found[1]) <= 0:
-        raise ValueError(f"--record-budget: found {text!r}, expected a size such as 500M or 10G; correct it")
+        raise ValueError(f"{option}: found {text!r}, expected a size such as 500M or 10G; correct it")
     return round(float(found[1]) * _UNITS[found[2]])
 
 

@@ -1,0 +1,75 @@
+"""How often each message is wanted, and what a link can carry of it."""
+
+from collections.abc import Collection
+
+import numpy as np
+
+from fleet.telemetry.craft import Craft
+from fleet.telemetry.decode import layout
+from gateway.record.size import in_words, read_size
+from gateway.spec import Spec
+
+WANTED_HZ: dict[str, float] = {  # [Hz]
+    "ATTITUDE": 25,
+    "SERVO_OUTPUT_RAW": 20,
+    "GLOBAL_POSITION_INT": 10,
+    "VFR_HUD": 10,
+    "NAV_CONTROLLER_OUTPUT": 5,
+    "MISSION_CURRENT": 1,
+}
+LEAST = 0.1  # share of the rates wanted that is asked for in any case: less is of no use
+BUDGET = "1M"  # what the aircraft of one link may send [bytes/s]
+_FRAME = 12  # bytes round a payload
+_RADIO = 0.7  # share of a serial line that telemetry may fill
+_STEADY = 0.15  # a share that would change by less stays
+
+
+def budget_of(spec: Spec, text: str = "") -> float:
+    """Give what aircraft may send on a link [bytes/s]: as asked for, or what suits its kind.
+
+    Raises:
+        ValueError: when `text` is no size.
+    """
+    if text or spec.kind != "serial":
+        return float(read_size(text or BUDGET, "--budget"))
+    return _RADIO * spec.port / 10  # ten bits a byte
+
+
+def size_of(name: str) -> int:
+    """Give the length of a message on the wire, nothing cut off [bytes]."""
+    return _FRAME + layout(name).itemsize
+
+
+WANTED_BYTES_S = sum(hz * size_of(name) for name, hz in WANTED_HZ.items())
+"""What one aircraft would send of the messages wanted [bytes/s]."""
+
+
+class Share:
+    """The share of the rates wanted that fits a link: the same for all of its aircraft.
+
+    Args:
+        budget: what they may send together [bytes/s]
+    """
+
+    def __init__(self, budget: float) -> None:
+        self.now = 1.0
+        self.sentence = ""
+        self._budget = budget
+
+    def weigh(self, crafts: Collection[Craft]) -> float:
+        """Give the share for these aircraft; what they send unasked counts too, where it is known."""
+        unasked = sum(
+            hz * size_of(name) for craft in crafts for name, hz in craft.rates.items() if name not in WANTED_HZ
+        )
+        wanted = WANTED_BYTES_S * len(crafts)
+        fits = float(np.clip((self._budget - unasked) / wanted, LEAST, 1.0)) if crafts else 1.0
+        if abs(fits - self.now) > _STEADY * self.now or (fits == 1.0) != (self.now == 1.0):
+            self.now = fits
+        self.sentence = ""
+        if self.now < 1.0:
+            need = in_words(wanted + unasked)
+            self.sentence = (
+                f"{len(crafts)} aircraft would send {need}/s, the budget is {in_words(self._budget)}/s: "
+                f"{self.now:.0%} of the rates wanted are asked for; raise --budget where the link carries more"
+            )
+        return self.now
