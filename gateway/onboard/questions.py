@@ -18,7 +18,7 @@ RETRY_S = 0.5  # for one item or a handful of parameters [s]
 ITEM_TRIES = 20  # in vain, then the list is asked for again: it may have become shorter
 WATCH_S, PROOF_S = 15.0, 1.0  # between two looks at an item: known; believed since others were as before [s]
 AGAIN_S, AGAIN_ITEM_S = 60.0, 2.0  # between two downloads where single items cannot be looked at, and for each item [s]
-KEEP_S = 60.0  # between two looks at whether there is something new to keep [s]
+KEEP_S, SOON_S = 60.0, 15.0  # between two looks at whether there is something new to keep, and before the first [s]
 TRIP_S = 10.0  # between two questions for the time [s]
 PARAMS_AT_ONCE = 10
 LIST_AGAIN = 200  # so many parameters missing are asked for as a list
@@ -35,7 +35,8 @@ class Questions:
         self.craft = craft
         self._recall = None if cache is None else Recall(craft, cache)
         self._share = 1.0
-        self._watch_at = self._keep_at = self._trip_at = now
+        self._watch_at = self._trip_at = now
+        self._keep_at = now - KEEP_S + SOON_S
         self._watched = 0
         self._to = (craft.system, craft.component)
         self._since = now
