@@ -35,13 +35,12 @@ class ParamBook:
         if name == HASH:
             self.hash = value
             return
-        if 0 < message.param_count <= MOST and not self.count:
-            self.count = message.param_count
-        if message.param_index != UNSOLICITED and message.param_count <= MOST:
+        asked = message.param_index != UNSOLICITED
+        if message.param_count <= MOST and (asked or not self.count):
             if message.param_count != self.count:
                 self.count = message.param_count
                 self._changed = True
-            if message.param_index < self.count:
+            if asked and message.param_index < self.count:
                 self._indices.add(message.param_index)
         self.put(name, value)
 
