@@ -26,10 +26,10 @@ def flight(seconds, drift=0.0, jitter_s=0.05, boot=100.0, seed=1):
 def test_jitter_and_drift_leave_a_few_milliseconds(drift):
     clocks = c.new_clocks()
     timing, told, error = Timing(lambda: clocks), {}, []
-    for true, own, arrival in zip(*flight(1200.0, drift), strict=True):
+    for k, (true, own, arrival) in enumerate(zip(*flight(1200.0, drift), strict=True)):
         t = c.tell(clocks, c.BOOT, own, arrival)
         error.append(t - true - 0.03)  # the quickest way cannot be known
-        told = timing.told(arrival)
+        told = timing.told(arrival) if k % 25 == 0 else told
     late = np.abs(error[25 * 60 :])
     assert np.median(late) < 5e-3 and np.quantile(late, 0.99) < 12e-3
     assert told["clock_drift"] == pytest.approx(drift, abs=2e-5)
@@ -48,12 +48,12 @@ def test_the_worst_delay_is_taken_and_begins_anew():
 
 def test_after_a_restart_and_over_a_wrap_time_goes_on_and_drift_is_learnt_anew():
     clocks = c.new_clocks()
-    timing, times = Timing(lambda: clocks), []
+    timing, times, told = Timing(lambda: clocks), [], {}
     for first, boot in ((0.0, c.WRAP_BOOT_S - 300.0), (600.0, 2.0)):
-        for _, own, arrival in zip(*flight(600.0, 1e-4, boot=boot), strict=True):
+        for k, (_, own, arrival) in enumerate(zip(*flight(600.0, 1e-4, boot=boot), strict=True)):
             t = c.tell(clocks, c.BOOT, own % c.WRAP_BOOT_S, arrival + first)
             times += [] if np.isnan(t) else [(t, arrival + first)]
-            told = timing.told(arrival + first)
+            told = timing.told(arrival + first) if k % 25 == 0 else told
         assert told["clock_drift"] == pytest.approx(1e-4, abs=3e-5)
         assert c.jumps(clocks) == (first > 0)
     t, arrival = np.array(times).T
