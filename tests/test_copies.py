@@ -1,6 +1,5 @@
 """Copies of recorded aircraft: ids, places and times of their own, all else as recorded; on the bus and as MAVLink."""
 
-import contextlib
 import ipaddress
 import os
 import signal
@@ -221,13 +220,17 @@ def aired(path, copies):
         ear.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 24)
         ear.bind(("127.0.0.1", 0))
         ear.settimeout(0.5)
-        airing, heard = Airing(path, 20.0, copies, Ids(1, 250)), []
+        airing, heard = Airing(path, 8.0, range(copies), copies, Ids(1, 250)), []
         thread = threading.Thread(target=airing.send, args=(ear.getsockname(), threading.Event()))
         thread.start()
-        while thread.is_alive() or len(heard) < airing.sent:
-            with contextlib.suppress(TimeoutError):
+        while True:
+            try:
                 heard.append(ear.recv(65_535))
+            except TimeoutError:
+                if not thread.is_alive():
+                    break
         thread.join()
+    assert len(heard) == airing.sent
     assert airing.trouble == ""
     return airing, heard
 
@@ -283,7 +286,7 @@ def test_signatures_are_left_out_for_whoever_signed_did_not_sign_this(tmp_path):
 def test_more_aircraft_than_system_ids_are_refused(tmp_path):
     path = tmp_path / "one.tlog"
     path.write_bytes(log_of(seconds=1.0))
-    airing = Airing(path, 100.0, 251, Ids(1, 250))
+    airing = Airing(path, 100.0, range(251), 251, Ids(1, 250))
     airing.send(("127.0.0.1", 9), threading.Event())
     assert "found all 250 taken" in airing.trouble
 

@@ -10,7 +10,7 @@ from fleet.bars import shown
 from fleet.bus import ROUTER
 from fleet.children import run_until
 from fleet.cli import stop_on_signal
-from fleet.telemetry.airing import MOST_ON_A_LINK, Airing, address
+from fleet.telemetry.airing import MOST_ON_A_LINK, Airing, address, shared
 from fleet.telemetry.ids import Ids
 from fleet.telemetry.pace import read_speed
 
@@ -21,6 +21,7 @@ EXAMPLES = """
   fleet replay monday.parauav --results                        what the twins said then, not what they say now
   fleet replay flight.tlog --copies 50                         fifty aircraft, 500 m apart
   fleet replay flight.tlog --copies 50 --to 127.0.0.1:14550    the same as MAVLink over UDP
+  fleet replay flight.tlog --copies 500 --to 127.0.0.1:14550 --to 127.0.0.1:14551    250 aircraft a link
 """
 
 
@@ -30,7 +31,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--speed", default="1", metavar="N|max", help="times real time, or max (1)")
     parser.add_argument("--copies", type=int, default=1, metavar="N", help="aircraft for each recorded one (1)")
     parser.add_argument("--results", action="store_true", help="play also the models, predictions and alerts recorded")
-    parser.add_argument("--to", metavar="HOST:PORT", help="send a .tlog as MAVLink over UDP there, on this machine")
+    parser.add_argument(
+        "--to",
+        action="append",
+        metavar="HOST:PORT",
+        help="send a .tlog as MAVLink over UDP there, on this machine; "
+        f"repeatable: the copies are shared out, at most {MOST_ON_A_LINK} aircraft each",
+    )
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
     parser.add_argument("--router", default=ROUTER, help=f"where the bus is ({ROUTER})")
 
@@ -47,11 +54,15 @@ def run(args: argparse.Namespace) -> int:
 
 def _send(args: argparse.Namespace) -> int:
     """Send every file in a thread of its own; exit code 1 where one could not be sent to its end."""
-    to = address(args.to)
-    ids = Ids(1, MOST_ON_A_LINK)
-    airings = [Airing(Path(name), read_speed(args.speed), args.copies, ids) for name in args.file]
+    airings, places = [], []
+    for to, numbers in zip(map(address, args.to), shared(args.copies, len(args.to)), strict=True):
+        ids = Ids(1, MOST_ON_A_LINK)
+        for name in args.file if numbers else ():
+            airings.append(Airing(Path(name), read_speed(args.speed), numbers, args.copies, ids))
+            places.append(to)
     stop = stop_on_signal()
-    threads = [threading.Thread(target=airing.send, args=(to, stop), name=airing.name) for airing in airings]
+    pairs = zip(airings, places, strict=True)
+    threads = [threading.Thread(target=airing.send, args=(to, stop), name=airing.name) for airing, to in pairs]
     with shown(airings, lambda line: print(f"fleet replay: {line}", file=sys.stderr, flush=True)):
         for thread in threads:
             thread.start()

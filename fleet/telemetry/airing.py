@@ -21,18 +21,26 @@ from fleet.telemetry.recast import Cut, cut, recast
 from fleet.telemetry.recordings import Recording
 from fleet.telemetry.scan import ID, SYSTEM
 from fleet.telemetry.tlog import Tlog
+from fleet.telemetry.volley import Volley
 
+Said = tuple[np.ndarray, Cut]
+"""Frames of one aircraft as every copy says them, (n, b) uint8, and where they are in it; each is a datagram."""
 STEP_S = 0.05  # recorded time between two rounds of datagrams [s]
 MOST_ON_A_LINK = 250  # system ids 1 to 250; the rest belongs to ground stations
 
 
+def shared(copies: int, places: int) -> list[range]:
+    """Share copies out over places: the numbers of each one's."""
+    return [range(place, copies, places) for place in range(places)]
+
+
 def address(text: str) -> tuple[str, int]:
-    """Read HOST:PORT of this machine.
+    """Read HOST:PORT of this machine, `udpout:` before it or not.
 
     Raises:
         ValueError: when it is none, or another machine: recorded aircraft must not reach real ground stations.
     """
-    host, _, port = text.rpartition(":")
+    host, _, port = text.removeprefix("udpout:").rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
         raise ValueError(f"--to: found {text!r}, expected HOST:PORT such as 127.0.0.1:14550; correct it")
     try:
@@ -53,14 +61,15 @@ class Airing:
     Args:
         path: the recording
         speed: times real time
-        copies: aircraft in place of each recorded one, itself included
+        numbers: of the copies sent to this place; 0 is the recorded aircraft itself
+        total: copies at all places
         ids: MAVLink system ids given out, shared by all that are sent to one place
     Raises:
         ValueError: when it is no telemetry log.
         OSError: when it cannot be read.
     """
 
-    def __init__(self, path: Path, speed: float, copies: int, ids: Ids) -> None:
+    def __init__(self, path: Path, speed: float, numbers: range, total: int, ids: Ids) -> None:
         recording = Recording(path)
         if recording.suffix != ".tlog":
             raise ValueError(f"{path.name}: found a {recording.kind}, expected a telemetry log for --to; leave it out")
@@ -70,7 +79,7 @@ class Airing:
         self.trouble = ""
         self._source = Source(path)
         self._tlog = Tlog(self._source)
-        self._copies, self._ids = copies, ids
+        self._numbers, self._total, self._ids = np.array(numbers), total, ids
         self._systems: dict[int, np.ndarray] = {}  # of the cast, by the recorded one, (copies,)
         self._asides: list[Aside] | None = None
 
@@ -81,7 +90,9 @@ class Airing:
 
     def words(self) -> str:
         """Say how far it has been sent, and how fast."""
-        return f"{self.pace.words()}, {len(self._systems) * self._copies} aircraft, {self.sent:,} datagrams"
+        aircraft, took = len(self._systems) * len(self._numbers), self.pace.took_s
+        rate = f", {self.sent / took:,.0f} a second" if took > 0 else ""
+        return f"{self.pace.words()}, {aircraft} aircraft, {self.sent:,} datagrams{rate}"
 
     def send(self, to: tuple[str, int], stop: threading.Event) -> None:
         """Send everything until it ends or `stop` is set; what goes wrong is left in `trouble`."""
@@ -89,25 +100,22 @@ class Airing:
         family = socket.AF_INET6 if ":" in to[0] else socket.AF_INET
         try:
             with socket.socket(family, socket.SOCK_DGRAM) as out:
-                for now, datagrams in self._rounds():
+                out.connect(to)
+                volley = Volley(out)
+                for now, said in self._rounds():
                     if self.pace.wait(now, stop):
                         return
-                    for datagram in datagrams:
-                        self._put(out, datagram, to)
+                    for told, one in said:
+                        at = np.arange(len(told))[:, None] * told.shape[1] + one.start
+                        length = np.broadcast_to(one.payload - one.start + one.size + 2, at.shape)
+                        self.sent += volley.send(told.ravel(), at.ravel(), length.ravel())
         except (ValueError, OSError) as error:
             self.trouble = str(error)
         if not self._systems and not self.trouble and not stop.is_set():
             self.trouble = f"{self.name}: found no aircraft in it, expected at least one heartbeat; check the file"
 
-    def _put(self, out: socket.socket, datagram: bytes, to: tuple[str, int]) -> None:
-        try:
-            out.sendto(datagram, to)
-            self.sent += 1
-        except OSError:  # nobody listens yet, no room: gone, as with a radio
-            return
-
-    def _rounds(self) -> Iterator[tuple[float, list[bytes]]]:
-        """Give round by round: (recorded time [s since 1970], datagrams)."""
+    def _rounds(self) -> Iterator[tuple[float, list[Said]]]:
+        """Give round by round: (recorded time [s since 1970], what is said now)."""
         past: deque[list[Cut]] = deque(maxlen=GROUPS)  # newest first
         sources: deque[list[int]] = deque(maxlen=GROUPS)
         first, now = np.nan, 0.0
@@ -126,14 +134,14 @@ class Airing:
             sources.appendleft([])
             yield now + lag * STEP_S, list(self._said(past, sources))
 
-    def _said(self, past: deque[list[Cut]], sources: deque[list[int]]) -> Iterator[bytes]:
+    def _said(self, past: deque[list[Cut]], sources: deque[list[int]]) -> Iterator[Said]:
         """Give what originals say now, and copies a few steps later."""
         for lag, (cuts, systems) in enumerate(zip(past, sources, strict=True)):
             for one, system in zip(cuts, systems, strict=True):
                 cast = self._systems[system][lag::GROUPS]
                 if len(cast):
                     aside = self._asides[lag] if self._asides is not None else None
-                    yield from (row.tobytes() for row in recast(one, cast, aside))
+                    yield recast(one, cast, aside), one
 
     def _meet(self, frames: Frames) -> None:
         """Learn which aircraft there are; give them and their copies system ids."""
@@ -144,11 +152,11 @@ class Airing:
                 message = frames.message(i)
                 new.update([system] if message is not None and is_aircraft(message) else [])
         cast = {system: [self._ids.give((self, system, 0), system)] for system in sorted(new)}
-        for copy in range(1, self._copies):
+        for copy in range(1, len(self._numbers)):
             for system, mine in cast.items():
                 mine.append(self._ids.give((self, system, copy), mine[0]))
         self._systems.update((system, np.array(mine, np.uint8)) for system, mine in cast.items())
-        if self._asides is None and self._copies > 1:
+        if self._asides is None and self._total > 1:
             self._find_place(frames)
 
     def _find_place(self, frames: Frames) -> None:
@@ -158,5 +166,4 @@ class Airing:
         if len(known):
             at = known[0]
             origin = Origin(int(fields.lat[at]), int(fields.lon[at]), int(fields.alt[at]))
-            numbers = np.arange(self._copies)
-            self._asides = [Aside(numbers[lag::GROUPS], self._copies, origin) for lag in range(GROUPS)]
+            self._asides = [Aside(self._numbers[lag::GROUPS], self._total, origin) for lag in range(GROUPS)]

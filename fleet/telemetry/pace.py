@@ -28,10 +28,14 @@ class Pace:
         return stopped
 
     @property
+    def took_s(self) -> float:
+        """Tell how long it has been playing [s]."""
+        return self._newest - self._begun
+
+    @property
     def reached(self) -> float:
         """Tell the speed reached so far, recorded seconds per second; nan before the start."""
-        took = self._newest - self._begun
-        return self.passed_s / took if took > 0 else math.nan
+        return self.passed_s / self.took_s if self.took_s > 0 else math.nan
 
     def words(self) -> str:
         """Say how far it has come, and how fast."""

@@ -1,0 +1,59 @@
+"""Many datagrams in one call: `sendmmsg` on Linux, one by one elsewhere.
+
+Source: sendmmsg(2); structures as in <sys/socket.h> of 64-bit Linux.
+"""
+
+import ctypes
+import socket
+import sys
+
+import numpy as np
+
+MOST = 1024  # datagrams in one call, the system's limit
+_VECTOR = np.dtype([("base", "u8"), ("size", "u8")])
+_MESSAGE = np.dtype(
+    {
+        "names": ["vector", "vectors", "sent"],
+        "formats": ["u8", "u8", "u4"],
+        "offsets": [16, 24, 56],
+        "itemsize": 64,
+    }
+)
+
+
+class Volley:
+    """Sends from one connected socket."""
+
+    def __init__(self, out: socket.socket) -> None:
+        self._out = out
+        self._call = getattr(ctypes.CDLL(None), "sendmmsg", None) if sys.platform.startswith("linux") else None
+        if self._call is not None:
+            self._call.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
+
+    def send(self, told: np.ndarray, start: np.ndarray, length: np.ndarray) -> int:
+        """Send the datagrams that begin at `start` in `told`; gives how many the system took.
+
+        Args:
+            told: bytes, (b,) uint8
+            start, length: of each datagram in them, (n,)
+        """
+        if self._call is None:
+            return sum(
+                self._one(told[a : a + n].tobytes()) for a, n in zip(start.tolist(), length.tolist(), strict=True)
+            )
+        vectors, messages = np.zeros(len(start), _VECTOR), np.zeros(len(start), _MESSAGE)
+        vectors["base"], vectors["size"] = told.ctypes.data + start, length
+        messages["vector"], messages["vectors"] = vectors.ctypes.data + np.arange(len(start)) * _VECTOR.itemsize, 1
+        at = sent = 0
+        while at < len(start):
+            where = messages.ctypes.data + at * _MESSAGE.itemsize
+            took = self._call(self._out.fileno(), where, min(MOST, len(start) - at), 0)
+            at, sent = at + max(took, 1), sent + max(took, 0)  # nobody listens yet, no room: gone, as with a radio
+        return sent
+
+    def _one(self, datagram: bytes) -> int:
+        try:
+            self._out.send(datagram)
+        except OSError:
+            return 0
+        return 1
