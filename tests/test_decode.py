@@ -15,6 +15,7 @@ from fleet.telemetry.heard import Heard
 from fleet.telemetry.opening import Source
 from fleet.telemetry.scan import STOP
 from fleet.telemetry.tlog import Tlog
+from tests.bench.gateway import fuzz
 
 QUICK = 4_000  # frames; `python -m tests.bench.gateway.equal` takes a hundred thousand and more
 
@@ -121,6 +122,12 @@ def test_incompatible_flags_are_no_frame():
     crc = mav.x25crc(bytes(good[1:-2]) + bytes([50])).crc
     good[-2:] = crc.to_bytes(2, "little")
     assert len(oracle.ours([bytes(good)]).at) == 0
+
+
+def test_junk_neither_raises_nor_hangs_nor_hides_a_good_aircraft():
+    found = fuzz.run(seed=5, total=1_500_000)
+    assert found["blocks_with_the_good_aircraft"] == found["blocks"] == 15
+    assert found["slowest_cpu_s"] < 2.0 and found["counters"]["bad_bytes"] > 1_000_000
 
 
 @pytest.mark.recordings
