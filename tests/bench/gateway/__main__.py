@@ -4,9 +4,9 @@
     python -m tests.bench.gateway.equal      equality with pymavlink field by field, the long run
     python -m tests.bench.gateway.fuzz       random and mutated bytes
 
-`ratio`: messages per CPU-second, ours to pymavlink's, both in this run. `fleet`: copies of the recording are sent as one
-MAVLink frame a datagram, at most 250 aircraft a link; CPU is that of the whole gateway process, all threads; a datagram
-is lost where the gateway did not count it and the system did not either.
+`ratio`: messages per CPU-second, ours to pymavlink's, both in this run. `fleet`: copies of the recording are sent as
+one MAVLink frame a datagram, at most 250 aircraft a link; CPU is that of the whole gateway process, all threads; a
+datagram is lost uncounted where neither the gateway nor the system counted it.
 """
 
 import argparse

@@ -110,6 +110,7 @@ def _watched(
         "gateway_cores": round(cpu / took, 3),
         "us_a_message": round(1e6 * cpu / heard, 2),
         "sender_cores": round(busy / took, 2),
+        "published_a_second": round((ended.published - began.published) / took),
         "samples_a_second": round(samples / took),
         "bytes_a_sample": round(size / max(samples, 1)),
         "sent_in_all": sent,
