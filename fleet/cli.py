@@ -47,13 +47,14 @@ def stop_on_signal() -> threading.Event:
     for number in (signal.SIGINT, signal.SIGTERM):
         # not stop.set(): a handler runs in the main thread, which may hold that event's own lock in wait(), for ever
         signal.signal(number, lambda number, _: told.put(number))
-    threading.Thread(target=_hear, args=(told, stop), daemon=True).start()
+    threading.Thread(target=_pass_on, args=(told, stop), daemon=True).start()
     if parent := os.environ.get(PARENT):
         threading.Thread(target=_outlive_nobody, args=(int(parent), stop), daemon=True).start()
     return stop
 
 
-def _hear(told: queue.SimpleQueue[int], stop: threading.Event) -> None:
+def _pass_on(told: queue.SimpleQueue[int], stop: threading.Event) -> None:
+    """Set the event once a signal was told of."""
     told.get()
     stop.set()
 

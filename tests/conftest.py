@@ -1,6 +1,12 @@
 """What every test shares: the recordings, a browser, a free port, the option that renews the golden bytes."""
 
+import fleet  # noqa: F401  before numpy: it holds BLAS to one thread
+
+# isort: split
+
+import contextlib
 import copy
+import itertools
 import os
 import shutil
 import socket
@@ -11,6 +17,7 @@ from pathlib import Path
 
 import flights
 import hover
+import numpy as np
 import pytest
 
 from fleet.bus import MemoryBus, open_router
@@ -23,6 +30,12 @@ from twin_worker.worker import Held, Worker
 
 ROOT = Path(__file__).resolve().parent.parent
 LONG_FILES = pytest.StashKey[list[str]]()
+HEAVY = (  # files by the time they take, so that none begins when the others have ended; the rest follows by name
+    *("effect_injection", "twin", "prove", "foresee_hostile", "end_to_end", "diagnose_flightstack"),
+    *("diagnose_concealed", "paper", "every_vehicle", "mismatch_shown", "diagnose_real", "diagnose_past"),
+    *("hostile_windows", "conceal", "live_offline", "assess", "long_tlog", "rotor", "browser", "bench_identification"),
+)
+"""The first two begin at once: one compiles the twin's physics, the other has no need of it."""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 
 
@@ -49,11 +62,17 @@ def chromium() -> str:
     return found
 
 
-def unused_port() -> int:
-    """Number of a loopback TCP port that nobody holds."""
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
+_PORTS = itertools.cycle(np.random.default_rng(os.getpid()).permutation(np.arange(20_000, 32_000)).tolist())
+"""Below those the system hands out by itself: none is taken between being found free and being used."""
+
+
+def unused_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    """Number of a loopback port that nobody holds, and that this process has not given before."""
+    for port in _PORTS:
+        with contextlib.suppress(OSError), socket.socket(type=kind) as s:
+            s.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError
 
 
 @pytest.fixture
@@ -74,6 +93,13 @@ def router() -> Iterator[str]:
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[LONG_FILES] = []
     os.environ.setdefault("PARAUAV_ONBOARD", tempfile.mkdtemp(prefix="parauav-onboard-"))  # not the user's own
+    config.option.loadscopereorder = False  # pytest-xdist puts files of many tests first, which are the quick ones
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put heavy files first."""
+    rank = {f"test_{name}": k for k, name in enumerate(HEAVY)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, unused_port
 from pretend_feed import HOSTILE, PretendFleet
 
 from fleet.bus import connect, open_router
@@ -63,16 +63,10 @@ class Viewer:
         self.process.communicate(timeout=10)
 
 
-def a_free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
-
-
 @pytest.fixture(scope="module")
 def router() -> Iterator[str]:
     """A router with a pretend fleet on it."""
-    address, stop = f"tcp/127.0.0.1:{a_free_port()}", threading.Event()
+    address, stop = f"tcp/127.0.0.1:{unused_port()}", threading.Event()
     session = open_router(address)
     with connect(address) as bus:
         fleet = PretendFleet(bus, UAVS, hostile=EVIL)
@@ -91,7 +85,7 @@ def router() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def viewer(router: str) -> Iterator[Viewer]:
-    one = Viewer(a_free_port(), router)
+    one = Viewer(unused_port(), router)
     yield one
     one.kill()
 
@@ -224,9 +218,9 @@ def test_a_killed_server_is_announced_and_comes_back(page, viewer: Viewer) -> No
 
 def test_an_empty_page_says_what_it_waits_for(page) -> None:
     """Open another viewer on a router without a fleet, and stop it as an operator would."""
-    address = f"tcp/127.0.0.1:{a_free_port()}"
+    address = f"tcp/127.0.0.1:{unused_port()}"
     session = open_router(address)
-    other = Viewer(a_free_port(), address)
+    other = Viewer(unused_port(), address)
     try:
         page.goto(f"http://127.0.0.1:{other.port}/?fixedDpr=0.5")
         page.get_by_text("No vehicles yet").wait_for(timeout=15_000)

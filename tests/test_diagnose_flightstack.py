@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from left_out import left_out
 
+from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.calibrate import calibrate
 from twin_worker.diagnose.card import read
 from twin_worker.diagnose.flight import Flight, read_flights
@@ -35,9 +36,14 @@ def nominal(sitl: Path) -> list[Flight]:
 
 
 @pytest.fixture(scope="module")
-def reports(sitl: Path, nominal: list[Flight]) -> dict[str, Report]:
+def base(nominal: list[Flight]) -> Baseline:
+    return calibrate(nominal, CARD)
+
+
+@pytest.fixture(scope="module")
+def reports(sitl: Path, base: Baseline) -> dict[str, Report]:
     files = [sitl / f"{name}.tlog.xz" for name in (*CHANGED, MULTI)]
-    return {one.flight: one for found, _ in shared(files, calibrate(nominal, CARD), 2, print) for one in found}
+    return {one.flight: one for found, _ in shared(files, base, 1, print) for one in found}
 
 
 @pytest.mark.parametrize("name", CHANGED)
@@ -65,3 +71,32 @@ def test_three_nominal_aircraft_of_one_recording_are_left_in_peace(reports: dict
 def test_nominal_flights_left_out_in_turn_are_not_named(nominal: list[Flight]) -> None:
     for report in left_out(nominal, CARD):
         assert report.outcome in (Outcome.NONE, Outcome.SUSPECTED), report.sentence
+
+
+# --- airspeed concealed --------------------------------------------------------------------------------------------
+
+WITHOUT_AIRSPEED = {
+    "s04_wind_step": ("wind_steady", "speed_mps", 9.0, 0.2),
+    "s05_engine_75": ("thrust_loss", "loss", 0.30, 0.1),
+}
+
+
+@pytest.fixture(scope="module")
+def stack(sitl: Path, base: Baseline) -> dict[str, Report]:
+    files = [sitl / f"{name}.tlog.xz" for name in (*WITHOUT_AIRSPEED, "s08_airspeed_ratio")]
+    told = shared(files, base, 1, print, ("airspeed", "wind", "battery"))
+    return {one.flight: one for found, _ in told for one in found}
+
+
+@pytest.mark.parametrize("name", WITHOUT_AIRSPEED)
+def test_without_airspeed_the_change_is_named_and_sized_all_the_same(name: str, stack: dict[str, Report]) -> None:
+    effect, number, truth, within = WITHOUT_AIRSPEED[name]
+    report = stack[name]
+    assert report.outcome is Outcome.NAMED and "concealed: airspeed, wind, battery" in report.lacks, report.sentence
+    (found,) = report.findings
+    assert found.guess.effect.name == effect and len(found.rivals) <= 2, report.sentence
+    assert abs(found.told[number] - truth) <= within * truth, report.sentence
+
+
+def test_a_fault_of_the_concealed_sensor_is_not_invented(stack: dict[str, Report]) -> None:
+    assert stack["s08_airspeed_ratio"].outcome is Outcome.NONE, stack["s08_airspeed_ratio"].sentence

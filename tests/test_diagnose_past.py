@@ -34,7 +34,7 @@ def sitl(recordings: Path) -> Path:
 @pytest.fixture(scope="module")
 def reports(sitl: Path) -> dict[str, Report]:
     files = [sitl / f"{name}.tlog.xz" for name in (*CHANGED, NOMINAL)]
-    return {one.flight: one for found, _ in shared(files, OwnPast(UNTIL_S, CARD), 2, print) for one in found}
+    return {one.flight: one for found, _ in shared(files, OwnPast(UNTIL_S, CARD), 1, print) for one in found}
 
 
 @pytest.fixture(scope="module")

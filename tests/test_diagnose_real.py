@@ -12,8 +12,7 @@ from fleet.telemetry.recordings import replay_messages
 from twin_worker.diagnose import __main__ as diagnosis
 from twin_worker.diagnose import hidden
 from twin_worker.diagnose.baseline import CHANNELS, Baseline
-from twin_worker.diagnose.calibrate import calibrate
-from twin_worker.diagnose.card import UNKNOWN, read
+from twin_worker.diagnose.card import UNKNOWN
 from twin_worker.diagnose.fit import fit_wind
 from twin_worker.diagnose.flight import Flight, read_flights
 from twin_worker.diagnose.held import ENERGY, lost
@@ -21,45 +20,12 @@ from twin_worker.diagnose.own_past import OwnPast
 from twin_worker.diagnose.past import before, calibrate_past, since
 from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.diagnose.residual import Case
-from twin_worker.diagnose.share import shared
 from twin_worker.history import History
 
 pytestmark = pytest.mark.recordings
 ALFA = "alfa_20180718_155331_1_engine_failure"
-CARD = read(Path("skywalker"))
 BEFORE_S = 8.0  # of ALFA's streams, before the fault, are not trusted
 FORWARD_S = 547.5  # on the quadplane's clock: transition done
-
-
-# --- the flight stack, airspeed concealed ----------------------------------------------------------------------------
-
-WITHOUT_AIRSPEED = {
-    "s04_wind_step": ("wind_steady", "speed_mps", 9.0, 0.2),
-    "s05_engine_75": ("thrust_loss", "loss", 0.30, 0.1),
-}
-
-
-@pytest.fixture(scope="module")
-def stack(recordings: Path) -> dict[str, Report]:
-    sitl = recordings / "sitl"
-    nominal = [f for path in sorted(sitl.glob("s0[123]*.tlog.xz")) for f in read_flights(path, CARD)]
-    files = [sitl / f"{name}.tlog.xz" for name in (*WITHOUT_AIRSPEED, "s08_airspeed_ratio")]
-    told = shared(files, calibrate(nominal, CARD), 2, print, ("airspeed", "wind", "battery"))
-    return {one.flight: one for found, _ in told for one in found}
-
-
-@pytest.mark.parametrize("name", WITHOUT_AIRSPEED)
-def test_without_airspeed_the_change_is_named_and_sized_all_the_same(name: str, stack: dict[str, Report]) -> None:
-    effect, number, truth, within = WITHOUT_AIRSPEED[name]
-    report = stack[name]
-    assert report.outcome is Outcome.NAMED and "concealed: airspeed, wind, battery" in report.lacks, report.sentence
-    (found,) = report.findings
-    assert found.guess.effect.name == effect and len(found.rivals) <= 2, report.sentence
-    assert abs(found.told[number] - truth) <= within * truth, report.sentence
-
-
-def test_a_fault_of_the_concealed_sensor_is_not_invented(stack: dict[str, Report]) -> None:
-    assert stack["s08_airspeed_ratio"].outcome is Outcome.NONE, stack["s08_airspeed_ratio"].sentence
 
 
 # --- ALFA ------------------------------------------------------------------------------------------------------------

@@ -57,7 +57,7 @@ def fly() -> Flown:
     plans = [Plan(f"control {seed}", seed) for seed in CONTROLS]
     for i, (name, effect) in enumerate(ALL.items()):
         plans += [Plan(f"{name} {size}", 10 + 3 * i + size, (injected(effect, size),)) for size in range(3)]
-    told = shared(flown(plans), base, 2, print)
+    told = shared(flown(plans), base, 1, print)
     return Flown(base, {report.flight: report for reports, _ in told for report in reports})
 
 

@@ -170,10 +170,8 @@ def test_a_recording_keeps_its_pace(tmp_path):
 # ---- end to end
 
 
-def udp_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
+def udp_port() -> int:
+    return unused_port(socket.SOCK_DGRAM)
 
 
 def test_udp_to_zenoh_through_a_megabyte_of_noise(router):

@@ -1,1 +1,3 @@
 """Judgement to picture: the operator's page."""
+
+import fleet  # noqa: F401  before numpy and numba: it holds BLAS to one thread and names the compile cache
