@@ -116,7 +116,8 @@ def test_a_gateway_that_records_begins_without_a_router_and_joins_it_later(tmp_p
     while (message := stream.recv_msg()) is not None:
         kept.append(bytes(message.get_msgbuf()))
     stream.close()
-    assert len(kept) > 100 and kept == sent[sent.index(kept[0]) :][: len(kept)]
+    said = iter(sent)
+    assert len(kept) > 100 and all(frame in said for frame in kept), "in the order it was sent"
 
 
 def test_without_a_recording_a_missing_router_stops_the_start():
