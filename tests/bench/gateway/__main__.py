@@ -20,6 +20,8 @@ from fleet.telemetry.opening import Source
 
 from . import decoding, load
 
+PLAIN = 60  # aircraft for the plain loop, which bears no more
+
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -35,8 +37,11 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as folder:
             plain = Path(folder) / "flight.tlog"
             plain.write_bytes(Source(args.file).open().read(1 << 30) or b"")
-            found["fleet"] = load.measure(plain, args.uavs, args.seconds, args.begin)
-        print(json.dumps(found["fleet"], indent=1), flush=True)
+            fleet = load.measure(plain, args.uavs, args.seconds, args.begin)
+            loop = load.plain(plain, min(args.uavs, PLAIN), args.seconds, args.begin)
+        loop["ratio"] = round(loop["us_a_message"] / fleet["us_a_message"], 1)
+        found |= {"fleet": fleet, "plain_loop": loop}
+        print(json.dumps({"fleet": fleet, "plain_loop": loop}, indent=1), flush=True)
     if args.json:
         args.json.write_text(json.dumps(found, indent=1))
     return 0

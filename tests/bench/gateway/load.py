@@ -138,3 +138,29 @@ def _quiet(ear: Ear, account: Account) -> Account:
         if after.datagrams == account.datagrams:
             return after
         account = after
+
+
+def plain(path: Path, uavs: int, seconds: float, from_s: float) -> dict[str, Any]:
+    """Measure the plain loop with few aircraft, for it bears no more, over as long a stretch of the same recording."""
+    port, where = free(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free(socket.SOCK_STREAM)}"
+    router = open_router(where)
+    loop = start("tests.bench.gateway.plain", str(port), where)
+    assert loop.stdout is not None
+    sender = None
+    try:
+        loop.stdout.readline()
+        sender = start("fleet.cli", "replay", str(path), "--copies", str(uavs), f"--to=udpout:127.0.0.1:{port}")
+        while not int(loop.stdout.readline()):
+            pass
+        for _ in range(round(from_s)):
+            loop.stdout.readline()
+        before, cpu = int(loop.stdout.readline()), cpu_s(loop.pid)
+        for _ in range(round(seconds)):
+            heard = int(loop.stdout.readline()) - before
+        cpu = cpu_s(loop.pid) - cpu
+    finally:
+        for child in filter(None, (sender, loop)):
+            child.terminate()
+            child.communicate()
+        router.close()
+    return {"aircraft": uavs, "messages_a_second": round(heard / seconds), "us_a_message": round(1e6 * cpu / heard, 2)}
