@@ -13,6 +13,7 @@ from fleet.bus import ROUTER, connect
 from fleet.cli import guarded, parser_for, stop_on_signal
 from fleet.telemetry.ids import Ids
 from fleet.telemetry.intake import MOST_UAVS
+from fleet.telemetry.warm import warm_up
 from gateway.board import posted
 from gateway.gate import gates_of
 from gateway.link import Link
@@ -27,6 +28,7 @@ from gateway.record.tape import Budget
 from gateway.recorded import Replay
 from gateway.spec import read_forward, read_spec
 
+SWITCH_S = 5e-4  # how long a receiving thread waits while messages are made [s]
 DEFAULT_LINK = "udpin:127.0.0.1:14550"
 EXAMPLES = """
   gateway                                              listen on loopback, port 14550
@@ -65,6 +67,8 @@ def run(args: argparse.Namespace) -> int:
     gates = gates_of(specs, len(args.forward), args.keys)
     budget = Budget(args.record, read_size(args.record_budget, "--record-budget")) if args.record is not None else None
     stop = stop_on_signal()
+    sys.setswitchinterval(SWITCH_S)
+    warm_up()
     with connect(args.router, patient=budget is not None) as bus, contextlib.ExitStack() as held:
         links: list[Link] = []
         ids = Ids()
