@@ -40,7 +40,7 @@ def with_added(sight: Any, channel: str, x: np.ndarray) -> Any:
 
 @pytest.mark.parametrize("hertz", [0.17, 0.93])
 def test_a_hum_is_heard_in_its_channel_and_noise_is_none(hertz: float) -> None:
-    hum = 1.2 * np.sin(2 * np.pi * hertz * T + 1.0) * (T > ONSET_S)
+    hum = 1.6 * np.sin(2 * np.pi * hertz * T + 1.0) * (T > ONSET_S)
     heard = {one.channel: one for one in tones(with_added(quiet(1), "pitch", hum))}
     assert heard["pitch"].worth > RULES["tone"].least and abs(heard["pitch"].t0 - ONSET_S) < 20.0
     assert max(one.worth for name, one in heard.items() if name != "pitch") < 0.4 * RULES["tone"].least

@@ -33,10 +33,10 @@ class Rule(NamedTuple):
 
 
 RULES = {
-    "odd": Rule(300.0, 2.0, 3.0, 0.5, 0.25),  # the whole equation is another, beside the names
-    "shift": Rule(160.0, 1.6, 2.0, 0.05, 0.05),  # it changed in flight, beside the names
-    "one": Rule(110.0, 2.0, 1.0, 0.9, 0.9),  # one coefficient changed, instead of the names
-    "tone": Rule(150.0, 1.5, 1.0, 0.0, 0.0),  # it hums, beside the names
+    "odd": Rule(450.0, 3.0, 2.0, 0.5, 0.25),  # the whole equation is another, beside the names
+    "shift": Rule(240.0, 2.4, 1.5, 0.05, 0.05),  # it changed in flight, beside the names
+    "one": Rule(165.0, 3.0, 1.0, 0.9, 0.9),  # one coefficient changed, instead of the names
+    "tone": Rule(200.0, 2.0, 1.0, 0.0, 0.0),  # it hums, beside the names
 }
 
 
