@@ -22,7 +22,7 @@ from twin_worker.conflict.watch import home, watch
 from twin_worker.twin import Twin, advance
 
 NAN, INF = float("nan"), float("inf")
-KINDS = tuple(AlertKind)
+KINDS = tuple(RULES)
 
 # --- the ledger -----------------------------------------------------------------------------------------------------
 

@@ -89,10 +89,10 @@ def test_rising_air_blows_against_down() -> None:
 # --- forces and moments ----------------------------------------------------------------------------------------------
 
 
-def test_the_propeller_turns_and_pulls_in_proportion_to_thrust_and_diameter() -> None:
+def test_the_engine_turns_with_its_throttle_and_the_propeller_pulls_with_thrust_and_diameter() -> None:
     torque, oblique, beside = ALL["prop_torque"].act, ALL["p_factor"].act, ALL["thrust_asymmetry"].act
-    assert torque(flow(T=2000.0), 0.1)["L"] - torque(flow(T=1000.0), 0.1)["L"] == pytest.approx(190.0)
-    assert torque(flow(T=0.0), 0.1)["L"] == pytest.approx(0.19 * 0.03 * 900.0 * 9.80665)
+    assert torque(flow(delta_t=0.5, T=0.0), 0.1)["L"] == pytest.approx(0.19 * 0.5 * 0.25 * 900.0 * 9.80665)
+    assert torque(flow(delta_t=0.0, T=1000.0), 0.1)["L"] == 0.0
     assert oblique(flow(T=1000.0, alpha=0.1, beta=0.02), 0.5) == pytest.approx({"N": 95.0, "M": -19.0})
     assert beside(flow(T=1000.0), 0.1) == {"N": 100.0}
 

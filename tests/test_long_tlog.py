@@ -77,7 +77,7 @@ def test_progress_rises_to_the_end(tmp_path, monkeypatch):
 
 def test_ctrl_c_ends_an_inspection_at_once(tmp_path):
     path = tmp_path / "flight.tlog"
-    long_tlog.write(path, 60)
+    long_tlog.write(path, 180)
     primary, secondary = os.openpty()
     command = [sys.executable, "-m", "fleet.cli", "inspect", str(path)]
     with subprocess.Popen(command, cwd=ROOT, env=env(), stdout=secondary, stderr=secondary) as child:
