@@ -44,9 +44,16 @@ def shown(
     if not played:
         yield
         return
+    draw = _bars if console.is_terminal else _lines
+    with alongside(lambda done: draw(played, done, say, console, leave=leave)):
+        yield
+
+
+@contextmanager
+def alongside(show: Callable[[threading.Event], None]) -> Iterator[None]:
+    """Run `show` on a thread for as long as the block lasts; the event it is given tells it to end."""
     done = threading.Event()
-    show = _bars if console.is_terminal else _lines
-    thread = threading.Thread(target=show, args=(played, done, say, console), kwargs={"leave": leave}, name="bars")
+    thread = threading.Thread(target=show, args=(done,), name="shown")
     thread.start()
     try:
         yield

@@ -82,9 +82,17 @@ def run(args: argparse.Namespace) -> int:
             for replay in replays:
                 replay.look(stop)
             recorder = None if budget is None else held.enter_context(Recorder(budget, [spec.text for spec in specs]))
-            settings = {"gates": gates, "stations": len(args.forward), "most": args.most_uavs, "recorder": recorder}
-            settings |= {"budget": args.budget, "cache": None if args.listen_only else Cache()}
-            pump = Pump(links, bus, args.listen_only, **settings)
+            pump = Pump(
+                links,
+                bus,
+                args.listen_only,
+                gates=gates,
+                stations=len(args.forward),
+                most=args.most_uavs,
+                recorder=recorder,
+                budget=args.budget,
+                cache=None if args.listen_only else Cache(),
+            )
             if len(replays) < len(links):
                 console = Console() if sys.stdout.isatty() and not replays else None
                 held.enter_context(posted(pump.publisher.newest, _say, console))

@@ -40,6 +40,7 @@ class Tally:
     def __init__(self, links: Sequence[Link], recorder: Recorder | None = None) -> None:
         self._links, self._recorder = links, recorder
         self._flows = [_Flow() for _ in links]
+        self._overruns: dict[int, int] = {}
 
     def add(self, link: int, heard: Heard) -> None:
         """Count what came on a link."""
@@ -58,6 +59,7 @@ class Tally:
     ) -> Account:
         """Make the message; `t` is fleet time [s since 1970], `players` the UAV ids of recordings."""
         taped = self._recorder.account() if self._recorder is not None else [Taped() for _ in self._links]
+        self._overruns = overruns()
         told = tuple(self._link(t, k, intakes[k], taped[k], share) for k, share in enumerate(shares))
         refused: Counter[str] = Counter()
         uavs = set(players)
@@ -98,7 +100,7 @@ class Tally:
             bad_bytes=counts["bad_bytes"],
             bad_frames=counts["bad_frames"] + counts["unknown"],
             dropped=link.dropped,
-            overrun=overrun(link.spec.port) if link.spec.kind == "udpin" else None,
+            overrun=self._overruns.get(link.spec.port) if link.spec.kind == "udpin" else None,
             sent=flow.sent,
             bytes_out=flow.bytes_out,
             unsent=link.unsent,
@@ -113,15 +115,14 @@ class Tally:
         )
 
 
-def overrun(port: int, counts: Sequence[Path] = _SYSTEM_S_COUNT) -> int | None:
-    """Give the datagrams the system dropped at a UDP port as its buffer was full; None where it does not tell."""
-    found = None
+def overruns(counts: Sequence[Path] = _SYSTEM_S_COUNT) -> Counter[int]:
+    """Give the datagrams the system dropped at each UDP port as its buffer was full; none where it does not tell."""
+    found: Counter[int] = Counter()
     for path in counts:
         try:
             rows = [row.split() for row in path.read_text().splitlines()[1:]]
         except OSError:  # not Linux
             continue
         for row in rows:
-            if int(row[1].rpartition(":")[2], 16) == port:
-                found = (found or 0) + int(row[-1])
+            found[int(row[1].rpartition(":")[2], 16)] += int(row[-1])
     return found

@@ -2,8 +2,8 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import partial
 
 from rich.console import Console, Group
@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from fleet.bars import alongside
 from fleet.contract import Account, Link, Status
 from gateway.publish import Told
 from gateway.record.size import in_words
@@ -21,8 +22,9 @@ PLAIN_S = 30.0  # between lines where the output is no terminal [s]
 MOST_UAVS = 40  # shown, those in trouble first
 
 
-@contextmanager
-def posted(told: Callable[[], Told], say: Callable[[str], None], console: Console | None = None) -> Iterator[None]:
+def posted(
+    told: Callable[[], Told], say: Callable[[str], None], console: Console | None = None
+) -> AbstractContextManager[None]:
     """Show the counters for as long as the block lasts.
 
     Args:
@@ -30,15 +32,7 @@ def posted(told: Callable[[], Told], say: Callable[[str], None], console: Consol
         say: takes a line where there is no terminal
         console: the terminal; None where there is none
     """
-    done = threading.Event()
-    show = partial(_lines, say) if console is None else partial(_table, console)
-    thread = threading.Thread(target=show, args=(told, done), name="board")
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
+    return alongside(partial(_lines, say, told) if console is None else partial(_table, console, told))
 
 
 def _table(console: Console, told: Callable[[], Told], done: threading.Event) -> None:

@@ -17,7 +17,7 @@ from test_gateway import PATIENCE_S, Ear
 from fleet.bus import MemoryBus
 from fleet.contract import Account, Status
 from gateway import board
-from gateway.account import overrun
+from gateway.account import overruns
 from gateway.board import drawn, in_line, posted
 from gateway.links.udp import Udp
 from gateway.metrics import served
@@ -91,8 +91,8 @@ def test_what_the_system_dropped_is_read(tmp_path):
     rows = [f"{k}: 0100007F:{port:04X} 00000000:0000 07 0:0 00:0 0 0 0 1 2 0 {drops}" for k, port, drops in
             ((1, 14550, 40), (2, 14551, 3), (3, 14550, 2))]  # fmt: skip
     (tmp_path / "udp").write_text("\n".join([head, *rows]) + "\n")
-    assert overrun(14550, [tmp_path / "udp", tmp_path / "none"]) == 42
-    assert overrun(9, [tmp_path / "udp"]) is None
+    found = overruns([tmp_path / "udp", tmp_path / "none"])
+    assert found[14550] == 42 and 9 not in found
 
 
 def test_everything_sent_is_received_overrun_or_dropped_and_what_was_heard_is_recorded_or_counted(tmp_path, free_port):

@@ -13,13 +13,13 @@ from twin_worker.diagnose import __main__ as diagnosis
 from twin_worker.diagnose import hidden
 from twin_worker.diagnose.baseline import CHANNELS, Baseline
 from twin_worker.diagnose.card import UNKNOWN
-from twin_worker.diagnose.fit import fit_wind
 from twin_worker.diagnose.flight import Flight, read_flights
 from twin_worker.diagnose.held import ENERGY, lost
 from twin_worker.diagnose.own_past import OwnPast
 from twin_worker.diagnose.past import before, calibrate_past, since
 from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.diagnose.residual import Case
+from twin_worker.diagnose.weather import fit_wind
 from twin_worker.history import History
 
 pytestmark = pytest.mark.recordings

@@ -59,7 +59,8 @@ def frame_length(buf, at, end):
 
 
 @nb.njit(cache=True, nogil=True)
-def _message_id(buf, at):
+def message_id(buf, at):
+    """Give the message id of the frame at `at`."""
     if buf[at] == V1:
         return nb.int64(buf[at + 5])
     return nb.int64(buf[at + 7]) | nb.int64(buf[at + 8]) << 8 | nb.int64(buf[at + 9]) << 16
@@ -95,7 +96,7 @@ def _timely(t, last):
 
 
 @nb.njit(cache=True, nogil=True)
-def _known(buf, at, end, extras, table):
+def sound(buf, at, end, extras, table):
     """Give the end of the whole, sound frame of a message known here that starts at `at`; 0: there is none."""
     if at + 8 > end or (buf[at] != V1 and buf[at] != V2):
         return 0
@@ -103,7 +104,7 @@ def _known(buf, at, end, extras, table):
     if buf[at] == V2:
         if at + 12 > end or buf[at + 2] & ~SIGNED:
             return 0
-        head, tail, number = 10, 15 if buf[at + 2] & SIGNED else 2, _message_id(buf, at)
+        head, tail, number = 10, 15 if buf[at + 2] & SIGNED else 2, message_id(buf, at)
     crc = at + head + nb.int64(buf[at + 1])
     if crc + tail > end:
         return 0
@@ -117,12 +118,12 @@ def _known(buf, at, end, extras, table):
 def _leads_on(buf, at, end, extras, table):
     """Follow frames of unknown ids from `at` on; give where that ends: soundly, or -1."""
     while at < end:
-        if _known(buf, at, end, extras, table):
+        if sound(buf, at, end, extras, table):
             return at
         length = frame_length(buf, at, end)
         if length <= 0 or at + length > end:
             return -1
-        number = _message_id(buf, at)
+        number = message_id(buf, at)
         if number < len(extras) and extras[number] >= 0:
             return -1
         at += length
@@ -133,7 +134,7 @@ def _leads_on(buf, at, end, extras, table):
 def _hides(buf, at, after, end, extras, table):
     """Tell whether a sound frame begins between `at` and `after`."""
     inside = at + 1
-    while inside < after and not _known(buf, inside, end, extras, table):
+    while inside < after and not sound(buf, inside, end, extras, table):
         inside += 1
     return inside < after
 
@@ -144,7 +145,7 @@ def _note(buf, at, stop, found, n):
     second = buf[at] == V2
     head = 10 if second else 6
     found[n, START], found[n, STOP], found[n, PAYLOAD], found[n, SIZE] = at, stop, at + head, buf[at + 1]
-    found[n, ID] = _message_id(buf, at)
+    found[n, ID] = message_id(buf, at)
     found[n, SYSTEM] = buf[at + 5 if second else at + 3]
     found[n, COMPONENT] = buf[at + 6 if second else at + 4]
     found[n, SEQ] = buf[at + 4 if second else at + 2]
@@ -170,7 +171,7 @@ def straight(buf, begin, end, found, extras, table):
                 head, stop = 6, at + nb.int64(buf[at + 1]) + 8
             else:
                 return -1
-            number, crc = _message_id(buf, at), at + head + nb.int64(buf[at + 1])
+            number, crc = message_id(buf, at), at + head + nb.int64(buf[at + 1])
             if stop > last or number >= len(extras) or extras[number] < 0:
                 return -1
             if checksum(buf, at + 1, crc, extras[number], table) != _u(buf[crc]) | _u(buf[crc + 1]) << _u(8):
@@ -206,7 +207,7 @@ def scan(buf, parts, prefix, last_t, found, times, counts, extras, table):
         in_step, sure = parts[part, 2] == 0, at  # the one before ended here; unknown frames up to there are certain
         while at + prefix < end:
             magic = at + prefix
-            stop = _known(buf, magic, end, extras, table)
+            stop = sound(buf, magic, end, extras, table)
             if stop:
                 t = _stamp(buf, at) if prefix else 0.0
                 if not prefix or _timely(t, last_t):
@@ -229,10 +230,10 @@ def scan(buf, parts, prefix, last_t, found, times, counts, extras, table):
                 counts[BAD_BYTES] += 1
                 in_step = False
                 continue
-            number, after = _message_id(buf, magic), magic + length
+            number, after = message_id(buf, magic), magic + length
             strange = number >= len(extras) or extras[number] < 0
             if strange and prefix:
-                strange = _known(buf, after + prefix, end, extras, table) > 0 and _timely(_stamp(buf, after), t)
+                strange = sound(buf, after + prefix, end, extras, table) > 0 and _timely(_stamp(buf, after), t)
             elif strange and in_step and not (at == begin and after == end):
                 if at >= sure:
                     sure = _leads_on(buf, after, end, extras, table)

@@ -8,7 +8,7 @@ from collections.abc import Hashable, Sequence
 
 from gateway.link import POLL_S, Batch, Outlet
 from gateway.links.backoff import BackOff
-from gateway.links.stream import Stream, open_stream
+from gateway.links.stream import Stream, offer, open_stream
 from gateway.spec import Spec
 
 _log = logging.getLogger(__name__)
@@ -66,13 +66,7 @@ class Dialled:
 
     def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
         """Send to the far end, if it is there and has room."""
-        stream = self._stream
-        try:
-            sent = stream is not None and stream.outbox.put(data, messages)
-        except OSError:  # gone just now: the thread sees it too, and counts what waited
-            return
-        if not sent:
-            self.unsent += messages
+        self.unsent += offer(self._stream, data, messages)
 
     def close(self) -> None:
         """Wait for the thread; it closes what is open."""

@@ -87,6 +87,15 @@ class Serial:
 Stream = Tcp | Serial
 
 
+def offer(stream: Stream | None, data: bytes, messages: int) -> int:
+    """Offer whole messages to a stream, if it is there and has room; gives how many are not on their way."""
+    try:
+        taken = stream is not None and stream.outbox.put(data, messages)
+    except OSError:  # gone just now: its thread sees it too, and counts what waited
+        return 0
+    return 0 if taken else messages
+
+
 def open_stream(kind: str, where: str, port: Any) -> Stream:
     """Call a TCP server, or open a serial line at `port` baud.
 

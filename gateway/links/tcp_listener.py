@@ -9,7 +9,7 @@ import threading
 from collections.abc import Hashable, Sequence
 
 from gateway.link import POLL_S, Batch, Outlet
-from gateway.links.stream import Tcp
+from gateway.links.stream import Tcp, offer
 from gateway.spec import Spec
 
 MOST = 64  # callers at a time
@@ -99,13 +99,7 @@ class TcpListener:
 
     def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
         """Send to one of the callers, if it is there and has room."""
-        tcp = self._callers.get(where)
-        try:
-            sent = tcp is not None and tcp.outbox.put(data, messages)
-        except OSError:  # gone just now: the thread sees it too, and counts what waited
-            return
-        if not sent:
-            self.unsent += messages
+        self.unsent += offer(self._callers.get(where), data, messages)
 
     def close(self) -> None:
         """Wait for the thread and free the port."""

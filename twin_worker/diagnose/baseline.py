@@ -32,9 +32,10 @@ class Noise:
     sigma: np.ndarray
 
     def whiten(self, x: np.ndarray) -> np.ndarray:
-        """Whiten residuals, (n, c); the first two rows are zero."""
+        """Whiten residuals, (n, c), or their slopes, (n, c, k); the first two rows are zero."""
+        a1, a2, sigma = (one.reshape(-1, *(1,) * (x.ndim - 2)) for one in (*self.ar.T, self.sigma))
         e = np.zeros_like(x)
-        e[2:] = (x[2:] - self.ar[:, 0] * x[1:-1] - self.ar[:, 1] * x[:-2]) / self.sigma
+        e[2:] = (x[2:] - a1 * x[1:-1] - a2 * x[:-2]) / sigma
         return e
 
 

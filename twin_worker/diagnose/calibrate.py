@@ -8,13 +8,14 @@ import numpy as np
 from twin_worker.diagnose.baseline import CHANNELS, Baseline, Noise
 from twin_worker.diagnose.card import Card
 from twin_worker.diagnose.decide import best
-from twin_worker.diagnose.fit import fit, fit_timing, fit_wind, loose, wind
+from twin_worker.diagnose.fit import fit, fit_timing, loose
 from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.nuisance import WIDEST, nuisances, wandering, wanders
 from twin_worker.diagnose.odd import oddities
 from twin_worker.diagnose.residual import Case
 from twin_worker.diagnose.sight import Sight, is_weather
+from twin_worker.diagnose.weather import fit_wind, wind
 
 _ROUNDS = 10  # of expectation and maximisation
 _FADED = 4.0  # residual rows that count as one while spreads are learnt: whitening is never whole
@@ -169,7 +170,7 @@ def _spreads(
     floors = np.array([*(n.floor for n in several), *(one.floor for one in wanders(several, cases[0].base.vane))])
     parts = []
     for case, x, J in zip(cases, rows, slopes, strict=True):
-        white = np.stack([noise.whiten(J[:, :, k]) for k in range(J.shape[2])], axis=2)[case.ok]
+        white = noise.whiten(J)[case.ok]
         flat, e = white.reshape(-1, white.shape[2]), noise.whiten(x)[case.ok].ravel()
         parts.append((flat.T @ flat / _FADED, -flat.T @ e / _FADED))
     spread = floors.copy()

@@ -38,9 +38,9 @@ class Equation:
     def __init__(self, sight: Sight, channel: str, terms: dict[str, np.ndarray]) -> None:
         c = CHANNELS.index(channel)
         self.channel, self.names = channel, tuple(terms)
-        laid = np.zeros((len(terms), len(sight.case.t), len(CHANNELS)))
-        laid[:, :, c] = list(terms.values())
-        white = np.stack([sight.noise.whiten(x)[:, c] for x in laid], axis=1) * sight.ok[:, None]
+        laid = np.zeros((len(sight.case.t), len(CHANNELS), len(terms)))
+        laid[:, c] = np.transpose(list(terms.values()))
+        white = sight.noise.whiten(laid)[:, c] * sight.ok[:, None]
         self._J = (white / (np.linalg.norm(white, axis=0) + 1e-12))[:, None, :]
         self._sight = copy(sight)  # of this channel alone, but what the others say of the nuisances is kept
         self._sight.e, self._sight.Jn = sight.e[:, [c]], sight.Jn[:, [c]]

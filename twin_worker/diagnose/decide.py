@@ -61,8 +61,8 @@ def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: Non
         say(f"effect {len(named) + 1}")
         found = best(sight, [one.found.guess for one in named])
         ranking = ranking or found
-        borne = first.borne(named)
-        found = [one for one in found if earned(sight, named, one, borne) and believable(sight, one.guess)]
+        beside = Beside(sight, named, first.borne(named))
+        found = [one for one in found if beside.earned(one) and believable(sight, one.guess)]
         if not found:
             break
         more = [*named, choose(sight, found)]
@@ -80,7 +80,7 @@ class Joint:
 
     def __init__(self, sight: Sight) -> None:
         self._sight = copy(sight)
-        self._none = self._sight.cost(())
+        self._none, self._bare = self._sight.cost(()), self._sight.powers(())
 
     def gain(self, named: list[Named]) -> float:
         """Give the gain of all."""
@@ -88,28 +88,41 @@ class Joint:
 
     def borne(self, named: list[Named]) -> np.ndarray:
         """Give what all gain by channel, (c,)."""
-        return self._sight.powers(()) - self._sight.powers([one.found.guess for one in named])
+        return self._bare - self._sight.powers([one.found.guess for one in named])
 
     def better(self, more: list[Named], fewer: list[Named]) -> bool:
         """Tell whether one more is worth it: together they gain enough, and do not merely cancel each other."""
         gain = self.gain(more)
         without = min(self.gain([one for one in more if one is not left]) for left in more)
         cancelling = gain - without > _CANCEL * gain
-        before, own = self.borne(fewer), self.borne(more) - self.borne(fewer)
-        gained = min(gain - self.gain(fewer), aside(self._sight, own, before))
+        before = self.borne(fewer)
+        gained = min(gain - self.gain(fewer), beyond(self._sight, self.borne(more) - before, before))
         return not cancelling and gained > needed(self._sight, fewer, more[-1].found)
 
 
-def earned(sight: Sight, named: list[Named], found: Found, borne: np.ndarray) -> bool:
-    """Tell whether a guess gains what it must beside what is named, which gains `borne` by channel, (c,)."""
-    least = needed(sight, named, found)
-    if found.gain < least:
-        return False
-    own = sight.powers(()) - sight.powers((found.guess,)) if named else np.array([found.gain])
-    return min(found.gain, aside(sight, own, borne)) > least if named else True
+class Beside:
+    """What a further guess must gain beside those named.
+
+    Args:
+        sight: with the named granted
+        named: so far
+        borne: what they gain by channel, (c,)
+    """
+
+    def __init__(self, sight: Sight, named: list[Named], borne: np.ndarray) -> None:
+        self._sight, self._named, self._borne = sight, named, borne
+        self._before = sight.powers(())
+
+    def earned(self, found: Found) -> bool:
+        """Tell whether a guess gains what it must, and where the named are not merely wrong."""
+        least = needed(self._sight, self._named, found)
+        if not self._named or found.gain <= least:
+            return found.gain > least
+        own = self._before - self._sight.powers((found.guess,))
+        return beyond(self._sight, own, self._borne) > least
 
 
-def aside(sight: Sight, own: np.ndarray, borne: np.ndarray) -> float:
+def beyond(sight: Sight, own: np.ndarray, borne: np.ndarray) -> float:
     """Give what a guess gains beyond errors of those beside it, which are a share of what they gain there.
 
     Args:

@@ -4,16 +4,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
-from fleet.effects import catalogue
 from twin_worker.diagnose import equations as eq
 from twin_worker.diagnose.baseline import Baseline, Timing
 from twin_worker.diagnose.card import Card
 from twin_worker.diagnose.flight import Flight
-from twin_worker.diagnose.guess import Guess
 from twin_worker.diagnose.residual import RHO_0, Case, Terms
-from twin_worker.diagnose.smooth import thinned
+from twin_worker.diagnose.weather import CORRELATED, fit_wind, scale, wind
 from twin_worker.ridge import ridge
 
 RIDGE = 3e-4  # pull of a coefficient towards zero, as a share of its term's length
@@ -21,23 +18,12 @@ _ORDER = 3  # of the residuals' autoregression
 _WHITENINGS = {True: 2, False: 1}  # rounds by the accelerometer, and without: terms are noisier then
 _ROUNDS = 2
 _FADED = 4.0  # residual rows that count as one: whitening is never whole
-_SHEAR = 1.0  # usual growth of wind with height [m/s per 100 m]
-CORRELATED = 50.0  # residual rows that count as one
-_SIDE = 0.5  # weight of sideslip in the wind fit [-]
-_CALM = np.array([0.0, 0.0, 1.0])  # no wind [m/s], true airspeed [-]
-_STILL = np.array([0.5, 0.5, 100.0])  # how far a flight is held to that
 _LAGS = (0.0, 0.03, 0.06, 0.1, 0.14, 0.18, 0.22, 0.28, 0.35)  # [s]
 _DELAYS = (0.0, 0.02, 0.04, 0.06)  # [s]
 _ENGINES = {  # an electric motor turns up in a tenth, a piston engine in seconds; velocity tells less [s]
     True: (0.1, 0.14, 0.19, 0.27, 0.37, 0.51, 0.71, 0.98, 1.36, 1.88, 2.6, 3.61, 5.0),
     False: (0.1, 0.25, 0.5),
 }
-
-
-def wind(w: np.ndarray) -> tuple[Guess, ...]:
-    """Give a flight's own weather as guesses: wind, (2,) [m/s], and its growth with height, (2,) [m/s per 100 m]."""
-    known = catalogue()
-    return Guess(known["wind_steady"], "", tuple(w[:2].tolist())), Guess(known["wind_shear"], "", tuple(w[2:].tolist()))
 
 
 def fit(
@@ -51,7 +37,7 @@ def fit(
     speed = float(np.median(np.concatenate([np.hypot(f.readings["v_n"], f.readings["v_e"])[f.ok] for f in flights])))
     base = Baseline(card, {}, speed, timing=timing, vane=vane, flights=tuple(f.name for f in flights))
     winds = [np.zeros(4) for _ in flights]
-    base = replace(base, airspeed=_scale([Case(flight, base) for flight in flights]))
+    base = replace(base, airspeed=scale([Case(flight, base) for flight in flights]))
     cases = [Case(flight, base) for flight in flights]
     for _ in range(_ROUNDS):
         winds = [fit_wind(case, w) for case, w in zip(cases, winds, strict=True)]
@@ -200,53 +186,6 @@ def _airspeed(cases: list[Case], made: list[Terms]) -> float:
         [np.stack([m.flow.Va * np.sqrt(m.flow.rho / RHO_0), m.measured["airspeed"]])[:, c.ok] for c, m in rows], axis=1
     )
     return float((x @ y) / (x @ x))
-
-
-def _scale(cases: list[Case]) -> float:
-    """Give reported over indicated airspeed before anything else is known: on circles wind and scale come apart.
-
-    Started from a scale of one, the winds would take it up, and hand it on to the sideslip.
-    """
-    found = []
-    for case in cases:
-        if "Va" not in case.flight.readings:
-            return 1.0
-        m, r, ok = case.terms(()), case.flight.readings, case.ok
-        told = m.measured["airspeed"][ok] / np.sqrt(m.flow.rho[ok] / RHO_0)
-        v = np.stack([thinned(r[name])[ok] for name in ("v_n", "v_e", "v_d")])
-
-        def miss(x: np.ndarray, v: np.ndarray = v, told: np.ndarray = told) -> np.ndarray:
-            speed = np.linalg.norm(v - np.array([x[0], x[1], 0.0])[:, None], axis=0)
-            return np.concatenate([told - x[2] * speed, _STILL * (x - _CALM)])
-
-        found.append(least_squares(miss, _CALM).x[2])
-    return float(np.median(found))
-
-
-def fit_wind(case: Case, w: np.ndarray) -> np.ndarray:
-    """Fit a flight's weather, (4,) as in `wind`, to airspeed (it needs turns) and sideslip; robustly."""
-    if "Va" not in case.flight.readings and "beta" not in case.base.coef:
-        return w
-
-    def miss(w: np.ndarray) -> np.ndarray:
-        m = case.terms(wind(w))
-        out = []
-        if "Va" in case.flight.readings:
-            out.append(m.measured["airspeed"] / case.base.airspeed - m.flow.Va * np.sqrt(m.flow.rho / RHO_0))
-        if "beta" in case.base.coef:
-            out.append(_SIDE * (m.flow.beta - case.base.coef["beta"] @ m.terms["beta"]) * m.flow.Va)
-        return np.concatenate([x[case.ok] for x in out])
-
-    for _ in range(8):
-        r = miss(w)
-        J = np.stack([(miss(w + 0.3 * e) - r) / 0.3 for e in np.eye(4)], axis=1)
-        weight = 1.0 / (1.0 + r * r)
-        pull = np.diag([1e-6, 1e-6, *(2 * [(weight * r * r).mean() * CORRELATED / _SHEAR**2])])
-        change = -np.linalg.solve((J.T * weight) @ J + pull, (J.T * weight) @ r + pull @ w)
-        w = w + np.clip(change, -4.0, 4.0)
-        if np.abs(change).max() < 0.01:
-            break
-    return w
 
 
 def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:

@@ -15,10 +15,11 @@ from twin_worker.diagnose import equations as eq
 from twin_worker.diagnose.baseline import CHANNELS, DEAF, Baseline, Noise, silenced
 from twin_worker.diagnose.calibrate import settled
 from twin_worker.diagnose.card import Card
-from twin_worker.diagnose.fit import CORRELATED, Rows, axial, fit, fit_timing, pitch, wind
+from twin_worker.diagnose.fit import Rows, axial, fit, fit_timing, pitch
 from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.residual import Case, Terms
 from twin_worker.diagnose.sight import Sight
+from twin_worker.diagnose.weather import CORRELATED, wind
 
 PIECES = 4  # of the past, each foretold by the others
 LEAST_S = 40.0  # of trusted past

@@ -72,15 +72,12 @@ def _half(sight: Sight, guesses: tuple[Guess, ...], odd: bool) -> np.ndarray:
     after, by every second row around it.
     """
     t = sight.case.t
-    if any(guess.when.kind is not Onset.BUMP for guess in guesses):
-        half = blocks(t, odd=odd)
-        for guess in guesses:
-            if guess.effect.stage is Stage.SENSOR and guess.when.kind is Onset.STEP:
-                near = np.abs(t - guess.when.t0) < _JUMP_S
-                half = np.where(near, (np.arange(len(t)) % 2 == 1) == odd, half)
-        return half
-    passing = np.any([guess.when.gate(t) > _PASSES for guess in guesses], axis=0)
-    return passing & ((np.floor(t / _SHORT_S) % 2 == 1) == odd)
+    if all(guess.when.kind is Onset.BUMP for guess in guesses):
+        passing = np.any([guess.when.gate(t) > _PASSES for guess in guesses], axis=0)
+        return passing & ((np.floor(t / _SHORT_S) % 2 == 1) == odd)
+    jumps = [g.when.t0 for g in guesses if g.effect.stage is Stage.SENSOR and g.when.kind is Onset.STEP]
+    near = np.any([np.abs(t - t0) < _JUMP_S for t0 in jumps], axis=0) if jumps else np.zeros(len(t), bool)
+    return np.where(near, (np.arange(len(t)) % 2 == 1) == odd, blocks(t, odd=odd))
 
 
 def _powers(sight: Sight) -> np.ndarray:

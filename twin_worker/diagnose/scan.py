@@ -66,13 +66,14 @@ def covered(base: Baseline, effect: Effect, of: str) -> bool:
 def _by_slope(sight: Sight, effect: Effect, of: str) -> list[Found]:
     step = np.array([p.step for p in effect.parameters])
     nothing = Guess(effect, of, (0.0,) * effect.size)
-    J = sight.slopes(nothing, step)
+    plain = sight.plain_slopes(nothing, step)
+    J = sight.whole(plain)
     scale = np.sqrt((J**2).sum(axis=(0, 1)))
     if not (scale > 1e-9).all():
         return []
     J = J / scale
     sharp = sight.base.vane and Onset.STEP in effect.onsets  # a force taken from the velocity knows no first rows
-    jumps = sight.coming(nothing, step) / scale if sharp else None
+    jumps = sight.begun(plain) / scale if sharp else None
     out = []
     for kind in effect.onsets:
         gates, whens = gates_of(sight.case.t, kind, 1 if sharp else _EVERY)

@@ -1,6 +1,6 @@
 """Whitened residuals of one flight, the nuisances profiled out: what every hypothesis is measured by."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 
@@ -158,22 +158,25 @@ class Sight:
 
     def slopes(self, guess: Guess, step: np.ndarray) -> np.ndarray:
         """Give how the whitened residuals change with each parameter about a guess, (n, c, k)."""
-        return self._slopes(guess, step, self.whitened)
+        return self.whole(self.plain_slopes(guess, step))
 
-    def coming(self, guess: Guess, step: np.ndarray) -> np.ndarray:
-        """Give the first two whitened rows if what `slopes` shows began at each row, (2, n, c, k).
+    def whole(self, J: np.ndarray) -> np.ndarray:
+        """Whiten slopes of the residuals, (n, c, k)."""
+        return self.noise.whiten(J) * self.ok[:, None, None]
+
+    def begun(self, J: np.ndarray) -> np.ndarray:
+        """Whiten slopes of the residuals, (n, c, k), as if what shows began at each row: its first two, (2, n, c, k).
 
         Noise that wanders slowly hides what lasts: a step then shows by its first rows alone.
         """
-        J = self._slopes(guess, step, lambda guesses: self.case.residuals((*self.granted, *guesses)))
         ar, sigma = self.noise.ar, self.noise.sigma[:, None]
         first, second = J / sigma, J / sigma
         second[1:] -= ar[:, :1] * J[:-1] / sigma
         return np.stack([first, second]) * self.ok[None, :, None, None]
 
-    @staticmethod
-    def _slopes(guess: Guess, step: np.ndarray, seen: Callable[[Sequence[Guess]], np.ndarray]) -> np.ndarray:
-        here = seen((guess,))
+    def plain_slopes(self, guess: Guess, step: np.ndarray) -> np.ndarray:
+        """Give how the residuals change with each parameter about a guess, (n, c, k)."""
+        here = self.case.residuals((*self.granted, guess))
         out = []
         for k, h in enumerate(step):
             par = np.array(guess.par)
@@ -182,7 +185,7 @@ class Sight:
             if not h:  # at the upper bound
                 moved = guess.at(par - step[k] * np.eye(len(par))[k])
                 h = moved.par[k] - par[k]
-            out.append((seen((moved,)) - here) / (h or 1.0))
+            out.append((self.case.residuals((*self.granted, moved)) - here) / (h or 1.0))
         return np.stack(out, axis=2)
 
     def left(self) -> np.ndarray:

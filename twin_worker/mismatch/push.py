@@ -6,13 +6,13 @@ import numpy as np
 
 from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Body, Flow, Stage
 from twin_worker.diagnose.baseline import Baseline
-from twin_worker.diagnose.fit import fit_wind, wind
 from twin_worker.diagnose.flight import Flight
 from twin_worker.diagnose.guess import ALWAYS, Guess
 from twin_worker.diagnose.report import Outcome, Report
 from twin_worker.diagnose.residual import Case
 from twin_worker.diagnose.simulate import STATE, Simulation
 from twin_worker.diagnose.smooth import DT
+from twin_worker.diagnose.weather import fit_wind, wind
 
 _EVERY_S = 0.5  # between rows [s]
 _LONGEST_S = 60.0  # of the newest flight [s]
