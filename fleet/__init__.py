@@ -21,9 +21,12 @@ def _sources_hash() -> str:
     return digest.hexdigest()[:16]
 
 
+SOURCES = _sources_hash()
+
+
 def _name_compile_cache() -> None:
     base = os.environ.get("PARAUAV_CACHE") or Path(tempfile.gettempdir()) / f"parauav-{os.getuid()}"
-    os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(base) / f"numba-{_sources_hash()}"))
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(base) / f"numba-{SOURCES}"))
 
 
 _name_compile_cache()

@@ -1,181 +1,41 @@
-"""Publish, subscribe, ask and answer: on Zenoh, and in memory for tests. The only file that imports zenoh."""
+"""Publish, subscribe, ask and answer on Zenoh. The only file that imports zenoh."""
 
 import json
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import zenoh
 
 from fleet.codec import Stamp, Wire, decode, encode, encoding, pack_stamp, unpack_stamp
-from fleet.contract import PER_UAV
+from fleet.contract import PER_UAV, Claim
+from fleet.memory_bus import MemoryBus
+from fleet.talk import (
+    ROOT,
+    ROUTER,
+    Answer,
+    Answers,
+    Bus,
+    Heard,
+    Overheard,
+    Token,
+    Wants,
+    asked_for,
+    key,
+    newest,
+    uav_in,
+)
+
+__all__ = ["ROOT", "ROUTER", "Answers", "Bus", "MemoryBus", "ZenohBus", "asked_for", "connect", "endpoint", "key"]
+__all__ += ["newest", "open_router", "reachable", "uav_in"]
 
 M = TypeVar("M")
-Heard = Callable[[Any, Stamp | None], None]
-Overheard = Callable[[bytes, str, Stamp | None], None]
-Answers = Iterable[tuple[Any, Stamp | None]]
-Answer = Callable[[int | None, dict[str, str], bytes], Answers]
-
-ROOT = "parauav"
-ROUTER = "tcp/127.0.0.1:7447"
-
-
-def key(kind: type, who: int | str) -> str:
-    """Give the key of one message class: `parauav/7/sample`, `parauav/@fleet/state/{writer}`; who may be `*`."""
-    topic: str = kind.topic  # type: ignore[attr-defined]
-    return f"{ROOT}/{who}/{topic}" if kind in PER_UAV else f"{ROOT}/{topic}/{who}"
-
-
-def uav_in(name: str) -> int | None:
-    """Read the UAV id out of a key; None where the chunk is a wildcard or no number."""
-    chunk = name.split("/")[1] if name.count("/") >= 2 else ""
-    return int(chunk) if chunk.isdecimal() and len(chunk) <= 9 else None
-
-
-class Bus(AbstractContextManager, Protocol):
-    """What every process talks through."""
-
-    writer: int  # random id of this process on the bus
-
-    @property
-    def router(self) -> str:
-        """Name who is there to pass on what is published; empty: nobody, and it is looked for again and again."""
-
-    def publish(self, message: Any, stamp: Stamp | None = None) -> None:
-        """Send one message to whoever listens."""
-
-    def put(self, wire: Wire, stamp: Stamp | None = None) -> None:
-        """Send one message that is packed already."""
-
-    def subscribe(self, kind: type, heard: Heard) -> None:
-        """Call `heard(message, stamp)` for every message of a class; undecodable ones are counted, not raised."""
-
-    def overhear(self, kind: type, heard: Overheard) -> None:
-        """Call `heard(payload, encoding, stamp)` for every message of a class, as it came and whatever is in it."""
-
-    def answer(self, kind: type, reply: Answer) -> None:
-        """Declare one wildcard queryable for a class: `reply(uav or None, parameters, payload)`."""
-
-    def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
-        """Ask everyone for a class, for at most `timeout_s` [s]; the highest epoch per aircraft is kept.
-
-        Raises:
-            ConnectionError: when the session is closed; join the router again.
-        """
-
-    def inquire(self, kind: type[M], who: int, payload: bytes, timeout_s: float = 5.0) -> tuple[M, Stamp | None] | None:
-        """Ask about one aircraft with a payload; None where nobody answers.
-
-        Raises:
-            ValueError: when every answer is a refusal; in the words of the one who refused.
-            ConnectionError: when the session is closed; join the router again.
-        """
-
-    def present(self, name: str) -> None:
-        """Say that this process lives, until it does not: a liveliness token at `parauav/@live/{name}`."""
-
-    def close(self) -> None:
-        """Leave the bus."""
-
-
-def newest(found: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
-    """Keep the reply with the highest epoch, then the newest, per UAV (and alert); without a UAV all stay."""
-    best: dict[tuple[int, str], tuple[M, Stamp | None]] = {}
-    rest = []
-    for message, stamp in found:
-        uav = getattr(message, "uav", None)
-        if uav is None:
-            rest.append((message, stamp))
-            continue
-        what = uav, str(getattr(message, "about", ""))
-        rank = (stamp.epoch if stamp else 0, message.t)  # type: ignore[attr-defined]
-        held = best.get(what)
-        if held is None or rank > (held[1].epoch if held[1] else 0, held[0].t):  # type: ignore[attr-defined]
-            best[what] = (message, stamp)
-    return [best[what] for what in sorted(best)] + rest
-
-
-def asked_for(uav: int | None, answers: Answers) -> list[tuple[Any, Stamp | None]]:
-    """Keep the answers about the aircraft asked for; None keeps all."""
-    return [(m, stamp) for m, stamp in answers if uav is None or getattr(m, "uav", uav) == uav]
-
-
-class MemoryBus(AbstractContextManager):
-    """The bus within one process, synchronous; every message still goes through its bytes."""
-
-    router = "this process"
-
-    def __init__(self) -> None:
-        self.writer = secrets.randbits(63)
-        self._heard: dict[type, list[Heard]] = {}
-        self._overheard: dict[type, list[Overheard]] = {}
-        self._reply: dict[type, list[Answer]] = {}
-        self.bad = 0
-
-    def publish(self, message: Any, stamp: Stamp | None = None) -> None:
-        """Send one message to whoever listens."""
-        self.deliver(type(message), encode(message), encoding(type(message)), stamp)
-
-    def put(self, wire: Wire, stamp: Stamp | None = None) -> None:
-        """Send one message that is packed already."""
-        self.deliver(wire.kind, wire.payload, encoding(wire.kind), stamp)
-
-    def deliver(self, kind: type, payload: bytes, named: str, stamp: Stamp | None = None) -> None:
-        """Hand bytes to the listeners as if they had come over a wire; count what does not decode."""
-        for overheard in self._overheard.get(kind, []):
-            overheard(payload, named, stamp)
-        for heard in self._heard.get(kind, []):
-            try:
-                message: Any = decode(kind, payload, named)
-            except ValueError:
-                self.bad += 1
-                continue
-            heard(message, stamp)
-
-    def subscribe(self, kind: type, heard: Heard) -> None:
-        """Call `heard(message, stamp)` for every message of a class."""
-        self._heard.setdefault(kind, []).append(heard)
-
-    def overhear(self, kind: type, heard: Overheard) -> None:
-        """Call `heard(payload, encoding, stamp)` for every message of a class, as it came."""
-        self._overheard.setdefault(kind, []).append(heard)
-
-    def answer(self, kind: type, reply: Answer) -> None:
-        """Declare one wildcard queryable for a class."""
-        self._reply.setdefault(kind, []).append(reply)
-
-    def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
-        """Ask everyone for a class; the highest epoch per aircraft is kept."""
-        uav = who if isinstance(who, int) else None
-        found: list[tuple[M, Stamp | None]] = []
-        for reply in self._reply.get(kind, []):
-            try:
-                answers = asked_for(uav, reply(uav, {}, b""))
-            except ValueError:
-                continue  # a refusal; on Zenoh it travels as an error reply, which `ask` leaves out
-            found += [(decode(kind, encode(message), encoding(kind)), stamp) for message, stamp in answers]
-        return newest(found)
-
-    def inquire(self, kind: type[M], who: int, payload: bytes, timeout_s: float = 5.0) -> tuple[M, Stamp | None] | None:
-        """Ask about one aircraft with a payload; a refusal is raised as it is."""
-        answers = [pair for reply in self._reply.get(kind, []) for pair in asked_for(who, reply(who, {}, payload))]
-        found = newest([(decode(kind, encode(message), encoding(kind)), stamp) for message, stamp in answers])
-        return found[0] if found else None
-
-    def present(self, name: str) -> None:
-        """Need nothing: a process knows that it lives."""
-
-    def close(self) -> None:
-        """Forget everyone."""
-        self._heard.clear()
-        self._overheard.clear()
-        self._reply.clear()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+_WAITED_FOR = (Claim,)  # seldom and needed: the sender waits where the way is full, everything else is dropped there
+_LIVE = f"{ROOT}/@live/"
+_TOKENS = 4096  # asked for at once; with the usual channel more than 256 would block for ever
 
 
 class ZenohBus(AbstractContextManager):
@@ -189,11 +49,6 @@ class ZenohBus(AbstractContextManager):
         self._publishers: dict[str, Any] = {}
         self._lock = threading.Lock()
 
-    @property
-    def router(self) -> str:
-        """Name the router by its id, which is another after a restart; empty: none is there."""
-        return " ".join(map(str, self._session.info.routers_zid()))
-
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
         """Send one message to whoever listens."""
         kind = type(message)
@@ -206,14 +61,21 @@ class ZenohBus(AbstractContextManager):
         if publisher is None:
             with self._lock:
                 if (publisher := self._publishers.get(name)) is None:
-                    publisher = self._session.declare_publisher(name, encoding=encoding(wire.kind))
+                    publisher = self._session.declare_publisher(name, encoding=encoding(wire.kind), **_care(wire.kind))
                     self._publishers[name] = publisher
         publisher.put(wire.payload, attachment=pack_stamp(stamp) if stamp else None)
 
-    def subscribe(self, kind: type, heard: Heard) -> None:
+    @property
+    def router(self) -> str:
+        """Name the router by its id, which is another after a restart; empty: none is there."""
+        return " ".join(map(str, self._session.info.routers_zid()))
+
+    def subscribe(self, kind: type, heard: Heard, wants: Wants | None = None) -> None:
         """Call `heard(message, stamp)` for every message of a class, on a thread of the session."""
 
         def on_sample(sample: zenoh.Sample) -> None:
+            if wants is not None and ((uav := uav_in(str(sample.key_expr))) is None or not wants(uav)):
+                return
             pair = self._read(kind, sample)
             if pair is not None:
                 heard(*pair)
@@ -236,18 +98,16 @@ class ZenohBus(AbstractContextManager):
                 uav = uav_in(str(query.key_expr)) if kind in PER_UAV else None
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
-                    found = asked_for(uav, reply(uav, _parameters(query), payload))
+                    for message, stamp in asked_for(uav, reply(uav, _parameters(query), payload)):
+                        who = message.uav if kind in PER_UAV else f"{self.writer:016x}"
+                        query.reply(
+                            key(kind, who),
+                            encode(message),
+                            encoding=encoding(kind),
+                            attachment=pack_stamp(stamp) if stamp else None,
+                        )
                 except ValueError as error:
                     query.reply_err(str(error).encode(), encoding="text/plain")
-                    return
-                for message, stamp in found:
-                    who = message.uav if kind in PER_UAV else f"{self.writer:016x}"
-                    query.reply(
-                        key(kind, who),
-                        encode(message),
-                        encoding=encoding(kind),
-                        attachment=pack_stamp(stamp) if stamp else None,
-                    )
 
         name = key(kind, "*" if kind in PER_UAV else f"{self.writer:016x}")
         self._declared.append(self._session.declare_queryable(name, on_query, complete=False))
@@ -265,16 +125,24 @@ class ZenohBus(AbstractContextManager):
             raise ValueError(refused[0])
         return found[0] if found else None
 
+    def gather(self, kind: type[M], who: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
+        """Ask with a payload and give every answer as it comes."""
+        for reply in self._coming(key(kind, who), timeout_s, payload):
+            if reply.ok is not None and (pair := self._read(kind, reply.ok)) is not None:
+                yield pair[0]
+
     def _replies(self, name: str, timeout_s: float, payload: bytes | None = None) -> list[zenoh.Reply]:
+        return list(self._coming(name, timeout_s, payload))
+
+    def _coming(self, name: str, timeout_s: float, payload: bytes | None) -> Iterator[zenoh.Reply]:
         try:
-            replies = self._session.get(
+            yield from self._session.get(
                 name,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,
                 payload=payload,
             )
-            return list(replies)
         except zenoh.ZError as error:
             raise ConnectionError(
                 f"bus: asking on {name} failed ({error}), expected an open session; join the router again"
@@ -294,7 +162,19 @@ class ZenohBus(AbstractContextManager):
 
     def present(self, name: str) -> None:
         """Declare the liveliness token `parauav/@live/{name}`; it goes with the session."""
-        self._declared.append(self._session.liveliness().declare_token(f"{ROOT}/@live/{name}"))
+        self._declared.append(self._session.liveliness().declare_token(_LIVE + name))
+
+    def attend(self, told: Token) -> None:
+        """Call `told(name, lives)` for every process that is present, comes or goes; those there now at once."""
+
+        def on_token(sample: zenoh.Sample) -> None:
+            told(str(sample.key_expr).removeprefix(_LIVE), sample.kind == zenoh.SampleKind.PUT)
+
+        live = self._session.liveliness()
+        self._declared.append(live.declare_subscriber(_LIVE + "**", on_token))
+        for reply in live.get(_LIVE + "**", zenoh.handlers.FifoChannel(_TOKENS), timeout=1.0):
+            if reply.ok is not None:
+                on_token(reply.ok)
 
     def close(self) -> None:
         """Close the session."""
@@ -302,6 +182,13 @@ class ZenohBus(AbstractContextManager):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _care(kind: type) -> dict[str, Any]:
+    """Give how the messages of a class are sent."""
+    if kind not in _WAITED_FOR:
+        return {}
+    return {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH}
 
 
 def _stamp(sample: zenoh.Sample) -> Stamp | None:

@@ -13,6 +13,9 @@
                                                       gateway  a second sender that uses this id; answers queries
     parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; answers queries
     parauav/@gateway/{writer}            Account      gateway  counters of one gateway; answers queries
+    parauav/@claim/{writer}              Claim        worker   which aircraft it writes for; every 0.5 s; queries too
+    parauav/@handover/{writer}           Handover     worker   answers a `Wanted` of another worker: twins to go on with
+    parauav/@live/worker/{writer}/{lo-hi}/{incarnation}        a liveliness token: this worker lives, and may hold these
 
 `*` and `**` never match a chunk that starts with `@`, so `parauav/*/prediction` is aircraft only.
 
@@ -613,7 +616,46 @@ class Account(msgspec.Struct, frozen=True, kw_only=True):
     history_bytes: Annotated[int, Meta(description="kept for late joiners")] = 0
 
 
+class Claim(msgspec.Struct, frozen=True, kw_only=True):
+    """Which aircraft one worker writes for.
+
+    Of two claims on one aircraft the higher epoch counts, then the higher writer.
+    """
+
+    topic: ClassVar[str] = "@claim"
+    version: ClassVar[int] = 1
+
+    t: Annotated[float, Meta(description="when it was said, by the worker's clock [s since 1970]")]
+    worker: Annotated[str, Meta(description="writer, 16 hex digits")]
+    held: Annotated[tuple[tuple[int, int], ...], Meta(description="UAV id and epoch of each aircraft held")] = ()
+    bare: Annotated[tuple[int, ...], Meta(description="of these, whose telemetry of before is not there yet")] = ()
+    leaving: Annotated[bool, Meta(description="true: it hands over everything and goes")] = False
+    seen: Annotated[
+        tuple[tuple[int, int, str], ...],
+        Meta(description="to queries only: UAV id, epoch and writer of the highest claim it knows of"),
+    ] = ()
+
+
+class Handover(msgspec.Struct, frozen=True, kw_only=True):
+    """One aircraft's twin on its way to another worker, which writes for it from now on."""
+
+    topic: ClassVar[str] = "@handover"
+    version: ClassVar[int] = 1
+
+    t: Annotated[float, Meta(description="when it was handed over, by the worker's clock [s since 1970]")]
+    uav: Annotated[int, Meta(description="UAV id")]
+    epoch: Annotated[int, Meta(description="under which it was written for; the new owner's is higher")]
+    code: Annotated[str, Meta(description="hash of the sources that wrote `load`; others must not read it")]
+    load: Annotated[bytes, Meta(description="twin, messages not yet taken in, open conflicts, mismatch")] = b""
+
+
+class Wanted(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Payload of a query on `parauav/@handover/{writer}`: the twins of which aircraft."""
+
+    uavs: Annotated[tuple[int, ...], Meta(description="UAV ids")] = ()
+
+
 PER_UAV: tuple[type[Message], ...] = (Sample, Status, Mission, Params, History, Model, Prediction, Mismatch, Alert)
-CONTROL: tuple[type, ...] = (FleetState, Account)
-QUERIES: dict[type, type] = {Prediction: WhatIf}  # what a query on a key may carry
+CONTROL: tuple[type, ...] = (FleetState, Account, Claim, Handover)
+QUERIES: dict[type, type] = {Prediction: WhatIf, Handover: Wanted}  # what a query on a key may carry
 TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""The last minute of every aircraft, for whoever joins late: kept as it was sent, answered in one message."""
+"""The last minutes of every aircraft, for whoever joins late: kept as it was sent, answered in one message."""
 
 import contextlib
 import threading
@@ -11,7 +11,7 @@ from fleet.bus import Answers
 from fleet.codec import Wire
 from fleet.contract import History, Sample, Status
 
-SECONDS = 60.0
+SECONDS = 160.0  # as long as a twin remembers
 MOST = 512 << 20  # bytes over all aircraft; beyond, everybody's past becomes shorter
 KINDS = (Sample, Status)
 

@@ -26,13 +26,13 @@ def told(keeper, uav, **settings):
 def test_a_late_joiner_gets_what_was_published_in_order_and_no_more_than_was_asked_for():
     bus = MemoryBus()
     publisher = Publisher(bus)
-    said = [sample(7, T0 + 0.1 * k) for k in range(900)]
+    said = [sample(7, T0 + 0.1 * k) for k in range(1900)]
     for k, one in enumerate(said):
         publisher.publish([one, *([Status(uav=7, t=one.t, mode=f"m{k}")] if k % 10 == 0 else [])])
         publisher.publish([sample(8, T0 + 0.1 * k)])
     ((past, _),) = bus.ask(History, 7)
-    assert past.samples == tuple(said[-601:]) and past.t == said[-1].t
-    assert [status.mode for status in past.statuses] == [f"m{k}" for k in range(300, 900, 10)]
+    assert past.samples == tuple(said[-1601:]) and past.t == said[-1].t
+    assert [status.mode for status in past.statuses] == [f"m{k}" for k in range(300, 1900, 10)]
     assert said[298].t <= past.since <= said[299].t
     (short,) = told(publisher.history, 7, seconds=5)
     assert len(short.samples) == 51 and short.since == pytest.approx(past.t - 5)
@@ -43,9 +43,9 @@ def test_a_late_joiner_gets_what_was_published_in_order_and_no_more_than_was_ask
 
 def test_messages_packed_already_are_kept_too():
     publisher = Publisher(MemoryBus())
-    publisher.put([Wire(Sample, 3, encode(sample(3, T0 + k))) for k in range(100)])
+    publisher.put([Wire(Sample, 3, encode(sample(3, T0 + k))) for k in range(200)])
     (past,) = told(publisher.history, 3)
-    assert len(past.samples) == 61 and past.t == T0 + 99
+    assert len(past.samples) == 161 and past.t == T0 + 199
 
 
 def test_memory_is_bounded_whatever_comes_and_what_is_left_out_is_said():

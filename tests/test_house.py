@@ -14,6 +14,8 @@ ROOMS = (  # inside fleet a room imports only from rooms above it, and from itse
     ("frames",),
     ("contract",),
     ("codec",),
+    ("talk",),
+    ("fence", "memory_bus"),
     ("bus",),
     ("window",),
     ("airframe", "airframes"),

@@ -19,7 +19,7 @@ def test_the_table_names_every_key_with_its_encoding(capsys: pytest.CaptureFixtu
     table = shown(capsys, "schema").split("\n\n")[0].splitlines()
     assert len(table) == len(TOPICS)
     assert table[0].split()[:2] == ["parauav/{uav}/sample", "application/msgpack;parauav.sample.1"]
-    assert table[-1].split()[0] == "parauav/@gateway/{writer}"
+    assert table[-1].split()[0] == "parauav/@handover/{writer}"
 
 
 def test_one_topic_shows_fields_units_defaults_and_parts(capsys: pytest.CaptureFixture[str]) -> None:

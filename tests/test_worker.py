@@ -10,6 +10,7 @@ from fleet.bus import MemoryBus
 from fleet.codec import Stamp
 from fleet.contract import Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, State, Status
 from twin_worker import worker as live
+from twin_worker.claims.keeper import INBOX
 from twin_worker.whatif.grid import resample, wanted
 from twin_worker.worker import Worker
 
@@ -241,9 +242,9 @@ def test_a_failure_of_one_is_counted_said_and_stays_its_own(bus, worker, monkeyp
 
 def test_a_flood_sheds_the_oldest_and_says_so(bus, worker):
     status = Status(uav=2, t=f.T0)
-    for _ in range(live._INBOX + 7):
+    for _ in range(INBOX + 7):
         bus.publish(status)
-    assert worker.turn() == live._INBOX
+    assert worker.turn() == INBOX
     assert "7 messages shed" in worker.state().sentence
 
 

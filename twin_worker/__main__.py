@@ -52,7 +52,6 @@ def _run(args: argparse.Namespace) -> int:
     airframe, bases = load(args.airframe), _bases(args.baseline)
     stop = stop_on_signal()
     with connect(args.router) as bus:
-        bus.present(f"worker/{bus.writer:016x}/{args.uavs.start}-{args.uavs.stop - 1}")
         bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
         from twin_worker.conflict.separation import Separation
         from twin_worker.mismatch.background import Background
@@ -70,12 +69,8 @@ def _run(args: argparse.Namespace) -> int:
             separation=Separation(*args.separation),
             diagnosis=None if args.no_diagnosis else Live(hand, bases, adapt=not args.no_adapt),
         )
-        worker.listen()
-        worker.sentence = "compiling the twin's physics, once"
-        bus.publish(worker.state())
-        warm_up()
-        worker.sentence = ""
-        print(f"twin_worker: holding UAVs {args.uavs.start}-{args.uavs.stop - 1}", flush=True)
+        warm_up()  # before anything is claimed: who compiles cannot take over
+        print(f"twin_worker: may hold UAVs {args.uavs.start}-{args.uavs.stop - 1}", flush=True)
         try:
             worker.run(stop)
         finally:

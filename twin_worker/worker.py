@@ -4,9 +4,7 @@ import copy
 import logging
 import threading
 import time
-from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -27,6 +25,11 @@ from fleet.contract import (
     Status,
     WhatIf,
 )
+from fleet.fence import Fence
+from twin_worker.claims.carry import Load
+from twin_worker.claims.keeper import Held, Twins
+from twin_worker.claims.protocol import Claiming
+from twin_worker.conflict.ledger import Ledger
 from twin_worker.conflict.separation import Separation
 from twin_worker.conflict.traffic import Traffic
 from twin_worker.memory import AUTO
@@ -38,22 +41,8 @@ from twin_worker.whatif.answer import answer
 from twin_worker.whatif.grid import resample, wanted
 
 _log = logging.getLogger(__name__)
-_INBOX = 4096  # messages waiting per UAV; the oldest go first and are counted
 _SILENT_S = 1.0  # wall time without news after which data time runs on by the wall clock [s]
 _STATE_S = 1.0  # between fleet tables [s]
-
-
-@dataclass
-class Held:
-    """One UAV this worker holds: its twin, its inbox and its claim."""
-
-    twin: Twin
-    epoch: int
-    inbox: deque[Message] = field(default_factory=lambda: deque(maxlen=_INBOX))
-    arrived: float = float("nan")  # wall time of the newest sample [s, monotonic]
-    shed: int = 0
-    failed: str = ""  # what went wrong last, a defect of ours
-    lock: threading.Lock = field(default_factory=threading.Lock)  # held while the twin changes, or is copied
 
 
 class Worker:
@@ -74,46 +63,55 @@ class Worker:
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
         self.sentence = ""
         self.traffic = Traffic(separation or Separation())
-        self._epochs: dict[int, int] = {}  # highest heard of others' aircraft
-        self._held: dict[int, Held] = {}
-        self._lock = threading.Lock()
+        self._twins = Twins(bus, self._make, self)
+        self._held = self._twins.held
+        self.claiming = Claiming(bus, uavs, self._twins)
+        self._fence = Fence()
         self._news = threading.Event()
 
     def listen(self) -> None:
         """Subscribe, answer queries, and ask for what was said before this worker came."""
+        self.claiming.join()
         for kind in (Sample, Status, Mission, Params):
-            self.bus.subscribe(kind, lambda message, _: self._hear(message))
+            self.bus.subscribe(kind, lambda message, _: self._hear(message), self._wants)
         self.bus.subscribe(Prediction, self._overhear)
+        self.bus.subscribe(Model, self._twins.overhear, lambda uav: uav in self.uavs and uav not in self._held)
         self.bus.answer(Prediction, self._predictions)
         self.bus.answer(Alert, lambda uav, *_: self._stamped((h, a) for h in self._asked(uav) for a in self.active(h)))
         self.bus.answer(Model, lambda uav, *_: self._stamped((h, h.twin.model) for h in self._asked(uav)))
         self.bus.answer(Mismatch, lambda uav, *_: self._stamped((h, self._found(h)) for h in self._asked(uav)))
         self.bus.answer(FleetState, lambda *_: [(self.state(), None)])
-        for kind in (Status, Mission, Params):
-            for message, _ in self.bus.ask(kind):
-                self._hear(message)
+        for status, _ in self.bus.ask(Status):
+            self.claiming.hear_of(status.uav)
+
+    def _make(self, uav: int) -> Twin:
+        return Twin(uav, omega=self.omega, method=self.method, airframe=self.airframe)
+
+    def _wants(self, uav: int) -> bool:
+        """Tell whether an aircraft is held, or about to be; one never heard of may be claimed."""
+        self.claiming.hear_of(uav)
+        return uav in self._held
 
     def _hear(self, message: Message) -> None:
-        if message.uav not in self.uavs:
-            return
-        with self._lock:
-            held = self._held.get(message.uav)
-            if held is None:
-                epoch = int(time.time() * 1000)
-                twin = Twin(message.uav, omega=self.omega, method=self.method, airframe=self.airframe)
-                held = self._held[message.uav] = Held(twin, epoch)
-        if isinstance(message, Sample):
-            held.arrived = time.monotonic()
-        held.shed += len(held.inbox) == _INBOX
-        held.inbox.append(message)
-        self._news.set()
+        if self._twins.hear(message):
+            self._news.set()
 
     def _overhear(self, made: Prediction, stamp: Stamp | None) -> None:
-        """Keep what others predict of their aircraft; of two writers the higher epoch is believed."""
-        epoch = stamp.epoch if stamp else 0
-        if made.uav not in self._held and epoch >= self._epochs.get(made.uav, 0):
-            self._epochs[made.uav] = epoch
+        """Keep what others predict of their aircraft; of two writers the higher claim is believed."""
+        self.claiming.overheard(made.uav, stamp)
+        if made.uav not in self._held and self._fence.believes(made.uav, stamp):
             self.traffic.hear(made)
+
+    def take(self, uav: int, load: Load) -> None:
+        """Keep what came with a twin from another worker."""
+        self.traffic.take(uav, load.conflicts)
+        if self.diagnosis is not None and load.mismatch is not None:
+            self.diagnosis.watch(uav).told = load.mismatch
+
+    def give(self, uav: int) -> tuple[Ledger, Mismatch | None]:
+        """Give what belongs to a twin that is held here no longer."""
+        watch = self.diagnosis.watches.pop(uav, None) if self.diagnosis is not None else None
+        return self.traffic.give(uav), watch.told if watch is not None else None
 
     def active(self, held: Held) -> list[Alert]:
         """Give the alerts of one aircraft that are in force."""
@@ -121,23 +119,27 @@ class Worker:
 
     def holding(self) -> list[Held]:
         """Give what this worker holds, by UAV id."""
-        with self._lock:
-            return [self._held[uav] for uav in sorted(self._held)]
+        return self._twins.ready()
 
     def turn(self) -> int:
         """Advance every twin once; give how many messages were taken in."""
         taken = 0
         for held in self.holding():
-            messages = [held.inbox.popleft() for _ in range(len(held.inbox))]
-            taken += len(messages)
+            waiting = len(held.inbox)
+            taken += waiting
             try:
-                for result in _advance_all(held, messages, self.traffic):
-                    self.bus.publish(result, Stamp(held.epoch, self.bus.writer))
+                for result in _advance_all(held, waiting, self.traffic):
+                    self._publish(result, held)
             except Exception as error:  # a defect met by one aircraft must not stop the others
                 held.failed = f"{held.twin.name}: found a defect ({error}), its results are missing; report it"
                 _log.exception(held.failed)
         self._diagnose()
         return taken
+
+    def _publish(self, result: Message, held: Held) -> None:
+        """Publish under the claim in force; what is held no longer, or not surely, is kept back."""
+        if held.ready and self.claiming.may_write():
+            self.bus.publish(result, Stamp(held.epoch, self.bus.writer))
 
     def _diagnose(self) -> None:
         """Let the diagnosis go on in the background, and publish what it found."""
@@ -146,7 +148,7 @@ class Worker:
         held = {one.twin.uav: one for one in self.holding()}
         try:
             for found in self.diagnosis.turn([(one.twin, one.lock) for one in held.values()]):
-                self.bus.publish(found, Stamp(held[found.uav].epoch, self.bus.writer))
+                self._publish(found, held[found.uav])
         except Exception:  # a defect of the diagnosis must not stop the predictions
             _log.exception("the diagnosis met a defect and is off; report it")
             self.sentence, self.diagnosis = "the diagnosis met a defect and is off; restart the worker", None
@@ -168,15 +170,22 @@ class Worker:
         return FleetState(t=time.time(), rows=tuple(rows), sentence=self.sentence or " ".join(said[:3]))
 
     def run(self, stop: threading.Event) -> None:
-        """Turn until told to stop, publishing the fleet table once a second."""
+        """Join, turn until told to stop, publishing the fleet table once a second; then hand everything over."""
+        self.claiming.threaded = True
+        self.listen()
+        claims = threading.Thread(target=self.claiming.run, args=(stop,), name="claims")
+        claims.start()
         due = 0.0
         while not stop.is_set():
             self._news.wait(timeout=0.1)
             self._news.clear()
+            self.claiming.tick()
             self.turn()
             if time.monotonic() >= due:
                 due = time.monotonic() + _STATE_S
                 self.bus.publish(self.state())
+        claims.join()
+        self.claiming.leave()
 
     def _predictions(self, uav: int | None, asked: dict[str, str], payload: bytes) -> Iterator[tuple[Any, Stamp]]:
         grid = wanted(asked)
@@ -235,15 +244,17 @@ def data_time(held: Held) -> float:
     return newest + silent if silent > _SILENT_S else newest
 
 
-def _advance_all(held: Held, messages: list[Message], traffic: Traffic) -> Iterator[Message]:
+def _advance_all(held: Held, waiting: int, traffic: Traffic) -> Iterator[Message]:
     """Turn the loop after every message, as offline; the wall clock turns it on where data have fallen silent."""
     twin = held.twin
-    for message in messages:
+    for _ in range(waiting):
         with held.lock:
-            results = advance(twin, (message,))
+            if not held.ready:  # handed over meanwhile, with what still waits
+                return
+            results = advance(twin, (held.inbox.popleft(),))
         yield from traffic.after(twin.uav, twin.turned_t, results)
     now = data_time(held)
-    if not messages and now > twin.history.newest:  # a worker that is late hears no silence
+    if not waiting and now > twin.history.newest:  # a worker that is late hears no silence
         with held.lock:
-            results = advance(twin, (), now)
+            results = advance(twin, (), now) if held.ready else []
         yield from traffic.after(twin.uav, twin.turned_t, results)

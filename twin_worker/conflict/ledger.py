@@ -53,7 +53,7 @@ class Finding:
 
 
 @dataclass
-class _Open:
+class Open:
     """One danger under watch."""
 
     alert: Alert | None = None  # in force
@@ -64,12 +64,12 @@ class _Open:
 class Ledger:
     """The alerts of one UAV: in force, or about to be."""
 
-    _open: dict[About, _Open] = field(default_factory=dict)
+    _open: dict[About, Open] = field(default_factory=dict)
 
     def judge(self, uav: int, now: float, finding: Finding) -> list[Alert]:
         """Take a finding at data time `now` [s since 1970]; give the alert it raises or withdraws, if any."""
         about = finding.kind, finding.other
-        entry, rule = self._open.setdefault(about, _Open()), RULES[finding.kind]
+        entry, rule = self._open.setdefault(about, Open()), RULES[finding.kind]
         p = finding.probability if isfinite(finding.probability) else 0.0
         contrary = p < rule.clear_below if entry.alert else p >= rule.raise_at
         if not contrary:

@@ -48,6 +48,15 @@ class Traffic:
             found.setdefault(other, Finding(AlertKind.CONFLICT, 0.0, "", _KEPT.format(other), other))
         return [alert for finding in found.values() for alert in ledger.judge(uav, now, finding)]
 
+    def take(self, uav: int, conflicts: Ledger) -> None:
+        """Go on with what another worker found of an aircraft that is held here from now on."""
+        self._ledgers[uav] = conflicts
+
+    def give(self, uav: int) -> Ledger:
+        """Give what was found of an aircraft that is held here no longer."""
+        self._judged.pop(uav, None)
+        return self._ledgers.pop(uav, None) or Ledger()
+
     def active(self, uav: int) -> list[Alert]:
         """Give the conflicts of one held aircraft that are in force."""
         return self._ledgers[uav].active if uav in self._ledgers else []

@@ -1,0 +1,147 @@
+"""A twin on its way to another worker: it goes on exactly as it would have, and hostile bytes become no twin."""
+
+import copy
+
+import flights as f
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet.contract import Message, Model, Prediction, Sample
+from twin_worker.claims.carry import CARRIED, Load, packed, unpacked
+from twin_worker.claims.revive import revive
+from twin_worker.claims.tree import pack, unpack
+from twin_worker.memory import Twin, hear
+from twin_worker.twin import advance
+
+
+def later(heard: tuple[Message, ...], by: float = 20.0) -> list[Message]:
+    """What comes next: the last seconds of the flight again, as if it went on so."""
+    end = heard[-1].t
+    found = [m for m in heard if isinstance(m, Sample) and m.t > end - by]
+    return f.shifted([msgspec.structs.replace(m, t=m.t) for m in found], by, 1e9)
+
+
+def said(twin: Twin, messages: list[Message]) -> list[Message]:
+    return [result for m in messages for result in advance(twin, (m,))]
+
+
+def test_who_takes_over_says_what_the_other_would_have_said(twin: Twin, heard: tuple[Message, ...]) -> None:
+    data = packed(Load(twin, inbox=[heard[-1]]))
+    carried = unpacked(data, 1)
+    assert packed(carried) == data and carried.inbox == [heard[-1]]
+    rest = later(heard)
+    assert len(rest) > 100
+    one, other = said(copy.deepcopy(twin), rest), said(carried.twin, rest)
+    assert {type(m) for m in one} >= {Prediction, Model} and len(one) > 20
+    assert [msgspec.msgpack.encode(m) for m in one] == [msgspec.msgpack.encode(m) for m in other]
+
+
+def test_what_was_one_thing_stays_one(twin: Twin) -> None:
+    assert any(twin.plant is one.plant for one in twin.pool), "the model in force is one of the pool"
+    carried = unpacked(packed(Load(twin)), 1).twin
+    assert any(carried.plant is one.plant for one in carried.pool)
+
+
+def test_a_multirotor_travels_too(hovered: Twin) -> None:
+    assert packed(unpacked(packed(Load(hovered)), 7)) == packed(Load(hovered))
+
+
+def test_a_twin_is_a_few_megabytes_at_most(twin: Twin) -> None:
+    assert len(packed(Load(twin))) < 3_000_000
+
+
+def test_another_aircraft_s_twin_is_refused(twin: Twin) -> None:
+    with pytest.raises(ValueError, match=r"uav-2: found another thing carried, expected its twin; it is taken over c"):
+        unpacked(packed(Load(twin)), 2)
+    with pytest.raises(ValueError, match="found another thing"):
+        unpacked(pack([1, 2], CARRIED), 1)
+
+
+HOSTILE = (
+    ["o", "os.system", "x", 1],
+    ["o", "Twin"],
+    ["o", "Note", "event", None, "t", 0.0, "said", "", "more", 1],
+    ["s", "Twin", b"\x80"],
+    ["s", "Status", b"\x80"],
+    ["e", "Twin", 1],
+    ["e", "State", "no such"],
+    ["n", "State", 1],
+    ["x", "CubicSpline", ["t", ["a", "<f8", [2], bytes(16)], ["a", "<f8", [9, 9], bytes(648)]]],
+    ["x", "KalmanFilter", ["d", "predict", 1]],
+    ["x", "Twin", None],
+    ["a", "|O8", [1], bytes(8)],
+    ["a", "<f8", [1 << 60], b""],
+    ["a", "<f8", [-1], b""],
+    ["a", "<f8", [2], bytes(8)],
+    ["r", 5],
+    ["r", -9],
+    ["d", ["l"], 1],
+    ["q", -1],
+    ["w", [4], 1],
+    ["?"],
+    [],
+    {"a": 1},
+)
+
+
+@pytest.mark.parametrize("told", HOSTILE, ids=lambda told: repr(told)[:30])
+def test_hostile_trees_are_refused(told: object) -> None:
+    with pytest.raises(ValueError):
+        unpack(msgspec.msgpack.encode(told), CARRIED)
+
+
+def test_depth_is_limited() -> None:
+    deep: object = 1
+    for _ in range(60):
+        deep = ["l", deep]
+    with pytest.raises(ValueError, match="deep"):
+        unpack(msgspec.msgpack.encode(deep), CARRIED)
+
+
+@given(st.binary(max_size=200))
+def test_random_bytes_are_refused_or_harmless(data: bytes) -> None:
+    with pytest.raises(ValueError):
+        unpacked(data, 1)
+
+
+def test_what_nobody_named_is_not_carried() -> None:
+    with pytest.raises(TypeError, match=r"complex: is not carried; name it"):
+        pack([1j], CARRIED)
+
+
+# --- cold ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cold(heard: tuple[Message, ...]) -> Twin:
+    """A twin that has heard everything and learnt nothing."""
+    twin = Twin(1)
+    for message in heard:
+        hear(twin, message)
+    return twin
+
+
+def test_a_published_model_flies_at_once_and_about_as_well(twin: Twin, cold: Twin, heard: tuple) -> None:
+    assert twin.model is not None and revive(cold, twin.model)
+    assert cold.in_force.fit == twin.in_force.fit and "taken over" in cold.in_force.sentence
+    made = next(m for m in said(cold, later(heard, 3.0)) if isinstance(m, Prediction))
+    before = twin.prediction
+    assert made.method in f.ROUTE, made.sentence
+    assert made.t - before.t < 3.0 and made.path.shape[1] == 3
+
+
+def test_a_model_that_cannot_be_is_not_believed(twin: Twin, cold: Twin) -> None:
+    model, told = twin.model, twin.model.derivatives
+    replace = msgspec.structs.replace
+    for odd in (
+        replace(model, derivatives=None),
+        replace(model, in_force=None),
+        replace(model, derivatives=replace(told, names=told.names[::-1])),
+        replace(model, derivatives=replace(told, prior="airliner")),
+        replace(model, derivatives=replace(told, U0=0.0)),
+        replace(model, derivatives=replace(told, value=replace(told.value, shape=(5,)))),
+        replace(model, derivatives=replace(told, covariance=told.value)),
+    ):
+        assert not revive(cold, odd) and cold.plant is None

@@ -1,0 +1,187 @@
+"""Claims, pure: who owns what, what is taken, asked for and given, which epochs, and when nothing may be written."""
+
+import numpy as np
+import pytest
+
+from fleet.codec import Stamp
+from fleet.fence import GIVE_UP_S, Fence
+from twin_worker.claims.decide import PAUSE_S, SETTLE_S, Claims, Plan, Rank
+from twin_worker.claims.owner import owner, owners
+
+IDS = range(100)
+WALL = 1_700_000_000_000
+
+
+def workers(count: int, ids: range = IDS) -> dict[str, range]:
+    return {f"{k:016x}": ids for k in range(count)}
+
+
+def claims(me: str = "b", *, peers: tuple[str, ...] = (), known: range = range(0), now: float = 0.0) -> Claims:
+    """One worker that has asked everyone, in sight of the router, and knows of some aircraft."""
+    one = Claims(me, IDS)
+    for name in peers:
+        one.appeared(name, IDS, 1)
+    one.known.update(known)
+    one.tick(now, True)
+    one.synced(WALL)
+    return one
+
+
+# --- owner -----------------------------------------------------------------------------------------------------------
+
+
+def test_everyone_names_the_same_owner_and_the_share_is_fair() -> None:
+    found = owners(range(2000), workers(5, range(2000)))
+    assert owners(reversed(range(2000)), dict(reversed(workers(5, range(2000)).items()))) == found
+    counts = np.unique(list(found.values()), return_counts=True)[1]
+    assert len(counts) == 5 and counts.min() > 340 and counts.max() < 460
+
+
+def test_when_one_leaves_only_its_own_move() -> None:
+    five = workers(5)
+    before = owners(IDS, five)
+    gone = sorted(five)[2]
+    after = owners(IDS, {name: ids for name, ids in five.items() if name != gone})
+    assert {uav for uav in IDS if before[uav] != after[uav]} == {uav for uav in IDS if before[uav] == gone}
+
+
+def test_only_who_may_hold_an_id_owns_it() -> None:
+    two = {"a": range(10), "b": range(5, 20)}
+    found = owners(range(30), two)
+    assert all(uav in two[name] for uav, name in found.items())
+    assert sorted(found) == list(range(20)) and {found[uav] for uav in range(5, 10)} == {"a", "b"}
+    assert owner(25, two) is None and owner(3, {}) is None and owner(15, two) == "b"
+    assert owners([], two) == {}
+
+
+# --- decide ----------------------------------------------------------------------------------------------------------
+
+
+def test_alone_it_takes_everything_it_knows_of() -> None:
+    one = claims(known=range(3))
+    assert one.plan(0.0) == Plan(take=[0, 1, 2])
+    assert one.take(0, WALL) == WALL and one.held == {0: WALL}
+    assert one.plan(0.0) == Plan(take=[1, 2])
+
+
+def test_a_live_holder_is_asked_and_a_dead_one_is_not() -> None:
+    one = claims(peers=("a",), known=IDS)
+    one.heard("a", dict.fromkeys(range(50), WALL))
+    plan, mine = one.plan(0.0), {uav for uav, who in owners(IDS, {"a": IDS, "b": IDS}).items() if who == "b"}
+    assert set(plan.ask) == {"a"} and set(plan.ask["a"]) == mine & set(range(50))
+    assert set(plan.take) == mine - set(range(50))
+    one.vanished("a", 1)
+    assert one.plan(0.0) == Plan(take=list(IDS))
+
+
+def test_epochs_rise_above_all_seen_and_with_the_clock() -> None:
+    one = claims(peers=("a",))
+    one.heard("a", {7: WALL + 5000})
+    assert one.take(7, WALL) == WALL + 5001, "a clock that is late"
+    assert one.take(8, WALL) == WALL
+    assert one.give([7, 9]) == {7: WALL + 5001} and 7 not in one.held
+    assert one.take(7, WALL) == WALL + 5002, "its own last epoch counts, too"
+
+
+def test_the_higher_claim_wins_whoever_hears_first_and_a_tie_has_a_winner() -> None:
+    one, other = claims("a", peers=("b",)), claims("b", peers=("a",))
+    one.take(1, WALL)
+    other.take(1, WALL)
+    assert one.heard("b", other.held) == [1] and not one.held
+    assert other.heard("a", {1: WALL}) == [] and other.held == {1: WALL}
+    other.take(2, WALL + 9)
+    assert one.heard("b", other.held) == [] and other.heard("a", {2: WALL + 10}) == [2]
+    assert other.heard("a", {2: WALL + 10}) == [], "said again, nothing is lost again"
+
+
+def test_a_claim_met_in_results_first_wins_all_the_same_once_it_is_announced() -> None:
+    one = claims(peers=("a",))
+    one.take(1, WALL)
+    one.note(1, Rank(WALL + 5, "a"))
+    assert one.held == {1: WALL}
+    assert one.heard("a", {1: WALL + 5}) == [1] and not one.held
+
+
+def test_a_stale_claim_of_who_handed_over_takes_nothing_back() -> None:
+    one = claims(peers=("a",))
+    one.heard("a", {4: WALL})
+    assert one.take(4, WALL) == WALL + 1
+    assert one.heard("a", {4: WALL}) == [] and one.held == {4: WALL + 1}
+
+
+def test_after_a_pause_it_writes_nothing_until_it_has_asked() -> None:
+    one = claims(known=range(2))
+    one.take(0, WALL)
+    assert one.may_write(PAUSE_S) and not one.may_write(PAUSE_S + 0.01), "though nobody has looked at the clock since"
+    one.tick(3.0, True)
+    assert not one.may_write(3.0) and one.plan(3.0) == Plan()
+    one.synced(WALL)
+    assert one.may_write(3.0) and one.plan(3.0) == Plan(take=[1]) and one.held == {0: WALL}
+
+
+def test_who_was_overtaken_while_it_stood_still_claims_anew_or_yields() -> None:
+    one = claims(peers=("a",))
+    for uav in (0, 1, 2):
+        one.take(uav, WALL)
+    one.tick(5.0, True)
+    assert one.heard("a", {0: WALL + 50}) == [0]
+    one.note(1, Rank(WALL + 70, "c"))  # of a worker that is no more
+    one.synced(WALL + 9)
+    assert one.held == {1: WALL + 71, 2: WALL}
+
+
+def test_without_a_router_it_claims_nothing_and_after_it_only_once_tokens_have_settled() -> None:
+    one = claims(peers=("a",), known=IDS)
+    one.take(0, WALL)
+    one.tick(0.5, False)
+    one.vanished("a", 1)  # as all tokens do with the router
+    assert one.plan(0.5) == Plan() and not one.may_write(0.5) and one.held == {0: WALL}
+    one.tick(1.0, True)
+    one.synced(WALL)
+    assert one.may_write(1.0) and one.plan(1.0) == Plan()
+    one.appeared("a", IDS, 1)
+    one.tick(0.5 + SETTLE_S, True)
+    assert set(one.plan(0.5 + SETTLE_S).take) < set(IDS), "only its own share: the other is back"
+
+
+def test_the_end_of_an_earlier_life_says_nothing() -> None:
+    one = claims()
+    one.appeared("a", IDS, 2)
+    one.vanished("a", 1)
+    one.appeared("a", range(3), 1)
+    assert one.peers["a"].ids == IDS
+    one.vanished("a", 2)
+    assert not one.peers
+
+
+def test_who_is_leaving_owns_nothing_but_is_still_asked() -> None:
+    one = claims(peers=("a",), known=IDS)
+    one.heard("a", dict.fromkeys(IDS, WALL), leaving=True)
+    assert one.plan(0.0) == Plan(ask={"a": list(IDS)})
+    one.leaving = True
+    assert one.plan(0.0) == Plan()
+
+
+def test_its_own_name_and_ids_beyond_its_range_are_nobody_s_news() -> None:
+    one = claims(known=range(1))
+    one.appeared("b", IDS, 9)
+    one.note(500, Rank(1, "a"))
+    one.note(1, Rank(1, "b"))
+    assert not one.peers and not one.seen and one.known == {0}
+
+
+# --- readers ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("low", [Stamp(4, 9), Stamp(5, 1), None])
+def test_readers_believe_the_higher_claim_until_it_falls_silent(low: Stamp | None) -> None:
+    now = [0.0]
+    fence = Fence(lambda: now[0])
+    assert fence.believes(1, low) and fence.believes(1, Stamp(5, 2)) and not fence.believes(1, low)
+    assert fence.believes(2, low), "another aircraft"
+    now[0] = GIVE_UP_S - 1.0
+    assert fence.believes(1, Stamp(5, 2)), "the same again, and as long as it speaks"
+    now[0] = GIVE_UP_S + 1.0
+    assert not fence.believes(1, low)
+    now[0] = 2 * GIVE_UP_S
+    assert fence.believes(1, low), "a fleet that was started anew with its clock set back"

@@ -1,0 +1,109 @@
+"""One aircraft's whole twin as bytes, from worker to worker: who takes over goes on as the other would have."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+from scipy.interpolate import CubicSpline
+
+from fleet import contract as c
+from fleet.airframe import ServoMap
+from fleet.airframes import Airframe
+from fleet.contract import Message, Mismatch
+from fleet.frames import Origin
+from twin_worker.calibration.adapt import Factors, Levels
+from twin_worker.calibration.ledger import Ledger as Book
+from twin_worker.calibration.revision import Earlier
+from twin_worker.calibration.written import Tables
+from twin_worker.calibration.written import load as load_tables
+from twin_worker.claims.tree import Known, Special, pack, unpack
+from twin_worker.conflict.ledger import Ledger, Open
+from twin_worker.contest import Contest
+from twin_worker.control import Control
+from twin_worker.coupled import Coupled
+from twin_worker.earned import Earned
+from twin_worker.events.note import Note
+from twin_worker.events.watch import Ground
+from twin_worker.greybox import Grey
+from twin_worker.history import History
+from twin_worker.horizon import Made, Record, Trust
+from twin_worker.hybrid.energy import Ridge
+from twin_worker.hybrid.fit import Hybrid
+from twin_worker.identify import Axis
+from twin_worker.learn_law import Learnt
+from twin_worker.memory import Believed, Twin
+from twin_worker.mismatch.marks import Extension, Mark
+from twin_worker.preprocess import Grid
+from twin_worker.rotor import Rotor
+from twin_worker.wind import WindFilter
+
+
+@dataclass
+class Load:
+    """What travels of one aircraft.
+
+    Attributes:
+        twin: everything that was heard and learnt
+        inbox: messages not yet taken in, oldest first
+        conflicts: its open conflicts
+        mismatch: what was found last; None: nothing
+    """
+
+    twin: Twin
+    inbox: list[Message] = field(default_factory=list)
+    conflicts: Ledger = field(default_factory=Ledger)
+    mismatch: Mismatch | None = None
+
+
+def _filter(parts: dict[str, Any]) -> KalmanFilter:
+    out = KalmanFilter(dim_x=8, dim_z=2)
+    for name, value in parts.items():
+        if type(value) is not type(getattr(out, name)) and value is not None:
+            raise TypeError(f"a filter with {name}")
+        setattr(out, name, value)
+    return out
+
+
+def _parts(one: KalmanFilter) -> dict[str, Any]:
+    return {name: getattr(one, name) for name in ("x", "P", "R")}
+
+
+def _spline(parts: tuple[np.ndarray, np.ndarray]) -> CubicSpline:
+    x, coefficients = parts
+    if coefficients.ndim != 3 or coefficients.shape[:2] != (4, len(x) - 1):
+        raise TypeError(f"a spline of {coefficients.shape} over {len(x)}")
+    return CubicSpline.construct_fast(coefficients, x, extrapolate=True, axis=0)
+
+
+_WIRE = (c.Status, c.Mission, c.Params, c.Sample, c.Model, c.Prediction, c.Mismatch, c.Alert, c.Verdict, c.Item)
+_NAMED = (c.State, c.Event, c.AlertKind, Origin)
+_OURS = (
+    *(Load, Twin, History, Grid, WindFilter, Record, Ledger, Open, Rotor, Grey, Learnt, Contest, Earned, Mark),
+    *(Coupled, Axis, Hybrid, Ridge, Believed, Extension, Ground, Note, Control, Earlier, Book, Levels, Factors),
+    *(Made, Trust, Airframe, ServoMap),
+)
+CARRIED: Known = {
+    **{one.__name__: one for one in (*_WIRE, *_NAMED, *_OURS) if one is not Book},
+    "Book": Book,
+    "KalmanFilter": (KalmanFilter, Special(_parts, _filter)),
+    "CubicSpline": (CubicSpline, Special(lambda one: (one.x, one.c), _spline)),
+    "Tables": (Tables, Special(lambda _: None, lambda _: load_tables())),  # everyone has them
+}
+
+
+def packed(load: Load) -> bytes:
+    """Give the bytes of what travels."""
+    return pack(load, CARRIED)
+
+
+def unpacked(data: bytes, uav: int) -> Load:
+    """Give what travelled.
+
+    Raises:
+        ValueError: when the bytes are not that of this aircraft; take it over cold.
+    """
+    load = unpack(data, CARRIED)
+    if not isinstance(load, Load) or not isinstance(load.twin, Twin) or load.twin.uav != uav:
+        raise ValueError(f"uav-{uav}: found another thing carried, expected its twin; it is taken over cold")
+    return load

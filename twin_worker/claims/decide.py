@@ -1,0 +1,161 @@
+"""What one worker holds and what it does next: the claim protocol without bus, thread or clock.
+
+A worker knows the others by their liveliness tokens and what they hold by their announcements. An aircraft belongs to
+its `owner`. The owner asks a live holder to hand it over, takes what nobody live holds, and gives what it is asked for.
+Every taking raises the aircraft's epoch; of two writers the higher `Rank` is believed, by readers and by both.
+
+    unsure    after a pause, and with no router in sight: writes nothing and claims nothing until it has asked the
+              others what they hold
+    settling  for a while after the router came back into sight: claims nothing, since the others' tokens come one
+              by one and whoever is still on the way would pass for dead
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from twin_worker.claims.owner import owners
+
+PAUSE_S = 0.8  # a worker that stood still for longer may have been replaced [s]
+SETTLE_S = 1.5  # after the router came back, before anything is claimed [s]
+
+
+class Rank(NamedTuple):
+    """A claim on one aircraft; the greater wins: by epoch, then by name."""
+
+    epoch: int
+    worker: str
+
+
+class Peer(NamedTuple):
+    """Another live worker."""
+
+    ids: range
+    incarnation: int
+    leaving: bool = False
+
+
+@dataclass
+class Plan:
+    """What is to be done next: take these at once; ask these workers for those."""
+
+    take: list[int] = field(default_factory=list)
+    ask: dict[str, list[int]] = field(default_factory=dict)
+
+
+class Claims:
+    """The claims of one worker.
+
+    Args:
+        me: its name
+        ids: what it may hold
+    """
+
+    def __init__(self, me: str, ids: range) -> None:
+        self.me, self.ids = me, ids
+        self.held: dict[int, int] = {}  # epoch by UAV id
+        self.seen: dict[int, Rank] = {}  # the highest claim on each id of ours, mine among them
+        self.peers: dict[str, Peer] = {}
+        self.known: set[int] = set()  # ids of ours that were heard of
+        self.leaving = False
+        self.unsure = True
+        self._settled = float("-inf")
+        self._ticked = float("nan")
+
+    # --- what is heard -----------------------------------------------------------------------------------------------
+
+    def appeared(self, worker: str, ids: range, incarnation: int) -> None:
+        """Take the token of a worker."""
+        old = self.peers.get(worker)
+        if worker != self.me and (old is None or old.incarnation <= incarnation):
+            leaving = old is not None and old.incarnation == incarnation and old.leaving
+            self.peers[worker] = Peer(ids, incarnation, leaving)
+
+    def vanished(self, worker: str, incarnation: int) -> None:
+        """Take the end of a token; one of an earlier life says nothing."""
+        old = self.peers.get(worker)
+        if old is not None and old.incarnation <= incarnation:
+            del self.peers[worker]
+
+    def heard(self, worker: str, held: Mapping[int, int], leaving: bool = False) -> list[int]:
+        """Take an announcement: epochs by UAV id; give what is lost to a higher claim."""
+        peer = self.peers.get(worker)
+        if peer is not None:
+            self.peers[worker] = peer._replace(leaving=leaving)
+        lost = []
+        for uav, epoch in held.items():
+            rank = Rank(epoch, worker)
+            self.note(uav, rank)
+            if uav in self.held and worker != self.me and rank > Rank(self.held[uav], self.me):
+                del self.held[uav]
+                lost.append(uav)
+        return lost
+
+    def note(self, uav: int, rank: Rank) -> None:
+        """Remember a claim of another's, as one met in its results; it takes nothing that is held."""
+        if uav not in self.ids or rank.worker == self.me:
+            return
+        self.known.add(uav)
+        self.seen[uav] = max(rank, self.seen.get(uav, rank))
+
+    # --- time --------------------------------------------------------------------------------------------------------
+
+    def tick(self, now: float, in_sight: bool) -> None:
+        """Look at the clock (monotonic [s]) and for the router; to be called several times in `PAUSE_S`."""
+        if now - self._ticked > PAUSE_S:
+            self.unsure = True
+        if not in_sight:
+            self.unsure, self._settled = True, now + SETTLE_S
+        self._ticked = now
+
+    def may_write(self, now: float) -> bool:
+        """Tell whether results may be published now."""
+        return not self.unsure and now - self._ticked <= PAUSE_S
+
+    def synced(self, wall_ms: int) -> None:
+        """Go on after everyone was asked: what is held under a claim that is no longer the highest is claimed anew."""
+        self.unsure = False
+        for uav, epoch in list(self.held.items()):
+            if self.seen[uav] != Rank(epoch, self.me):
+                self.take(uav, wall_ms)
+
+    # --- what to do --------------------------------------------------------------------------------------------------
+
+    def plan(self, now: float) -> Plan:
+        """Give what this worker should hold and does not."""
+        plan = Plan()
+        missing = self.known - self.held.keys()
+        if not missing or not self._ready(now):
+            return plan
+        for uav, who in owners(sorted(missing), self._candidates()).items():
+            if who != self.me:
+                continue
+            holder = self._holder(uav)
+            if holder is None:
+                plan.take.append(uav)
+            else:
+                plan.ask.setdefault(holder, []).append(uav)
+        return plan
+
+    def _ready(self, now: float) -> bool:
+        return not self.leaving and self.may_write(now) and now >= self._settled
+
+    def _candidates(self) -> dict[str, range]:
+        return {self.me: self.ids} | {name: peer.ids for name, peer in self.peers.items() if not peer.leaving}
+
+    def _holder(self, uav: int) -> str | None:
+        """Give the live worker that is known to hold an aircraft; None where it is free."""
+        rank = self.seen.get(uav)
+        return rank.worker if rank is not None and rank.worker in self.peers else None
+
+    def take(self, uav: int, wall_ms: int) -> int:
+        """Hold an aircraft from now on; give the epoch, which is above every one seen and not below the clock's."""
+        self.known.add(uav)
+        before = self.seen[uav].epoch if uav in self.seen else 0
+        epoch = self.held[uav] = max(before + 1, wall_ms)
+        self.seen[uav] = Rank(epoch, self.me)
+        return epoch
+
+    def give(self, uavs: Iterable[int]) -> dict[int, int]:
+        """Hold these no longer, because their owner asked for them; give those that were held, with their epochs."""
+        return {uav: self.held.pop(uav) for uav in uavs if uav in self.held}

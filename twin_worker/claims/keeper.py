@@ -1,0 +1,193 @@
+"""The twins one worker keeps: where messages wait for them, how they come, and how they go."""
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import fleet
+from fleet.bus import Bus
+from fleet.codec import Stamp
+from fleet.contract import Handover, Message, Mismatch, Model, Sample
+from fleet.fence import Fence
+from twin_worker.claims.carry import Load, packed, unpacked
+from twin_worker.claims.past import recall
+from twin_worker.claims.revive import revive
+from twin_worker.conflict.ledger import Ledger
+from twin_worker.memory import Twin
+
+_log = logging.getLogger(__name__)
+INBOX = 4096  # messages waiting per UAV; the oldest go first and are counted
+_AT_ONCE = 8  # aircraft whose last minutes are asked for at once
+
+
+@dataclass
+class Held:
+    """One UAV this worker holds: its twin, its inbox and its claim."""
+
+    twin: Twin
+    epoch: int
+    inbox: deque[Message] = field(default_factory=lambda: deque(maxlen=INBOX))
+    arrived: float = float("nan")  # wall time of the newest sample [s, monotonic]
+    shed: int = 0
+    failed: str = ""  # what went wrong last, a defect of ours
+    lock: threading.Lock = field(default_factory=threading.Lock)  # held while the twin changes, or is copied
+    ready: bool = True  # its twin is here
+    bare: bool = False  # without the telemetry of before
+
+
+class Extras(Protocol):
+    """Who keeps what belongs to an aircraft besides its twin."""
+
+    def take(self, uav: int, load: Load) -> None:
+        """Keep what came with a twin."""
+
+    def give(self, uav: int) -> tuple[Ledger, Mismatch | None]:
+        """Give it up: open conflicts, and the mismatch found last."""
+
+
+class Twins:
+    """What is kept; a `Keeper`.
+
+    Args:
+        bus: joined
+        make: makes the twin of an id
+        extras: takes and gives what belongs to an aircraft besides its twin
+    """
+
+    def __init__(self, bus: Bus, make: Callable[[int], Twin], extras: Extras) -> None:
+        self.held: dict[int, Held] = {}
+        self.lock = threading.Lock()
+        self._bus, self._make, self._extras = bus, make, extras
+        self._models: dict[int, Model] = {}  # last published by others, of ids of ours
+        self._fence = Fence()
+
+    # --- what is heard -----------------------------------------------------------------------------------------------
+
+    def hear(self, message: Message) -> bool:
+        """Let a message wait for its twin; tell whether there is one."""
+        held = self.held.get(message.uav)
+        if held is None:
+            return False
+        if isinstance(message, Sample):
+            held.arrived = time.monotonic()
+        held.shed += len(held.inbox) == INBOX
+        held.inbox.append(message)
+        return True
+
+    def overhear(self, model: Model, stamp: Stamp | None) -> None:
+        """Keep the model another worker published."""
+        if model.uav not in self.held and self._fence.believes(model.uav, stamp):
+            self._models[model.uav] = model
+
+    def ready(self) -> list[Held]:
+        """Give those whose twins are here, by UAV id."""
+        with self.lock:
+            return [held for _, held in sorted(self.held.items()) if held.ready]
+
+    # --- how they come -----------------------------------------------------------------------------------------------
+
+    def expect(self, uavs: Iterable[int]) -> None:
+        """Begin to collect what is heard of these, before their twins are here."""
+        for uav in uavs:
+            self._place(uav)
+
+    def adopt(self, uav: int, epoch: int, twin: Handover | None) -> None:
+        """Hold one from now on, with its twin or without."""
+        held = self._place(uav)
+        held.epoch, held.bare = epoch, twin is None and not held.ready
+        if twin is None:
+            return
+        try:
+            if twin.code != fleet.SOURCES:
+                raise ValueError(f"uav-{uav}: found a twin of other sources, expected ours; start all workers alike")
+            load = unpacked(twin.load, uav)
+        except ValueError as error:
+            _log.warning("%s", error)
+            self.recall([uav])
+            return
+        self._extras.take(uav, load)
+        self._models.pop(uav, None)
+        self._begin(held, load.twin, load.inbox)
+
+    def recall(self, uavs: list[int]) -> None:
+        """Begin some without their twins: with the gateway's last minutes, and the model published last."""
+        if len(uavs) == 1:
+            self._recall(uavs[0])
+        elif uavs:
+            with ThreadPoolExecutor(_AT_ONCE, "recall") as pool:
+                list(pool.map(self._recall, uavs))
+
+    def _recall(self, uav: int) -> None:
+        held = self.held.get(uav)
+        if held is None or held.ready:
+            return
+        twin = self._make(uav)
+        try:
+            recall(self._bus, twin)
+        except ConnectionError:  # we are leaving
+            return
+        if (model := self._models.pop(uav, None)) is not None:
+            revive(twin, model)
+        self._begin(held, twin, [])
+
+    def renew(self, uav: int, epoch: int) -> None:
+        """Write under another epoch from now on."""
+        if (held := self.held.get(uav)) is not None:
+            held.epoch = epoch
+
+    def _place(self, uav: int) -> Held:
+        with self.lock:
+            return self.held.setdefault(uav, Held(self._make(uav), 0, ready=False))
+
+    @staticmethod
+    def _begin(held: Held, twin: Twin, before: list[Message]) -> None:
+        """Go on with a twin, and with what came since: telemetry it has already taken in is not taken in again."""
+        with held.lock:
+            known = twin.data_t if twin.data_t > 0 else twin.history.newest
+            since = [m for m in held.inbox if not isinstance(m, Sample) or m.t > max([known, *(b.t for b in before)])]
+            held.inbox.clear()
+            held.inbox.extend([*before, *since])
+            held.twin = twin
+            held.bare, held.ready = False, True
+            if held.arrived != held.arrived and twin.history.newest > 0:
+                held.arrived = time.monotonic()
+
+    # --- how they go -------------------------------------------------------------------------------------------------
+
+    def drop(self, uavs: Iterable[int]) -> None:
+        """Hold these no longer."""
+        with self.lock:
+            gone = {uav: self.held.pop(uav) for uav in uavs if uav in self.held}
+        for uav, held in gone.items():
+            held.ready = False
+            if held.twin.model is not None:
+                self._models[uav] = held.twin.model
+            self._extras.give(uav)
+
+    def hand_over(self, uav: int, epoch: int) -> Handover | None:
+        """Hold one no longer; give its twin, between two of its turns."""
+        held = self.held.get(uav)
+        if held is None or not held.ready:
+            return None
+        with held.lock:
+            held.ready = False
+            conflicts, mismatch = self._extras.give(uav)
+            try:
+                load = packed(Load(held.twin, list(held.inbox), conflicts, mismatch))
+            except TypeError:  # a defect: its new owner begins cold
+                _log.exception("uav-%d cannot be handed over; report it", uav)
+                load = b""
+        with self.lock:
+            self.held.pop(uav, None)
+        return Handover(t=time.time(), uav=uav, epoch=epoch, code=fleet.SOURCES, load=load)
+
+    @property
+    def bare(self) -> tuple[int, ...]:
+        """Name those without the telemetry of before."""
+        with self.lock:
+            return tuple(uav for uav, held in self.held.items() if held.bare)

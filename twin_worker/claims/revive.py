@@ -1,0 +1,53 @@
+"""A cold takeover: a twin that was never handed over begins with the last minutes and the last published model."""
+
+import msgspec
+import numpy as np
+
+from fleet.contract import Model, Outcome, State
+from fleet.physics.wrench import N_PAR, NAMES
+from twin_worker.airframe_prior import prior
+from twin_worker.coupled import Coupled
+from twin_worker.memory import Believed, Twin
+
+_TRIM = np.array([0.0, 0.0, 0.0, 0.5])  # inputs that nothing is known of
+
+
+def revive(twin: Twin, model: Model) -> bool:
+    """Let a fresh twin believe a model that another worker published; tell whether it can.
+
+    The model comes without the hybrid and without what held its parameters: its whole covariance counts as told by the
+    data of its own stretch, so that no datum is counted twice when that stretch is identified again.
+    """
+    plant = _coupled(twin, model)
+    if plant is None or model.in_force is None or model.in_force.outcome is not Outcome.VERIFIED:
+        return False
+    said = f"{model.in_force.sentence}; taken over from another worker"
+    verdict = msgspec.structs.replace(model.in_force, sentence=said)
+    twin.plant = twin.last = plant
+    twin.verdict = twin.in_force = verdict
+    twin.pool = [Believed(plant, verdict, model.t, float("nan"))]
+    twin.state, twin.model = State.VERIFIED, model
+    twin.wind.blow(model.t, np.array([model.wind_n, model.wind_e, 0.0]))
+    return True
+
+
+def _coupled(twin: Twin, model: Model) -> Coupled | None:
+    """Give the coupled model of a message; None where it has none, or one that cannot be."""
+    told = model.derivatives
+    if told is None or told.names != NAMES or told.prior != twin.airframe.name:
+        return None
+    try:
+        par, covariance = told.value.numpy().astype(float), told.covariance.numpy().astype(float)
+        precision = np.linalg.inv(covariance)
+    except (ValueError, np.linalg.LinAlgError):
+        return None
+    at = np.array([told.U0, told.W0])
+    whole = par.shape == (N_PAR,) and precision.shape == (N_PAR, N_PAR) and told.U0 > 0
+    if not whole or not all(np.isfinite(each).all() for each in (par, precision, at)):
+        return None
+    mean, sigma = prior(twin.airframe, at, _TRIM, np.array([model.wind_n, model.wind_e]))
+    firm = np.diag(sigma**-2.0)
+    begin = told.window_t0
+    return Coupled(
+        par, at, precision, mean, firm, np.ones(9), (mean, firm), begin, begin + max(told.window_s, 1.0), steps=0
+    )
