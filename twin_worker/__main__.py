@@ -9,12 +9,14 @@ from fleet.airframes import GENERIC, load
 from fleet.bus import ROUTER, connect
 from fleet.cli import guarded, id_range, parser_for, stop_on_signal
 from fleet.contract import FleetState
+from twin_worker.engine.pace import read_pace
 
 if TYPE_CHECKING:
     from twin_worker.diagnose.baseline import Baseline
 
 EXAMPLES = """
   twin_worker --uavs 0-49
+  twin_worker --uavs 0-199 --pace identify=5,predict=5,ensemble=5,renew=0.1       many aircraft, ten times a second
   twin_worker --uavs 0-9 --airframe my_aircraft.toml       copy fleet/airframes/small_fixed_wing.toml and fill it in
   twin_worker --uavs 50-99 --router tcp/192.168.1.10:7447
   twin_worker --uavs 0-9 --baseline skywalker.json         what `fleet calibrate` wrote; otherwise each one's own past
@@ -67,6 +69,7 @@ def _run(args: argparse.Namespace) -> int:
             method=args.method,
             airframe=airframe,
             separation=Separation(*args.separation),
+            pace=args.pace,
             diagnosis=None if args.no_diagnosis else Live(hand, bases, adapt=not args.no_adapt),
         )
         warm_up()  # before anything is claimed: who compiles cannot take over
@@ -107,6 +110,12 @@ def main(argv: list[str] | None = None) -> int:
         default=[],
         metavar="[ID=]MODEL",
         help="compare one aircraft, or all, with this model from `fleet calibrate` (each with its own first 105 s)",
+    )
+    parser.add_argument(
+        "--pace",
+        type=read_pace,
+        metavar="WORK=S,…",
+        help="between flights ahead, identifications, ensembles, renewals (predict=1,identify=1,ensemble=10; no renew)",
     )
     parser.add_argument("--no-adapt", action="store_true", help="diagnose, but predict as if nothing was found")
     parser.add_argument("--no-diagnosis", action="store_true", help="do not diagnose at all")

@@ -3,6 +3,7 @@
 import numpy as np
 
 from fleet.window import Window
+from twin_worker.engine.pace import Work
 from twin_worker.horizon import AHEAD
 from twin_worker.hybrid import ensemble
 from twin_worker.hybrid.fly import fly_hybrid
@@ -13,7 +14,6 @@ from twin_worker.predict import Flown, Situation, Start, fly_from, set_out
 
 HYBRID, BOTH = "hybrid", "both"
 _NEAR_S = 60.0  # the identified dynamics are flown as far; beyond, the hybrid goes on from there [s]
-_SPREAD_S = 10.0  # between ensembles [s]
 
 
 def fly_route(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
@@ -76,8 +76,8 @@ def _lengthened(path: np.ndarray, further: np.ndarray) -> np.ndarray:
 def _spread(twin: Twin, begin: tuple[Situation, Start]) -> None:
     """Fly the ensemble where it is due."""
     t = float(begin[1].good.t[-1])
-    known = twin.spread_t <= t < twin.spread_t + _SPREAD_S and twin.instead is None
-    if twin.hybrid is None or known:
+    known = twin.spread_t <= t < twin.spread_t + twin.pace.ensemble and twin.instead is None
+    if twin.hybrid is None or known or not twin.may(Work.ENSEMBLE):
         return
     rng = np.random.default_rng((twin.uav, int(t)))
     twin.spread, twin.spread_t = ensemble.spread(*begin, twin.hybrid, AHEAD, rng), t

@@ -16,6 +16,8 @@ from twin_worker.contest import Contest
 from twin_worker.control import Control
 from twin_worker.coupled import Coupled
 from twin_worker.earned import Earned
+from twin_worker.engine.pace import Pace, Work
+from twin_worker.engine.quota import Quota
 from twin_worker.events.heard import changed, mission_said, parameters_said
 from twin_worker.events.note import Note, void
 from twin_worker.events.watch import Ground
@@ -111,6 +113,9 @@ class Twin:
     in_force: Verdict | None = None  # the verdict `plant` was believed on
     model: Model | None = None
     prediction: Prediction | None = None
+    base: Prediction | None = None  # the newest that was flown ahead
+    pace: Pace = field(default_factory=Pace)
+    quota: Quota | None = None  # of the driver, where there is one
     control: Control | None = None  # the controller twin that flew it
     control_t: float = -np.inf  # and when that was last told
     state: State = State.WAITING
@@ -123,6 +128,7 @@ class Twin:
     wind_t: float = -np.inf
     identify_t: float = -np.inf
     predict_t: float = -np.inf
+    renew_t: float = -np.inf
     score_t: float = -np.inf
     flown_t: float = -np.inf  # models last flown in closed loop
     told_t: float = -np.inf  # model last published
@@ -138,6 +144,10 @@ class Twin:
     broken: bool = False  # much is heard, but no positions
     over: bool = False  # it has coasted up to its horizon
     bad: int = 0
+
+    def may(self, work: Work) -> bool:
+        """Tell whether heavy work that is due may be done now."""
+        return self.quota is None or self.quota.grants(work)
 
     @property
     def name(self) -> str:

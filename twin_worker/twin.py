@@ -9,6 +9,7 @@ from fleet.frames import to_ned
 from twin_worker import contest
 from twin_worker.blow import blow
 from twin_worker.conflict.watch import link, watch
+from twin_worker.engine.pace import SOON, Work
 from twin_worker.events.note import note
 from twin_worker.events.watch import watch as watch_events
 from twin_worker.foresee import foresee
@@ -16,9 +17,8 @@ from twin_worker.kinds import command_in_force
 from twin_worker.learn import learn
 from twin_worker.memory import Twin, hear
 from twin_worker.mismatch.marks import EVERY_S, mark
+from twin_worker.renew import renew
 
-HOP_S = 1.0  # between identifications [s]
-PREDICT_S = 1.0  # between predictions [s]
 LOST_S = 3.0  # without a sample: link lost [s]
 _TICK_S = 1.0  # between turns while data are silent, and between scorings [s]
 _BEFORE_S = 3.0  # positions from before those that were scored last, so that none falls between [s]
@@ -81,13 +81,18 @@ def _turn(twin: Twin, now: float) -> list[Message]:
         _remember(twin)
         watch_events(twin, command_in_force(twin))
         _score(twin)
-    if not twin.lost and _due(now, twin.identify_t, HOP_S):
+    pace = twin.pace
+    if not twin.lost and _due(now, twin.identify_t, pace.identify) and twin.may(Work.IDENTIFY):
         twin.identify_t = now
         results += learn(twin)
-    if _due(now, twin.predict_t, PREDICT_S):
-        twin.predict_t = now
+    if _due(now, twin.predict_t, pace.predict) and twin.may(Work.PREDICT):
+        twin.predict_t = twin.renew_t = now
         made = foresee(twin, now)
-        results += [*made, *watch(twin, now, twin.prediction if made else None)]
+        twin.base = twin.prediction if made else None
+        results += [*made, *watch(twin, now, twin.base)]
+    elif _due(now, twin.renew_t, SOON * pace.renew):
+        twin.renew_t = now
+        results += renew(twin)
     return results
 
 

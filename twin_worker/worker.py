@@ -32,6 +32,8 @@ from twin_worker.claims.protocol import Claiming
 from twin_worker.conflict.ledger import Ledger
 from twin_worker.conflict.separation import Separation
 from twin_worker.conflict.traffic import Traffic
+from twin_worker.engine.pace import Pace
+from twin_worker.engine.quota import SWEEP_S, Quota
 from twin_worker.memory import AUTO
 from twin_worker.mismatch.live import Live
 from twin_worker.mismatch.told import word
@@ -43,6 +45,7 @@ from twin_worker.whatif.grid import resample, wanted
 _log = logging.getLogger(__name__)
 _SILENT_S = 1.0  # wall time without news after which data time runs on by the wall clock [s]
 _STATE_S = 1.0  # between fleet tables [s]
+_NEW_S = 2.0  # an aircraft that came so lately is predicted before any other work begins [s]
 
 
 class Worker:
@@ -58,10 +61,13 @@ class Worker:
         airframe: Airframe | None = None,
         separation: Separation | None = None,
         diagnosis: Live | None = None,
+        pace: Pace | None = None,
     ) -> None:
         self.bus, self.uavs, self.diagnosis = bus, uavs, diagnosis
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
+        self.pace, self.quota = pace or Pace(), Quota()
         self.sentence = ""
+        self._first = 0  # whose turn is the first of the next sweep
         self.traffic = Traffic(separation or Separation())
         self._twins = Twins(bus, self._make, self)
         self._held = self._twins.held
@@ -85,7 +91,7 @@ class Worker:
             self.claiming.hear_of(status.uav)
 
     def _make(self, uav: int) -> Twin:
-        return Twin(uav, omega=self.omega, method=self.method, airframe=self.airframe)
+        return Twin(uav, omega=self.omega, method=self.method, airframe=self.airframe, pace=self.pace, quota=self.quota)
 
     def _wants(self, uav: int) -> bool:
         """Tell whether an aircraft is held, or about to be; one never heard of may be claimed."""
@@ -124,17 +130,27 @@ class Worker:
     def turn(self) -> int:
         """Advance every twin once; give how many messages were taken in."""
         taken = 0
-        for held in self.holding():
+        for held in self._in_turn():
             waiting = len(held.inbox)
             taken += waiting
             try:
                 for result in _advance_all(held, waiting, self.traffic):
                     self._publish(result, held)
+                self.quota.settle()
             except Exception as error:  # a defect met by one aircraft must not stop the others
                 held.failed = f"{held.twin.name}: found a defect ({error}), its results are missing; report it"
                 _log.exception(held.failed)
         self._diagnose()
         return taken
+
+    def _in_turn(self) -> list[Held]:
+        """Give all, those without a prediction first, then each sweep another: heavy work may go to the first alone."""
+        found = self.holding()
+        self._first = (self._first + 1) % max(len(found), 1)
+        found = found[self._first :] + found[: self._first]
+        new = [held for held in found if held.twin.prediction is None and time.monotonic() - held.since < _NEW_S]
+        self.quota.sweep(hurry=bool(new))
+        return [*new, *(held for held in found if all(held is not one for one in new))] if new else found
 
     def _publish(self, result: Message, held: Held) -> None:
         """Publish under the claim in force; what is held no longer, or not surely, is kept back."""
@@ -171,7 +187,7 @@ class Worker:
 
     def run(self, stop: threading.Event) -> None:
         """Join, turn until told to stop, publishing the fleet table once a second; then hand everything over."""
-        self.claiming.threaded = True
+        self.claiming.threaded, self.quota.limit = True, SWEEP_S
         self.listen()
         claims = threading.Thread(target=self.claiming.run, args=(stop,), name="claims")
         claims.start()

@@ -23,6 +23,8 @@ from twin_worker.contest import Contest
 from twin_worker.control import Control
 from twin_worker.coupled import Coupled
 from twin_worker.earned import Earned
+from twin_worker.engine.pace import Pace
+from twin_worker.engine.quota import Quota
 from twin_worker.events.note import Note
 from twin_worker.events.watch import Ground
 from twin_worker.greybox import Grey
@@ -81,13 +83,14 @@ _NAMED = (c.State, c.Event, c.AlertKind, Origin)
 _OURS = (
     *(Load, Twin, History, Grid, WindFilter, Record, Ledger, Open, Rotor, Grey, Learnt, Contest, Earned, Mark),
     *(Coupled, Axis, Hybrid, Ridge, Believed, Extension, Ground, Note, Control, Earlier, Book, Levels, Factors),
-    *(Made, Trust, Airframe, ServoMap),
+    *(Made, Trust, Airframe, ServoMap, Pace),
 )
 CARRIED: Known = {
     **{one.__name__: one for one in (*_WIRE, *_NAMED, *_OURS) if one is not Book},
     "Book": Book,
     "KalmanFilter": (KalmanFilter, Special(_parts, _filter)),
     "CubicSpline": (CubicSpline, Special(lambda one: (one.x, one.c), _spline)),
+    "Quota": (Quota, Special(lambda _: None, lambda _: None)),  # the next driver has its own
     "Tables": (Tables, Special(lambda _: None, lambda _: load_tables())),  # everyone has them
 }
 

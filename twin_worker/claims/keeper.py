@@ -38,6 +38,7 @@ class Held:
     lock: threading.Lock = field(default_factory=threading.Lock)  # held while the twin changes, or is copied
     ready: bool = True  # its twin is here
     bare: bool = False  # without the telemetry of before
+    since: float = float("-inf")  # when its twin came [s, monotonic]
 
 
 class Extras(Protocol):
@@ -111,6 +112,8 @@ class Twins:
             self.recall([uav])
             return
         self._extras.take(uav, load)
+        fresh = self._make(uav)
+        load.twin.pace, load.twin.quota = fresh.pace, fresh.quota
         self._models.pop(uav, None)
         self._begin(held, load.twin, load.inbox)
 
@@ -153,7 +156,7 @@ class Twins:
             held.inbox.clear()
             held.inbox.extend([*before, *since])
             held.twin = twin
-            held.bare, held.ready = False, True
+            held.bare, held.ready, held.since = False, True, time.monotonic()
             if held.arrived != held.arrived and twin.history.newest > 0:
                 held.arrived = time.monotonic()
 

@@ -1,0 +1,48 @@
+"""The share of each sweep over all twins that heavy work may take: telemetry of every aircraft always goes first."""
+
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+
+from twin_worker.engine.pace import Work
+
+SWEEP_S = 0.05  # of heavy work in one sweep [s]
+_SHARE = {Work.PREDICT: 1.0, Work.IDENTIFY: 0.7, Work.ENSEMBLE: 0.5}  # of a sweep, up to which each kind may begin [-]
+
+
+@dataclass
+class Quota:
+    """What may be begun in one sweep; without a limit everything.
+
+    Attributes:
+        limit: of heavy work in one sweep [s]
+        hurry: an aircraft waits for its first prediction, so that nothing else is begun
+        done, refused: how often each kind was
+    """
+
+    limit: float = float("inf")
+    hurry: bool = False
+    done: Counter[Work] = field(default_factory=Counter)
+    refused: Counter[Work] = field(default_factory=Counter)
+    _spent: float = 0.0
+    _since: float | None = None  # when the work in hand was begun
+
+    def sweep(self, *, hurry: bool = False) -> None:
+        """Begin another sweep."""
+        self.settle()
+        self._spent, self.hurry = 0.0, hurry and self.limit < float("inf")
+
+    def settle(self) -> None:
+        """End the work in hand, if any."""
+        if self._since is not None:
+            self._spent += time.perf_counter() - self._since
+            self._since = None
+
+    def grants(self, work: Work) -> bool:
+        """Tell whether work that is due may be begun."""
+        self.settle()
+        granted = self._spent < self.limit * _SHARE[work] and not (self.hurry and work is not Work.PREDICT)
+        (self.done if granted else self.refused)[work] += 1
+        if granted:
+            self._since = time.perf_counter()
+        return granted
