@@ -94,7 +94,7 @@ class Bus(AbstractContextManager, Protocol):
 
 
 def newest(found: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
-    """Keep the reply with the highest epoch, then the newest, per UAV (and alert); without a UAV all stay."""
+    """Keep the reply with the highest claim, then the newest, per UAV (and alert); without a UAV all stay."""
     best: dict[tuple[int, str], tuple[M, Stamp | None]] = {}
     rest = []
     for message, stamp in found:
@@ -103,11 +103,14 @@ def newest(found: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
             rest.append((message, stamp))
             continue
         what = uav, str(getattr(message, "about", ""))
-        rank = (stamp.epoch if stamp else 0, message.t)  # type: ignore[attr-defined]
         held = best.get(what)
-        if held is None or rank > (held[1].epoch if held[1] else 0, held[0].t):  # type: ignore[attr-defined]
+        if held is None or _rank(message, stamp) > _rank(*held):
             best[what] = (message, stamp)
     return [best[what] for what in sorted(best)] + rest
+
+
+def _rank(message: Any, stamp: Stamp | None) -> tuple[Stamp, float]:
+    return stamp or Stamp(0, 0), message.t
 
 
 def asked_for(uav: int | None, answers: Answers) -> Answers:

@@ -73,7 +73,7 @@ def _run(args: argparse.Namespace) -> int:
             diagnosis=None if args.no_diagnosis else Live(hand, bases, adapt=not args.no_adapt),
         )
         warm_up()  # before anything is claimed: who compiles cannot take over
-        print(f"twin_worker: may hold UAVs {args.uavs.start}-{args.uavs.stop - 1}", flush=True)
+        print(f"twin_worker {bus.writer:016x}: may hold UAVs {args.uavs.start}-{args.uavs.stop - 1}", flush=True)
         try:
             worker.run(stop)
         finally:

@@ -14,6 +14,7 @@ from fleet.contract import (
     Account,
     Alert,
     AlertKind,
+    FleetRow,
     FleetState,
     Mismatch,
     Mission,
@@ -23,9 +24,10 @@ from fleet.contract import (
     State,
     Status,
 )
+from fleet.fence import GIVE_UP_S, Fence
 from viewer.events import MAX_RAISED
 from viewer.place import Place, TooFar, checked, first_fix
-from viewer.vehicle import ENDED_S, GIVE_UP_S, JUMP_S, Forecast, Vehicle, forecast
+from viewer.vehicle import ENDED_S, JUMP_S, Forecast, Vehicle, forecast
 
 MAX_VEHICLES = 2_000  # ids are written by strangers: more than this many are counted, not kept
 COASTING_S = 1.0  # a prediction so long after the last sample is of no flight that anything can be laid beside [s]
@@ -44,7 +46,7 @@ class Feed:
         self.counts: Counter[str] = Counter()
         self.since = clock()
         self.lock = threading.Lock()
-        self._bus, self._clock = bus, clock
+        self._bus, self._clock, self._fence = bus, clock, Fence(clock)
         hears: dict[type, Callable[[Any, Stamp | None, float], None]] = {
             Sample: self._sample,
             Status: self._keep("status"),
@@ -170,17 +172,17 @@ class Feed:
 
         return hear
 
-    def _believe(self, vehicle: Vehicle, epoch: int, now: float) -> bool:
-        """Tell whether a worker may speak for a UAV: not below the highest epoch that still speaks."""
-        if epoch < vehicle.epoch and now - vehicle.believed < GIVE_UP_S:
+    def _believe(self, vehicle: Vehicle, stamp: Stamp | None, now: float) -> bool:
+        """Tell whether a worker may speak for a UAV: not below the highest claim that still speaks."""
+        if not self._fence.believes(vehicle.uav, stamp):
             self.counts["outdated"] += 1
             return False
-        vehicle.epoch, vehicle.believed = epoch, now
+        vehicle.believed = now
         return True
 
     def _model(self, model: Model, stamp: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(model.uav)
-        if not self._believe(vehicle, stamp.epoch if stamp else 0, now):
+        if not self._believe(vehicle, stamp, now):
             return
         vehicle.model = model
         vehicle.note(model, now)
@@ -190,7 +192,7 @@ class Feed:
 
     def _prediction(self, message: Prediction, stamp: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(message.uav)
-        if not self._believe(vehicle, stamp.epoch if stamp else 0, now):
+        if not self._believe(vehicle, stamp, now):
             return
         if vehicle.prediction is not None and 0 < vehicle.prediction.t - message.t < JUMP_S:
             return  # delayed, and newer is here
@@ -210,7 +212,7 @@ class Feed:
 
     def _mismatch(self, found: Mismatch, stamp: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(found.uav)
-        if self._believe(vehicle, stamp.epoch if stamp else 0, now) and np.isfinite(found.t):
+        if self._believe(vehicle, stamp, now) and np.isfinite(found.t):
             vehicle.mismatch = found
             vehicle.note(found, now)
 
@@ -222,8 +224,10 @@ class Feed:
             if vehicle is not None and (played or now - vehicle.player > ENDED_S):
                 vehicle.player = now if played else -np.inf
 
-    def _alert(self, alert: Alert, _: Stamp | None, now: float) -> None:
+    def _alert(self, alert: Alert, stamp: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(alert.uav)
+        if stamp is not None and not self._believe(vehicle, stamp, now):  # without a stamp: of a gateway
+            return
         vehicle.note(alert, now)
         others = {about: held for about, held in vehicle.alerts.items() if about != alert.about}
         if len(others) < MAX_RAISED or not alert.active:
@@ -235,7 +239,7 @@ class Feed:
             del self.sentences[next(iter(self.sentences))]
         for row in fleet.rows:
             vehicle = self._vehicle(row.uav)
-            if row.state is not State.UNCLAIMED and self._believe(vehicle, row.epoch, now):
+            if row.state is not State.UNCLAIMED and self._believe(vehicle, _stamp_of(row), now):
                 vehicle.row = row
 
     def alerts(self) -> list[tuple[Vehicle, AlertKind, Alert]]:
@@ -245,3 +249,9 @@ class Feed:
             copies = [vehicle.still(now) for vehicle in self.vehicles.values() if vehicle.alerts]
             found = [(copy, alert.kind, alert) for copy in copies for alert in copy.alerts.values()]
         return sorted(found, key=lambda one: -one[2].t)
+
+
+def _stamp_of(row: FleetRow) -> Stamp:
+    """Give the claim of a row of the fleet table; the writer is a stranger's text."""
+    hexadecimal = len(row.worker) == 16 and all(letter in "0123456789abcdef" for letter in row.worker)
+    return Stamp(row.epoch, int(row.worker, 16) if hexadecimal else 0)

@@ -30,7 +30,6 @@ from viewer.track import Track
 
 TRAIL_ROWS = 900  # about 90 s at 10 Hz
 SILENT_S = 3.0  # without a sample for this long the link counts as lost, whatever was last said [s]
-GIVE_UP_S = 10.0  # a writer silent for so long has lost its claim: a lower epoch (a restarted fleet) may speak [s]
 ABANDONED_S = 30.0  # without a word of any worker for so long, what was last said is no state any more [s]
 LATE_S = 5.0  # a prediction older than this is no news, in wall time [s]
 ENDED_S = 3.0  # a recording whose player is silent for so long is over [s]
@@ -103,7 +102,6 @@ class Vehicle:
     """One UAV as the page knows it."""
 
     uav: int
-    epoch: int = 0
     believed: float = -np.inf  # when a worker's result was last accepted, monotonic [s]
     heard: float = -np.inf  # when a sample last arrived, monotonic [s]
     t: float = -np.inf  # fleet time of the newest sample [s]

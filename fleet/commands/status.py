@@ -42,7 +42,8 @@ def fleet_rows(bus: Bus) -> list[FleetRow]:
     best: dict[int, FleetRow] = {}
     for state, _ in bus.ask(FleetState):
         for row in state.rows:
-            if row.uav not in best or row.epoch > best[row.uav].epoch:
+            held = best.get(row.uav)
+            if held is None or (row.epoch, row.worker) > (held.epoch, held.worker):
                 best[row.uav] = row
     for status, _ in bus.ask(Status):
         sentence = "no worker holds this id: start `twin_worker` with a wider --uavs"

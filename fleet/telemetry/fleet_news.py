@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fleet.codec import decode, encoding
+from fleet.codec import Stamp, decode, encoding
 from fleet.contract import (
     COLUMNS,
     MAX_ITEMS,
@@ -50,7 +50,7 @@ class FleetNews:
         self._offset = offset
         self._refused: Counter[str] = Counter()
         self._places: dict[str, int] = {}  # of the first message refused for each reason
-        self._epochs: dict[int, int] = {}  # highest so far, by UAV id
+        self._claims: dict[int, Stamp] = {}  # highest so far, by UAV id
 
     @property
     def skipped(self) -> list[str]:
@@ -116,12 +116,12 @@ class FleetNews:
         self._places.setdefault(why, place)
 
     def _in_force(self, message: Any, record: Record) -> bool:
-        """Tell whether the writer held the aircraft: readers keep the highest epoch and drop the rest."""
+        """Tell whether the writer held the aircraft: readers keep the highest claim and drop the rest."""
         uav = getattr(message, "uav", None)
         if uav is None or record.stamp is None:
             return True
-        highest = self._epochs[uav] = max(self._epochs.get(uav, 0), record.stamp.epoch)
-        return record.stamp.epoch >= highest
+        highest = self._claims[uav] = max(self._claims.get(uav, record.stamp), record.stamp)
+        return record.stamp == highest
 
 
 def renumbered(message: Any, number: Any) -> Any | None:

@@ -1,0 +1,1 @@
+"""Do workers that share a fleet replace each other before anyone notices?"""

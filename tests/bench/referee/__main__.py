@@ -1,0 +1,140 @@
+"""Workers that share a fleet are killed, frozen, cut off, sent away and joined by others; readers keep count.
+
+    python -m tests.bench.referee --json referee.json
+    python -m tests.bench.referee --random 100 --seed 3
+    python -m tests.bench.referee --zenohd ~/.cargo/bin/zenohd --only kill join
+
+200 aircraft are copies of one flight that a gateway plays; 4 workers renew every prediction ten times a second, and
+fly ahead, identify and fly ensembles every 5 s. Gaps lie between predictions that a reader accepts.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fleet.cli import guarded, parser_for
+
+from . import faults
+from .site import PACE, Site, until
+
+LIMITS = {  # by fault: what is measured, and the most that is allowed
+    "kill": {"taken_s": 0.5, "gap_s": 0.5},
+    "freeze": {"taken_s": 1.5, "gap_s": 1.5},
+    "leave": {"gap_s": 0.3},
+    "join": {"gap_s": 0.3},
+    "restart_router": {"owners_changed": 0},
+    "delay": {"owners_changed": 0},
+    "blink": {"owners_changed": 0},
+}
+RANDOM = ("kill", "freeze", "leave", "join", "cut", "stall", "delay", "blink", "restart_router")
+
+
+def one_by_one(site: Site, names: list[str], repeat: int, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
+    """Do each fault some times; the fleet is made whole in between."""
+    for name in names:
+        for _ in range(repeat):
+            yield happen(site, name, rng)
+
+
+def at_random(site: Site, count: int, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
+    """Do faults at random."""
+    for _ in range(count):
+        yield happen(site, str(rng.choice(RANDOM)), rng)
+
+
+def happen(site: Site, name: str, rng: np.random.Generator) -> dict[str, Any]:
+    """Do one fault to a worker drawn by lot, then bring the fleet back to its size."""
+    most = site.wanted
+    if name == "join" and len(site.workers) > most:
+        faults.leave(site, site.workers[0])
+    site.reader.forget()
+    usual_since = time.monotonic()
+    worker = site.workers[int(rng.integers(len(site.workers)))]
+    try:
+        found = faults.ALL[name](site, worker)
+    except TimeoutError as error:
+        found = {"failed": str(error)}
+    limits = LIMITS.get(name, {})
+    found["over"] = [key for key, most_of in limits.items() if not (found.get(key, np.inf) <= most_of)]
+    others = set(range(site.uavs))
+    found |= {"fault": name, "usual_s": site.reader.usual(others, usual_since), "load": os.getloadavg()[0]}
+    print(json.dumps(found), flush=True)
+    while len(site.workers) < most:
+        site.add()
+        settle(site)
+    while len(site.workers) > most:
+        faults.leave(site, site.workers[0])
+    return found
+
+
+def settle(site: Site) -> None:
+    """Wait until every aircraft has a holder that lives and a prediction."""
+    names = {worker.name for worker in site.workers}
+
+    def whole() -> bool:
+        held = site.reader.holders()
+        return len(held) == site.uavs and set(held.values()) == names
+
+    until(whole, 120.0, "a holder of every aircraft")
+
+
+def _run(args: argparse.Namespace) -> int:
+    rng = np.random.default_rng(args.seed)
+    with Site(args.uavs, args.router, args.zenohd, args.pace) as site:
+        site.wanted = args.workers
+        try:
+            site.open(args.recording, args.workers)
+            settle(site)
+            warm = time.monotonic() + args.warm
+            until(lambda: time.monotonic() > warm, args.warm + 1.0, "time")
+            print(f"{args.uavs} aircraft, {args.workers} workers: begun", file=sys.stderr, flush=True)
+            steps = at_random(site, args.random, rng) if args.random else one_by_one(site, args.only, args.repeat, rng)
+            rows = list(steps)
+        except TimeoutError as error:
+            print(site.words(), file=sys.stderr)
+            raise OSError(str(error)) from None
+        reader = site.reader
+        summary = {
+            "uavs": args.uavs, "workers": args.workers, "pace": args.pace, "router": args.zenohd or "embedded",
+            "faults": len(rows), "over": sum(bool(row["over"]) or "failed" in row for row in rows),
+            "epoch_regressions": reader.regressions, "data_time_regressions": reader.back, "fenced": reader.fenced,
+            "worker_cpu_s": [round(worker.cpu_s, 1) for worker in site.workers],
+            "worker_rss_mb": [round(worker.rss_mb) for worker in site.workers],
+            "processors": os.cpu_count(),
+        }  # fmt: skip
+        print(json.dumps(summary, indent=1))
+        if args.words:
+            print(site.words(), file=sys.stderr)
+    if args.json:
+        args.json.write_text(json.dumps({"summary": summary, "faults": rows}, indent=1) + "\n")
+    return int(bool(summary["over"] or summary["epoch_regressions"]))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Judge the workers."""
+    parser = parser_for("python -m tests.bench.referee", "Judge workers that share a fleet.", __doc__ or "")
+    parser.add_argument("--uavs", type=int, default=200)
+    parser.add_argument("--workers", type=int, default=4)
+    parser.add_argument("--pace", default=PACE)
+    parser.add_argument("--router", default="tcp/127.0.0.1:7461")
+    parser.add_argument("--zenohd", help="the real router; without it a session of ours in router mode")
+    parser.add_argument("--recording", type=Path, help="a flight to play; without it one is flown first")
+    parser.add_argument("--only", nargs="+", default=list(faults.ALL), choices=list(faults.ALL))
+    parser.add_argument("--repeat", type=int, default=1)
+    parser.add_argument("--random", type=int, default=0, metavar="N", help="instead: so many faults at random")
+    parser.add_argument("--warm", type=float, default=30.0, help="between the first prediction and the first fault [s]")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write what was measured")
+    parser.add_argument("--words", action="store_true", help="show what the processes said")
+    return guarded("bench.referee", _run, parser.parse_args(argv))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

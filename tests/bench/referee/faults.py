@@ -1,0 +1,158 @@
+"""The faults, one a function: done to one worker or to the router, measured at the reader."""
+
+import signal
+import time
+from typing import Any
+
+import numpy as np
+
+from .site import Site, Worker, until
+
+_PATIENCE_S = 30.0
+_AFTER_S = 2.0  # looked at after it is over [s]
+
+
+def _held(site: Site, worker: Worker) -> set[int]:
+    return {uav for uav, name in site.reader.holders().items() if name == worker.name}
+
+
+def _wait(seconds: float) -> None:
+    end = time.monotonic() + seconds
+    until(lambda: time.monotonic() >= end, seconds + 1.0, "time")
+
+
+def _taken_over(site: Site, uavs: set[int], was: str, begun: float) -> dict[str, Any]:
+    """Wait until others hold these; give how long that took and the longest gap."""
+    until(lambda: site.reader.taken(uavs, begun, was) is not None, _PATIENCE_S, f"new owners of {len(uavs)} aircraft")
+    taken = site.reader.taken(uavs, begun, was)
+    _wait(_AFTER_S)
+    return {"aircraft": len(uavs), "taken_s": taken, "gap_s": site.reader.gap(uavs, begun)}
+
+
+def kill(site: Site, worker: Worker) -> dict[str, Any]:
+    """Kill a worker with -9."""
+    uavs, was = _held(site, worker), worker.name
+    windows = [site.reader.windows.get(uav, 0.0) for uav in uavs]
+    begun = time.monotonic()
+    worker.signal(signal.SIGKILL)
+    found = _taken_over(site, uavs, was, begun)
+    site.lose(worker)
+    return found | {"window_before_s": float(np.median(windows)) if windows else None}
+
+
+def freeze(site: Site, worker: Worker, seconds: float = 5.0) -> dict[str, Any]:
+    """Stop a worker as a suspended machine does, and let it go on."""
+    uavs, was = _held(site, worker), worker.name
+    begun = time.monotonic()
+    worker.signal(signal.SIGSTOP)
+    try:
+        found = _taken_over(site, uavs, was, begun)
+        _wait(max(begun + seconds - time.monotonic(), 0.0))
+    finally:
+        worker.signal(signal.SIGCONT)
+    return found | {"back": _back(site, worker)}
+
+
+def _back(site: Site, worker: Worker) -> dict[str, Any]:
+    """Wait until a worker that is back holds what it owns again; give the longest gap meanwhile."""
+    begun = time.monotonic()
+    until(lambda: len(_held(site, worker)) > 0.5 * site.uavs / len(site.workers), _PATIENCE_S, "a worker that is back")
+    took = time.monotonic() - begun
+    _wait(1.0)
+    uavs = set(range(site.uavs))
+    return {"s": took, "gap_s": site.reader.gap(uavs, begun)}
+
+
+def leave(site: Site, worker: Worker) -> dict[str, Any]:
+    """End a worker politely."""
+    uavs, was, fits = _held(site, worker), worker.name, site.reader.rows()
+    begun = time.monotonic()
+    worker.signal(signal.SIGTERM)
+    found = _taken_over(site, uavs, was, begun)
+    until(lambda: worker.process.poll() is not None, _PATIENCE_S, "the end of a worker")
+    site.lose(worker)
+    return found | _fits(uavs, fits, site.reader.rows())
+
+
+def join(site: Site, _: Worker) -> dict[str, Any]:
+    """Add a worker."""
+    fits = site.reader.rows()
+    begun_all = time.monotonic()
+    worker = site.add()
+    begun = time.monotonic()
+    until(lambda: len(_held(site, worker)) > 0.5 * site.uavs / len(site.workers), _PATIENCE_S, "aircraft for it")
+    _wait(_AFTER_S)
+    uavs = _held(site, worker)
+    found = {"aircraft": len(uavs), "gap_s": site.reader.gap(uavs, min(begun, begun_all + 1.0))}
+    return found | _fits(uavs, fits, site.reader.rows())
+
+
+def _fits(uavs: set[int], before: dict[int, float], after: dict[int, float]) -> dict[str, Any]:
+    both = [(before[uav], after[uav]) for uav in uavs if uav in before and uav in after]
+    if not both:
+        return {"fit_before": None, "fit_after": None}
+    return {"fit_before": float(np.mean([a for a, _ in both])), "fit_after": float(np.mean([b for _, b in both])),
+            "fits_lost": len(uavs & before.keys()) - len(both)}  # fmt: skip
+
+
+def restart_router(site: Site, _: Worker, seconds: float = 1.0) -> dict[str, Any]:
+    """Kill the router and start another."""
+    before = site.reader.holders()
+    begun = time.monotonic()
+    site.router_process.kill()
+    site.router_process.wait()
+    _wait(seconds)
+    site.open_router()
+    away = time.monotonic() - begun
+    until(lambda: len(site.reader.holders()) == len(before), _PATIENCE_S, "everyone's return")
+    _wait(3.0)
+    after = site.reader.holders()
+    moved = sum(after.get(uav) != name for uav, name in before.items())
+    return {"away_s": away, "gap_s": site.reader.gap(set(before), begun), "owners_changed": moved}
+
+
+def cut(site: Site, worker: Worker, seconds: float = 3.0) -> dict[str, Any]:
+    """Cut a worker off from the router, and mend the way."""
+    uavs, was = _held(site, worker), worker.name
+    begun = time.monotonic()
+    worker.way.cut = True
+    found = _taken_over(site, uavs, was, begun)
+    _wait(max(begun + seconds - time.monotonic(), 0.0))
+    worker.way.cut = False
+    return found | {"back": _back(site, worker)}
+
+
+def stall(site: Site, worker: Worker, seconds: float = 3.0) -> dict[str, Any]:
+    """Let nothing through between a worker and the router, without a word to either."""
+    uavs, was = _held(site, worker), worker.name
+    begun = time.monotonic()
+    worker.way.stalled = True
+    found = _taken_over(site, uavs, was, begun)
+    _wait(max(begun + seconds - time.monotonic(), 0.0))
+    worker.way.stalled = False
+    return found | {"back": _back(site, worker)}
+
+
+def delay(site: Site, worker: Worker, seconds: float = 3.0) -> dict[str, Any]:
+    """Let everything come 150 ms late for a while: nobody is dead."""
+    before, begun = site.reader.holders(), time.monotonic()
+    worker.way.delay_s = 0.15
+    _wait(seconds)
+    worker.way.delay_s = 0.0
+    _wait(1.0)
+    moved = sum(site.reader.holders().get(uav) != name for uav, name in before.items())
+    return {"owners_changed": moved, "gap_s": site.reader.gap(set(before), begun)}
+
+
+def blink(site: Site, worker: Worker) -> dict[str, Any]:
+    """Stop a worker for less than its lease."""
+    before, begun = site.reader.holders(), time.monotonic()
+    worker.signal(signal.SIGSTOP)
+    _wait(0.5)
+    worker.signal(signal.SIGCONT)
+    _wait(2.0)
+    moved = sum(site.reader.holders().get(uav) != name for uav, name in before.items())
+    return {"owners_changed": moved, "gap_s": site.reader.gap(set(before), begun)}
+
+
+ALL = {one.__name__: one for one in (kill, freeze, leave, join, restart_router, cut, stall, delay, blink)}

@@ -1,0 +1,103 @@
+"""What a reader sees: accepted predictions, gaps, claims that go back; and who says that it holds what."""
+
+import threading
+import time
+from collections import defaultdict
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet.bus import Bus
+from fleet.codec import Stamp
+from fleet.contract import Claim, FleetState, Model, Prediction
+from fleet.fence import Fence
+
+
+class Came(NamedTuple):
+    """One accepted prediction."""
+
+    heard: float
+    stamp: Stamp
+    t: float
+
+
+class Reader:
+    """Listens to everything a viewer would, and remembers."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.bus, self.lock, self.fence = bus, threading.Lock(), Fence()
+        self.came: dict[int, list[Came]] = defaultdict(list)
+        self.fits: dict[int, float] = {}  # mean fit of the model in force, as published last
+        self.windows: dict[int, float] = {}
+        self.whole: dict[int, tuple[float, str]] = {}  # since when one worker holds it with its telemetry of before
+        self.regressions = self.fenced = self.back = 0
+        bus.subscribe(Prediction, self._prediction)
+        bus.subscribe(Model, self._model)
+        bus.subscribe(Claim, self._claim)
+
+    def _prediction(self, made: Prediction, stamp: Stamp | None) -> None:
+        assert stamp is not None
+        with self.lock:
+            came = self.came[made.uav]
+            if not self.fence.believes(made.uav, stamp):
+                self.fenced += 1
+                return
+            self.regressions += bool(came) and stamp < came[-1].stamp
+            self.back += bool(came) and made.t < came[-1].t - 0.5
+            came.append(Came(time.monotonic(), stamp, made.t))
+
+    def _model(self, model: Model, stamp: Stamp | None) -> None:
+        fit = (model.in_force or model.verdict).fit
+        with self.lock:
+            self.fits[model.uav] = float(np.mean(list(fit.values()))) if fit else float("nan")
+            self.windows[model.uav] = model.window_s
+
+    def _claim(self, claim: Claim, _: Stamp | None) -> None:
+        now = time.monotonic()
+        with self.lock:
+            for uav, _epoch in claim.held:
+                if uav not in claim.bare and self.whole.get(uav, (0.0, ""))[1] != claim.worker:
+                    self.whole[uav] = now, claim.worker
+
+    def holders(self) -> dict[int, str]:
+        """Ask who holds what."""
+        found: dict[int, tuple[int, str]] = {}
+        for claim, _ in self.bus.ask(Claim):
+            for uav, epoch in claim.held:
+                found[uav] = max(found.get(uav, (0, "")), (epoch, claim.worker))
+        return {uav: worker for uav, (_, worker) in found.items()}
+
+    def rows(self) -> dict[int, float]:
+        """Ask for the mean fit of each model in force, by UAV id."""
+        rows = [row for state, _ in self.bus.ask(FleetState, timeout_s=3.0) for row in state.rows]
+        return {row.uav: float(np.mean(list(row.fit.values()))) for row in rows if row.fit}
+
+    def taken(self, uavs: set[int], since: float, was: str) -> float | None:
+        """Give how long it took until all had another holder with a full window [s]; None: not yet."""
+        with self.lock:
+            found = [self.whole.get(uav, (0.0, was)) for uav in uavs]
+        if any(worker == was or at < since for at, worker in found):
+            return None
+        return max((at - since for at, _ in found), default=0.0)
+
+    def gap(self, uavs: set[int], since: float) -> float:
+        """Give the longest time without an accepted prediction of any of these, up to now [s]."""
+        return max((max(self._gaps(uav, since)) for uav in uavs), default=0.0)
+
+    def usual(self, uavs: set[int], since: float) -> tuple[float, float]:
+        """Give median and 99 % quantile of the times between accepted predictions [s]."""
+        found = [gap for uav in uavs for gap in self._gaps(uav, since)]
+        return float(np.median(found)), float(np.quantile(found, 0.99))
+
+    def _gaps(self, uav: int, since: float) -> list[float]:
+        with self.lock:
+            heard = [one.heard for one in self.came[uav]]
+        k = int(np.searchsorted(heard, since))
+        at = [*heard[max(k - 1, 0) :], time.monotonic()]
+        return np.diff(at).tolist() or [float("inf")]
+
+    def forget(self) -> None:
+        """Forget all but the newest of each, so that a long run stays small."""
+        with self.lock:
+            for came in self.came.values():
+                del came[:-1]

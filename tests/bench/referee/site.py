@@ -1,0 +1,157 @@
+"""One site as processes: router, gateway that plays copies of a flight, workers behind ways of their own."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
+from pathlib import Path
+
+from fleet.bus import ROUTER, connect, endpoint, reachable
+from fleet.pretend.drive import to_tlog
+from fleet.pretend.uav import PretendUav
+
+from .forwarder import Forwarder
+from .reader import Reader
+
+ROOT = Path(__file__).resolve().parents[3]
+PACE = "predict=5,identify=5,ensemble=5,renew=0.1"
+_OPEN = "from fleet.bus import open_router; from fleet.cli import stop_on_signal; import sys; "
+_ROUTER = _OPEN + "session = open_router(sys.argv[1]); stop_on_signal().wait(); session.close()"
+
+
+def until(condition: Callable[[], object], patience_s: float, what: str) -> float:
+    """Wait for a condition; give how long it took [s].
+
+    Raises:
+        TimeoutError: when it does not come true.
+    """
+    begun, never = time.monotonic(), threading.Event()
+    while not condition():
+        if time.monotonic() - begun > patience_s:
+            raise TimeoutError(f"referee: {what} did not come within {patience_s:.0f} s")
+        never.wait(0.02)
+    return time.monotonic() - begun
+
+
+class Worker:
+    """One worker process and its way to the router."""
+
+    def __init__(self, site: "Site") -> None:
+        self.way = Forwarder(endpoint(site.router))
+        command = ("twin_worker", "--uavs", f"0-{site.uavs - 1}", "--no-diagnosis", "--pace", site.pace)
+        self.process = site.start(*command, "--router", f"tcp/127.0.0.1:{self.way.port}", name="worker")
+        self._said = site.log_of(self.process)
+
+    @property
+    def name(self) -> str:
+        """Give the name it claims by; empty before it says so."""
+        found = re.search(r"twin_worker ([0-9a-f]{16}): may hold", self._said.read_text(errors="replace"))
+        return found[1] if found else ""
+
+    def signal(self, number: int) -> None:
+        """Send a signal."""
+        self.process.send_signal(number)
+
+    @property
+    def cpu_s(self) -> float:
+        """Give the processor time used so far [s]."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    @property
+    def rss_mb(self) -> float:
+        """Give its resident memory [MB]."""
+        return int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+class Site(AbstractContextManager):
+    """Everything that runs.
+
+    Args:
+        uavs: aircraft
+        zenohd: the real router; None: a session of ours in router mode
+        recording: a flight to play; None: one is flown first
+    """
+
+    def __init__(self, uavs: int, router: str = ROUTER, zenohd: str | None = None, pace: str = PACE) -> None:
+        self.uavs, self.router, self.zenohd, self.pace = uavs, router, zenohd, pace
+        self.workers: list[Worker] = []
+        self.wanted = 0  # workers that there should be
+        self.reader: Reader = None  # type: ignore[assignment]
+        self._stack = ExitStack()
+        self._running: list[subprocess.Popen] = []
+        self._logs: dict[int, Path] = {}
+        self._log = Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
+
+    def open(self, recording: Path | None, workers: int) -> None:
+        """Start router, reader, workers and, once these can take over, the gateway."""
+        self.open_router()
+        self.reader = Reader(self._stack.enter_context(connect(self.router)))
+        if recording is None:
+            recording = self._log / "flight.tlog"
+            to_tlog(recording, [PretendUav(0, 3, wind=3.0, turbulence=2)], seconds=1200, loss=0.01, seed=3)
+        for _ in range(workers):
+            self.add()
+        link = f"--link=replay:{recording}?copies={self.uavs}"
+        self.gateway = self.start("gateway", link, "--offset=-1", "--router", self.router, name="gateway")
+
+    def open_router(self) -> None:
+        """Start the router."""
+        if self.zenohd is not None:
+            config = str(ROOT / "deploy" / "zenohd.json5")
+            command = [self.zenohd, "-c", config, "-l", self.router, "--no-multicast-scouting"]
+        else:
+            command = [sys.executable, "-c", _ROUTER, self.router]
+        self.router_process = self._begin(command, "router")
+        until(lambda: reachable(self.router), 60.0, "the router")
+
+    def add(self) -> Worker:
+        """Start a worker, and wait until it may claim."""
+        worker = Worker(self)
+        self.workers.append(worker)
+        until(lambda: worker.name or worker.process.poll() is not None, 300.0, "a worker")
+        return worker
+
+    def lose(self, worker: Worker) -> None:
+        """Count a worker no longer."""
+        self.workers.remove(worker)
+        worker.signal(signal.SIGKILL)
+        worker.process.wait()
+        worker.way.__exit__()
+
+    def start(self, module: str, *options: str, name: str) -> subprocess.Popen:
+        """Start `python -m module options…`."""
+        return self._begin([sys.executable, "-m", module, *options], name)
+
+    def _begin(self, command: list[str], name: str) -> subprocess.Popen:
+        path = self._log / f"{name}{len(self._running)}.txt"
+        with path.open("wb") as out:
+            child = subprocess.Popen(command, cwd=ROOT, stdout=out, stderr=subprocess.STDOUT)
+        self._running.append(child)
+        self._logs[child.pid] = path
+        return child
+
+    def log_of(self, child: subprocess.Popen) -> Path:
+        """Give the file of what a process says."""
+        return self._logs[child.pid]
+
+    def words(self) -> str:
+        """Give the last words of every process."""
+        said = [(path.name, path.read_text(errors="replace")[-400:]) for path in sorted(self._log.glob("*.txt"))]
+        return "\n".join(f"{name}: {text}" for name, text in said if text.strip())
+
+    def __exit__(self, *_: object) -> None:
+        for child in self._running:
+            if child.poll() is None:
+                child.send_signal(signal.SIGCONT)
+                child.kill()
+                child.wait()
+        for worker in self.workers:
+            worker.way.__exit__()
+        self._stack.close()
