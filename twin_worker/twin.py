@@ -82,9 +82,8 @@ def _turn(twin: Twin, now: float) -> list[Message]:
         watch_events(twin, command_in_force(twin))
         _score(twin)
     pace = twin.pace
-    if not twin.lost and _due(now, twin.identify_t, pace.identify) and twin.may(Work.IDENTIFY):
-        twin.identify_t = now
-        results += learn(twin)
+    if identify_due(twin) and twin.may(Work.IDENTIFY):
+        results += identify(twin)
     if _due(now, twin.predict_t, pace.predict) and twin.may(Work.PREDICT):
         twin.predict_t = twin.renew_t = now
         made = foresee(twin, now)
@@ -94,6 +93,18 @@ def _turn(twin: Twin, now: float) -> list[Message]:
         twin.renew_t = now
         results += renew(twin)
     return results
+
+
+def identify_due(twin: Twin) -> bool:
+    """Tell whether an identification is due at the data time of the last turn."""
+    ready = twin.origin is not None and np.isfinite([twin.history.newest, twin.turned_t]).all()
+    return bool(ready) and not twin.lost and _due(twin.turned_t, twin.identify_t, twin.pace.identify)
+
+
+def identify(twin: Twin) -> list[Message]:
+    """Identify and verify once, as of the last turn."""
+    twin.identify_t = twin.turned_t
+    return learn(twin)
 
 
 def _due(now: float, last: float, period: float) -> bool:

@@ -32,8 +32,10 @@ from twin_worker.claims.protocol import Claiming
 from twin_worker.conflict.ledger import Ledger
 from twin_worker.conflict.separation import Separation
 from twin_worker.conflict.traffic import Traffic
-from twin_worker.engine.pace import Pace
-from twin_worker.engine.quota import SWEEP_S, Quota
+from twin_worker.engine.learner import Learner
+from twin_worker.engine.pace import Pace, Work
+from twin_worker.engine.quota import LEAST_S, SWEEP_S, Quota
+from twin_worker.engine.rates import Rates
 from twin_worker.memory import AUTO
 from twin_worker.mismatch.live import Live
 from twin_worker.mismatch.told import word
@@ -45,6 +47,7 @@ from twin_worker.whatif.grid import resample, wanted
 _log = logging.getLogger(__name__)
 _SILENT_S = 1.0  # wall time without news after which data time runs on by the wall clock [s]
 _STATE_S = 1.0  # between fleet tables [s]
+_LATE_S = 0.2  # between sweeps, from which telemetry counts as late [s]
 _NEW_S = 2.0  # an aircraft that came so lately is predicted before any other work begins [s]
 
 
@@ -67,6 +70,9 @@ class Worker:
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
         self.pace, self.quota = pace or Pace(), Quota()
         self.sentence = ""
+        self.rates = Rates()
+        self.learner = Learner(self.holding, self._publish, self.rates)
+        self._swept = float("-inf")  # when the last sweep began [s, monotonic]
         self._first = 0  # whose turn is the first of the next sweep
         self.traffic = Traffic(separation or Separation())
         self._twins = Twins(bus, self._make, self)
@@ -133,6 +139,8 @@ class Worker:
         for held in self._in_turn():
             waiting = len(held.inbox)
             taken += waiting
+            if held.lock.locked():  # it is identified just now, or handed over
+                continue
             try:
                 for result in _advance_all(held, waiting, self.traffic):
                     self._publish(result, held)
@@ -149,8 +157,19 @@ class Worker:
         self._first = (self._first + 1) % max(len(found), 1)
         found = found[self._first :] + found[: self._first]
         new = [held for held in found if held.twin.prediction is None and time.monotonic() - held.since < _NEW_S]
+        self._watch_time()
         self.quota.sweep(hurry=bool(new))
         return [*new, *(held for held in found if all(held is not one for one in new))] if new else found
+
+    def _watch_time(self) -> None:
+        """Let heavy work wait where telemetry does: after a sweep that was late one flight ahead is begun, no more."""
+        now = time.monotonic()
+        late, self._swept = now - self._swept > _LATE_S, now
+        self.learner.pause = late
+        if self.claiming.threaded:
+            self.quota.limit = LEAST_S if late else SWEEP_S
+        if done := self.quota.done.pop(Work.PREDICT, 0):
+            self.rates.note(Work.PREDICT, now, done)
 
     def _publish(self, result: Message, held: Held) -> None:
         """Publish under the claim in force; what is held no longer, or not surely, is kept back."""
@@ -182,15 +201,17 @@ class Worker:
         ]
         shed = sum(held.shed for held in self.holding())
         said = [f"{shed} messages shed: too many UAVs for this worker"] if shed else []
+        said += self.rates.said(self.pace, len(self.holding()), time.monotonic())
         said += [held.failed for held in self.holding() if held.failed]
         return FleetState(t=time.time(), rows=tuple(rows), sentence=self.sentence or " ".join(said[:3]))
 
     def run(self, stop: threading.Event) -> None:
         """Join, turn until told to stop, publishing the fleet table once a second; then hand everything over."""
-        self.claiming.threaded, self.quota.limit = True, SWEEP_S
+        self.claiming.threaded, self.quota.aside = True, frozenset({Work.IDENTIFY})
         self.listen()
-        claims = threading.Thread(target=self.claiming.run, args=(stop,), name="claims")
-        claims.start()
+        hands = [threading.Thread(target=each.run, args=(stop,)) for each in (self.claiming, self.learner)]
+        for hand in hands:
+            hand.start()
         due = 0.0
         while not stop.is_set():
             self._news.wait(timeout=0.1)
@@ -200,7 +221,8 @@ class Worker:
             if time.monotonic() >= due:
                 due = time.monotonic() + _STATE_S
                 self.bus.publish(self.state())
-        claims.join()
+        for hand in hands:
+            hand.join()
         self.claiming.leave()
 
     def _predictions(self, uav: int | None, asked: dict[str, str], payload: bytes) -> Iterator[tuple[Any, Stamp]]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from twin_worker.engine.pace import Work
 
 SWEEP_S = 0.05  # of heavy work in one sweep [s]
+LEAST_S = 1e-3  # the same where telemetry is late: as much as one piece of work [s]
 _SHARE = {Work.PREDICT: 1.0, Work.IDENTIFY: 0.7, Work.ENSEMBLE: 0.5}  # of a sweep, up to which each kind may begin [-]
 
 
@@ -17,11 +18,13 @@ class Quota:
     Attributes:
         limit: of heavy work in one sweep [s]
         hurry: an aircraft waits for its first prediction, so that nothing else is begun
-        done, refused: how often each kind was
+        aside: kinds that are done by another hand
+        done, refused: how often each other kind was
     """
 
     limit: float = float("inf")
     hurry: bool = False
+    aside: frozenset[Work] = frozenset()
     done: Counter[Work] = field(default_factory=Counter)
     refused: Counter[Work] = field(default_factory=Counter)
     _spent: float = 0.0
@@ -40,6 +43,8 @@ class Quota:
 
     def grants(self, work: Work) -> bool:
         """Tell whether work that is due may be begun."""
+        if work in self.aside:
+            return False
         self.settle()
         granted = self._spent < self.limit * _SHARE[work] and not (self.hurry and work is not Work.PREDICT)
         (self.done if granted else self.refused)[work] += 1

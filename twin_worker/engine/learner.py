@@ -1,0 +1,58 @@
+"""A thread that identifies one aircraft after another, so that the telemetry of the others never waits for it."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+from fleet.contract import Message
+from twin_worker.claims.keeper import Held
+from twin_worker.engine.pace import Work
+from twin_worker.engine.rates import Rates
+from twin_worker.twin import identify, identify_due
+
+_log = logging.getLogger(__name__)
+_IDLE_S = 0.05
+Publish = Callable[[Message, Held], None]
+
+
+class Learner:
+    """Identifies whoever has waited longest.
+
+    Args:
+        holding: gives those whose twins are here
+        publish: sends a result
+        rates: where it is noted
+    """
+
+    def __init__(
+        self, holding: Callable[[], list[Held]], publish: Callable[[Message, Held], None], rates: Rates
+    ) -> None:
+        self.pause = False  # the telemetry is late
+        self._holding, self._publish, self._rates = holding, publish, rates
+
+    def run(self, stop: threading.Event) -> None:
+        """Identify until told to stop."""
+        while not stop.is_set():
+            held = None if self.pause else self._next()
+            if held is None:
+                stop.wait(_IDLE_S)
+                continue
+            try:
+                self._identify(held)
+            except Exception as error:  # a defect met by one aircraft must not stop the others
+                held.failed = f"{held.twin.name}: found a defect ({error}), its model is missing; report it"
+                _log.exception(held.failed)
+
+    def _next(self) -> Held | None:
+        found = [held for held in self._holding() if held.twin.prediction is not None and identify_due(held.twin)]
+        return min(found, key=lambda held: held.twin.identify_t, default=None)
+
+    def _identify(self, held: Held) -> None:
+        with held.lock:
+            if not held.ready:
+                return
+            results = identify(held.twin)
+        self._rates.note(Work.IDENTIFY, time.monotonic())
+        for result in results:
+            self._publish(result, held)
