@@ -4,7 +4,7 @@ import copy
 import logging
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import msgspec
@@ -17,17 +17,15 @@ from fleet.contract import (
     FleetState,
     Message,
     Mismatch,
-    Mission,
     Model,
-    Params,
     Prediction,
     Sample,
     Status,
     WhatIf,
 )
-from fleet.fence import Fence
 from twin_worker.claims.carry import Load
 from twin_worker.claims.keeper import Held, Twins
+from twin_worker.claims.past import SELDOM
 from twin_worker.claims.protocol import Claiming
 from twin_worker.conflict.ledger import Ledger
 from twin_worker.conflict.separation import Separation
@@ -47,6 +45,7 @@ from twin_worker.whatif.grid import resample, wanted
 _log = logging.getLogger(__name__)
 _SILENT_S = 1.0  # wall time without news after which data time runs on by the wall clock [s]
 _STATE_S = 1.0  # between fleet tables [s]
+_SWEEP_S = 0.015  # of telemetry is taken in at once [s]
 _LATE_S = 0.2  # between sweeps, from which telemetry counts as late [s]
 _NEW_S = 2.0  # an aircraft that came so lately is predicted before any other work begins [s]
 
@@ -75,17 +74,17 @@ class Worker:
         self._swept = float("-inf")  # when the last sweep began [s, monotonic]
         self._first = 0  # whose turn is the first of the next sweep
         self.traffic = Traffic(separation or Separation())
-        self._twins = Twins(bus, self._make, self)
+        self._twins = Twins(bus, uavs, self._make, self)
         self._held = self._twins.held
         self.claiming = Claiming(bus, uavs, self._twins)
-        self._fence = Fence()
         self._news = threading.Event()
 
     def listen(self) -> None:
         """Subscribe, answer queries, and ask for what was said before this worker came."""
         self.claiming.join()
-        for kind in (Sample, Status, Mission, Params):
-            self.bus.subscribe(kind, lambda message, _: self._hear(message), self._wants)
+        self.bus.subscribe(Sample, lambda message, _: self._hear(message), self._wants)
+        for kind in SELDOM:
+            self.bus.subscribe(kind, lambda message, _: self._hear(message), self._may_want)
         self.bus.subscribe(Prediction, self._overhear)
         self.bus.subscribe(Model, self._twins.overhear, lambda uav: uav in self.uavs and uav not in self._held)
         self.bus.answer(Prediction, self._predictions)
@@ -104,6 +103,11 @@ class Worker:
         self.claiming.hear_of(uav)
         return uav in self._held
 
+    def _may_want(self, uav: int) -> bool:
+        """Tell whether an aircraft may ever be held."""
+        self.claiming.hear_of(uav)
+        return uav in self.uavs
+
     def _hear(self, message: Message) -> None:
         if self._twins.hear(message):
             self._news.set()
@@ -111,7 +115,7 @@ class Worker:
     def _overhear(self, made: Prediction, stamp: Stamp | None) -> None:
         """Keep what others predict of their aircraft; of two writers the higher claim is believed."""
         self.claiming.overheard(made.uav, stamp)
-        if made.uav not in self._held and self._fence.believes(made.uav, stamp):
+        if self._twins.overhear(made, stamp):
             self.traffic.hear(made)
 
     def take(self, uav: int, load: Load) -> None:
@@ -212,18 +216,24 @@ class Worker:
         hands = [threading.Thread(target=each.run, args=(stop,)) for each in (self.claiming, self.learner)]
         for hand in hands:
             hand.start()
-        due = 0.0
-        while not stop.is_set():
+        self._turn_while(lambda: not stop.is_set())
+        heirs = threading.Thread(target=self.claiming.leave)
+        heirs.start()
+        self._turn_while(heirs.is_alive)  # each is written for until its own turn to go comes
+        for hand in (*hands, heirs):
+            hand.join()
+
+    def _turn_while(self, condition: Callable[[], bool]) -> None:
+        due, pause = 0.0, threading.Event()
+        while condition():
             self._news.wait(timeout=0.1)
+            pause.wait(_SWEEP_S)
             self._news.clear()
             self.claiming.tick()
             self.turn()
             if time.monotonic() >= due:
                 due = time.monotonic() + _STATE_S
                 self.bus.publish(self.state())
-        for hand in hands:
-            hand.join()
-        self.claiming.leave()
 
     def _predictions(self, uav: int | None, asked: dict[str, str], payload: bytes) -> Iterator[tuple[Any, Stamp]]:
         grid = wanted(asked)

@@ -12,11 +12,11 @@ from typing import Protocol
 import fleet
 from fleet.bus import Bus
 from fleet.codec import Stamp
-from fleet.contract import Handover, Message, Mismatch, Model, Sample
+from fleet.contract import Handover, Message, Mismatch, Model, Prediction, Sample
 from fleet.fence import Fence
 from twin_worker.claims.carry import Load, packed, unpacked
-from twin_worker.claims.past import recall
-from twin_worker.claims.revive import revive
+from twin_worker.claims.past import SELDOM, recall
+from twin_worker.claims.revive import go_on, revive
 from twin_worker.conflict.ledger import Ledger
 from twin_worker.memory import Twin
 
@@ -56,15 +56,19 @@ class Twins:
 
     Args:
         bus: joined
+        ids: that may come
         make: makes the twin of an id
         extras: takes and gives what belongs to an aircraft besides its twin
     """
 
-    def __init__(self, bus: Bus, make: Callable[[int], Twin], extras: Extras) -> None:
+    def __init__(self, bus: Bus, ids: range, make: Callable[[int], Twin], extras: Extras) -> None:
         self.held: dict[int, Held] = {}
         self.lock = threading.Lock()
+        self.ids = ids
         self._bus, self._make, self._extras = bus, make, extras
         self._models: dict[int, Model] = {}  # last published by others, of ids of ours
+        self._predictions: dict[int, Prediction] = {}
+        self._said: dict[int, dict[type, Message]] = {}  # by gateways, of aircraft that others hold
         self._fence = Fence()
 
     # --- what is heard -----------------------------------------------------------------------------------------------
@@ -73,6 +77,8 @@ class Twins:
         """Let a message wait for its twin; tell whether there is one."""
         held = self.held.get(message.uav)
         if held is None:
+            if isinstance(message, SELDOM) and message.uav in self.ids:
+                self._said.setdefault(message.uav, {})[type(message)] = message
             return False
         if isinstance(message, Sample):
             held.arrived = time.monotonic()
@@ -80,10 +86,15 @@ class Twins:
         held.inbox.append(message)
         return True
 
-    def overhear(self, model: Model, stamp: Stamp | None) -> None:
-        """Keep the model another worker published."""
-        if model.uav not in self.held and self._fence.believes(model.uav, stamp):
-            self._models[model.uav] = model
+    def overhear(self, said: Model | Prediction, stamp: Stamp | None) -> bool:
+        """Keep what another worker published of an aircraft of its own; tell whether that is believed."""
+        if said.uav in self.held or not self._fence.believes(said.uav, stamp):
+            return False
+        if isinstance(said, Model):
+            self._models[said.uav] = said
+        elif said.uav in self.ids:
+            self._predictions[said.uav] = said
+        return True
 
     def ready(self) -> list[Held]:
         """Give those whose twins are here, by UAV id."""
@@ -114,7 +125,8 @@ class Twins:
         self._extras.take(uav, load)
         fresh = self._make(uav)
         load.twin.pace, load.twin.quota = fresh.pace, fresh.quota
-        self._models.pop(uav, None)
+        for kept in (self._models, self._predictions, self._said):
+            kept.pop(uav, None)  # type: ignore[attr-defined]
         self._begin(held, load.twin, load.inbox)
 
     def recall(self, uavs: list[int]) -> None:
@@ -130,8 +142,10 @@ class Twins:
         if held is None or held.ready:
             return
         twin = self._make(uav)
+        if (made := self._predictions.pop(uav, None)) is not None:
+            go_on(twin, made)
         try:
-            recall(self._bus, twin)
+            recall(self._bus, twin, self._said.pop(uav, {}))
         except ConnectionError:  # we are leaving
             return
         if (model := self._models.pop(uav, None)) is not None:

@@ -1,5 +1,6 @@
 """The last minutes of one aircraft, from a gateway, into a twin that was never handed over."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,13 +10,15 @@ from fleet.contract import COLUMNS, Array, History, Message, Mission, Params, Ro
 from twin_worker.memory import Twin, hear
 
 PATIENCE_S = 0.5  # with a gateway that does not answer [s]
-_KINDS: tuple[type[Message], ...] = (Status, Params, Mission)
+SELDOM: tuple[type[Message], ...] = (Status, Params, Mission)
+"""What is said so seldom that the last of each is worth keeping."""
 
 
-def recall(bus: Bus, twin: Twin) -> None:
-    """Let a fresh twin hear what was said of its aircraft before."""
-    for kind in _KINDS:
-        for message, _ in bus.ask(kind, twin.uav, PATIENCE_S):
+def recall(bus: Bus, twin: Twin, known: Mapping[type, Message]) -> None:
+    """Let a fresh twin hear what was said of its aircraft before; what is `known` already is not asked for."""
+    for kind in SELDOM:
+        found = [known[kind]] if kind in known else [said for said, _ in bus.ask(kind, twin.uav, PATIENCE_S)]
+        for message in found:
             hear(twin, message)
     for said in bus.gather(History, twin.uav, b"", PATIENCE_S):
         if said.uav == twin.uav and said.samples:

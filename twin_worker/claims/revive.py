@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 
-from fleet.contract import Model, Outcome, State
+from fleet.contract import Model, Outcome, Prediction, State
 from fleet.physics.wrench import N_PAR, NAMES
 from twin_worker.airframe_prior import prior
 from twin_worker.coupled import Coupled
@@ -29,6 +29,16 @@ def revive(twin: Twin, model: Model) -> bool:
     twin.state, twin.model = State.VERIFIED, model
     twin.wind.blow(model.t, np.array([model.wind_n, model.wind_e, 0.0]))
     return True
+
+
+def go_on(twin: Twin, made: Prediction) -> None:
+    """Let a fresh twin renew the last prediction another worker published, until it has flown one of its own.
+
+    It keeps the origin of the local frame, too.
+    """
+    if made.ahead.shape[0] < 2 or made.path.shape != (made.ahead.shape[0], 3) or made.path.shape != made.tube.shape:
+        return
+    twin.origin, twin.prediction, twin.base = made.ned_origin(), made, made
 
 
 def _coupled(twin: Twin, model: Model) -> Coupled | None:

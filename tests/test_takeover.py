@@ -1,0 +1,188 @@
+"""Workers on one bus in memory, and on a real router: who takes over has window and model, and nobody is lost."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+
+import flights as f
+import msgspec
+import pytest
+
+from fleet.bus import MemoryBus, connect
+from fleet.codec import Stamp
+from fleet.contract import Claim, Handover, History, Message, Mission, Model, Prediction, Sample, Status, Wanted
+from gateway.publish import Publisher
+from twin_worker.claims.protocol import Claiming
+from twin_worker.claims.tree import pack
+from twin_worker.worker import Worker
+
+PATIENCE_S = 60.0
+OTHER = "00000000000000aa"
+
+
+def wait(condition: Callable[[], object]) -> None:
+    """Wait for a condition, at most as long as patience lasts."""
+    never, waited = threading.Event(), 0.0
+    while not condition():
+        assert waited < PATIENCE_S, "waited in vain"
+        never.wait(0.02)
+        waited += 0.02
+
+
+# --- in memory -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def bus() -> MemoryBus:
+    return MemoryBus()
+
+
+@pytest.fixture
+def worker(bus: MemoryBus) -> Worker:
+    made = Worker(bus, range(1, 5), omega=0.0)
+    made.listen()
+    return made
+
+
+def handed(bus: MemoryBus, *uavs: int) -> list[Handover]:
+    """Ask as another worker would."""
+    return list(bus.gather(Handover, "x", msgspec.msgpack.encode(Wanted(uavs=uavs)), 1.0))
+
+
+def test_what_is_asked_for_is_handed_over_and_written_for_no_longer(bus: MemoryBus, worker: Worker) -> None:
+    for uav in (1, 2, 3):
+        for message in f.messages(f.turn(4.0), uav=uav):
+            bus.publish(message)
+    worker.turn()
+    bus.publish(f.messages(f.turn(5.0), uav=2)[-1])  # waits in its inbox
+    epoch = {held.twin.uav: held.epoch for held in worker.holding()}[2]
+    (twin,) = handed(bus, 2, 9)
+    assert (twin.uav, twin.epoch) == (2, epoch) and len(twin.load) > 10_000
+    assert [held.twin.uav for held in worker.holding()] == [1, 3]
+    assert handed(bus, 2) == [] and list(bus.gather(Handover, "x", b"", 1.0)) == []
+
+    taker = Worker(MemoryBus(), range(1, 5), omega=0.0)
+    taker._twins.adopt(2, epoch + 1, twin)
+    (held,) = taker.holding()
+    assert held.epoch == epoch + 1 and len(held.inbox) == 1 and not taker._twins.bare
+    assert held.twin.history.newest == pytest.approx(f.T0 + 4.0, abs=0.2)
+    assert taker.turn() == 1 and held.twin.history.newest == pytest.approx(f.T0 + 5.0, abs=0.2)
+
+
+@pytest.mark.parametrize("odd", [{"code": "another"}, {"load": b""}, {"load": b"\xc1"}, {"load": pack([1], {})}])
+def test_a_twin_that_cannot_be_read_is_taken_over_cold(bus: MemoryBus, worker: Worker, odd: dict) -> None:
+    for message in f.messages(f.turn(2.0), uav=2):
+        bus.publish(message)
+    worker.turn()
+    (twin,) = handed(bus, 2)
+    taker = Worker(MemoryBus(), range(1, 5), omega=0.0)
+    taker._twins.expect([2])
+    taker._twins.adopt(2, 5, msgspec.structs.replace(twin, **odd))
+    (held,) = taker.holding()
+    assert held.epoch == 5 and held.twin.uav == 2 and held.twin.history.newest == -float("inf")
+
+
+def test_a_higher_claim_is_yielded_to_at_once(bus: MemoryBus, worker: Worker) -> None:
+    for message in f.messages(f.turn(2.0), uav=2):
+        bus.publish(message)
+    (held,) = worker.holding()
+    bus.publish(Claim(t=0.0, worker=OTHER, held=((2, held.epoch - 1),)))
+    assert worker.holding() == [held]
+    bus.publish(Claim(t=0.0, worker=OTHER, held=((2, held.epoch + 1), (3, -5), (4, 1 << 63))))
+    assert worker.holding() == []
+
+
+def test_a_cold_takeover_has_telemetry_mission_and_model(bus: MemoryBus, heard: tuple, flown: tuple) -> None:
+    """A worker comes when a gateway has been there for long, and another worker has just died."""
+    twin, said = flown
+    publisher = Publisher(bus)
+    publisher.publish(heard)
+    worker = Worker(bus, range(1, 5), omega=0.0)
+    worker.claiming.claims.heard(OTHER, {1: 7})
+    for kind in (Model, Prediction):
+        last = [m for m in said if isinstance(m, kind)][-1]
+        worker._twins.overhear(last, Stamp(7, int(OTHER, 16)))
+    worker.listen()
+    (held,) = worker.holding()
+    mine = held.twin
+    assert mine.mission is not None and mine.received == twin.received and mine.status is not None
+    assert mine.history.newest - mine.history.rows("attitude")[0][0] > 90.0
+    assert mine.in_force is not None and mine.in_force.fit == twin.in_force.fit
+    told: list[Prediction] = []
+    bus.subscribe(Prediction, lambda made, _: told.append(made))
+    bus.publish(f.shifted([m for m in heard if isinstance(m, Sample)][-12:], 0.5, 1e9)[-1])
+    worker.turn()
+    assert told and told[0].method in f.ROUTE
+
+
+def test_many_messages_are_one_and_what_does_not_fit_is_left_out(heard: tuple[Message, ...]) -> None:
+    from twin_worker.claims.past import joined
+
+    samples = tuple(m for m in heard if isinstance(m, Sample))[:200]
+    whole = joined(History(uav=1, t=samples[-1].t, samples=samples))
+    one, many = f.remembered([whole]), f.remembered(samples)
+    for name in f.HZ:
+        assert all((a == b).all() for a, b in zip(one.rows(name), many.rows(name), strict=True)), name
+    rows = samples[0].attitude
+    odd = [msgspec.structs.replace(rows, x=msgspec.structs.replace(rows.x, **bad))
+           for bad in ({"shape": (1, 2)}, {"data": b""}, {"dtype": "|O8"}, {"dtype": "no"})]  # fmt: skip
+    broken = [Sample(uav=1, t=0.0, attitude=each) for each in odd]
+    assert joined(History(uav=1, t=whole.t, samples=(*broken, *samples))) == whole
+
+
+# --- on a router -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def site(router: str) -> Iterator[Callable[[int], Worker]]:
+    """Starts workers on one router; each turns by itself, and leaves politely when its event is set."""
+    with ExitStack() as stack:
+
+        def start(name: int) -> Worker:
+            bus = stack.enter_context(connect(router))
+            bus.writer = name  # so that each owns some
+            worker = Worker(bus, range(6), omega=0.0)
+            stop = threading.Event()
+            thread = threading.Thread(target=worker.run, args=(stop,))
+            thread.start()
+            stack.callback(thread.join)
+            stack.callback(stop.set)
+            worker.leave = lambda: (stop.set(), thread.join())  # type: ignore[attr-defined]
+            return worker
+
+        yield start
+
+
+def held(worker: Worker) -> set[int]:
+    return {one.twin.uav for one in worker.holding()}
+
+
+def test_two_share_a_third_joins_one_leaves_and_nothing_is_forgotten(
+    site: Callable[[int], Worker], router: str
+) -> None:
+    with connect(router) as gateway:
+        publisher = Publisher(gateway)
+        one, two = site(1), site(2)
+        for uav in range(6):
+            publisher.publish([Status(uav=uav, t=f.T0), Mission(uav=uav, t=f.T0, items=(f.item(0),))])
+            publisher.publish(f.messages(f.turn(3.0), uav=uav))
+        wait(lambda: held(one) | held(two) == set(range(6)) and not held(one) & held(two))
+        wait(lambda: all(h.twin.history.newest > f.T0 + 2.5 for w in (one, two) for h in w.holding()))
+        epochs = {h.twin.uav: h.epoch for w in (one, two) for h in w.holding()}
+        three = site(3)
+        wait(lambda: held(three) and held(one) | held(two) | held(three) == set(range(6)))
+        moved = {h.twin.uav: h for h in three.holding()}
+        assert all(h.epoch > epochs[uav] for uav, h in moved.items())
+        assert all(h.twin.history.newest > f.T0 + 2.5 and h.twin.mission is not None for h in moved.values())
+        one.leave()  # type: ignore[attr-defined]
+        wait(lambda: held(two) | held(three) == set(range(6)))
+        assert not held(one)
+
+
+def test_the_protocol_ignores_strangers(bus: MemoryBus) -> None:
+    claiming = Claiming(bus, range(5), Worker(bus, range(5), omega=0.0)._twins)
+    for name in ("", "worker", "viewer/x/0-4/1", f"worker/{OTHER}/4/1", f"worker/{OTHER}/a-b/1", "worker/x/0-4/1"):
+        claiming._token(name, True)
+    assert not claiming.claims.peers
+    claiming._token(f"worker/{OTHER}/0-4/1", True)
+    assert list(claiming.claims.peers) == [OTHER]
