@@ -82,6 +82,12 @@ def test_a_twin_that_cannot_be_read_is_taken_over_cold(bus: MemoryBus, worker: W
     assert held.epoch == 5 and held.twin.uav == 2 and held.twin.history.newest == -float("inf")
 
 
+def test_who_is_asked_for_what_it_has_not_got_itself_yet_holds_it_no_longer(bus: MemoryBus, worker: Worker) -> None:
+    worker._twins.expect([4])
+    worker.claiming.claims.take(4, 5)
+    assert handed(bus, 4) == [] and 4 not in worker._held and 4 not in worker.claiming.claims.held
+
+
 def test_a_higher_claim_is_yielded_to_at_once(bus: MemoryBus, worker: Worker) -> None:
     for message in f.messages(f.turn(2.0), uav=2):
         bus.publish(message)

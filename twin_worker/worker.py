@@ -169,7 +169,7 @@ class Worker:
         """Let heavy work wait where telemetry does: after a sweep that was late one flight ahead is begun, no more."""
         now = time.monotonic()
         late, self._swept = now - self._swept > _LATE_S, now
-        self.learner.pause = late
+        self.learner.yield_to_telemetry(late)
         if self.claiming.threaded:
             self.quota.limit = LEAST_S if late else SWEEP_S
         if done := self.quota.done.pop(Work.PREDICT, 0):

@@ -150,7 +150,8 @@ class Twins:
             return
         if (model := self._models.pop(uav, None)) is not None:
             revive(twin, model)
-        self._begin(held, twin, [])
+        if self.held.get(uav) is held:  # it may have been lost meanwhile
+            self._begin(held, twin, [])
 
     def renew(self, uav: int, epoch: int) -> None:
         """Write under another epoch from now on."""
@@ -187,11 +188,14 @@ class Twins:
             self._extras.give(uav)
 
     def hand_over(self, uav: int, epoch: int) -> Handover | None:
-        """Hold one no longer; give its twin, between two of its turns."""
-        held = self.held.get(uav)
-        if held is None or not held.ready:
+        """Hold one no longer; give its twin, between two of its turns; None where it has none yet."""
+        with self.lock:
+            held = self.held.pop(uav, None)
+        if held is None:
             return None
         with held.lock:
+            if not held.ready:
+                return None
             held.ready = False
             conflicts, mismatch = self._extras.give(uav)
             try:
@@ -199,8 +203,6 @@ class Twins:
             except TypeError:  # a defect: its new owner begins cold
                 _log.exception("uav-%d cannot be handed over; report it", uav)
                 load = b""
-        with self.lock:
-            self.held.pop(uav, None)
         return Handover(t=time.time(), uav=uav, epoch=epoch, code=fleet.SOURCES, load=load)
 
     @property

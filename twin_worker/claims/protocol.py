@@ -175,6 +175,8 @@ class Claiming:
                 self.turn()
             except ConnectionError:  # the session is closed: we are leaving
                 return
+            except Exception:  # a defect met once must not end the claims
+                _log.exception("a turn of the claims failed; report it")
 
     def turn(self) -> None:
         """Do what is due."""

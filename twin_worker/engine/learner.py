@@ -1,6 +1,8 @@
 """A thread that identifies one aircraft after another, so that the telemetry of the others never waits for it."""
 
+import contextlib
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -13,6 +15,8 @@ from twin_worker.twin import identify, identify_due
 
 _log = logging.getLogger(__name__)
 _IDLE_S = 0.05
+_NICE = 10  # how far it yields to what predicts, in this process and in others
+_LEAST, _GROWS = 0.05, 1.2  # share of its time that it may work: never less, and how it recovers after a pause [-]
 Publish = Callable[[Message, Held], None]
 
 
@@ -28,21 +32,31 @@ class Learner:
     def __init__(
         self, holding: Callable[[], list[Held]], publish: Callable[[Message, Held], None], rates: Rates
     ) -> None:
-        self.pause = False  # the telemetry is late
+        self._share = 1.0
         self._holding, self._publish, self._rates = holding, publish, rates
+
+    def yield_to_telemetry(self, late: bool) -> None:
+        """Work less where telemetry is late; every piece of work after that may be followed sooner by the next."""
+        self._share = max(0.5 * self._share, _LEAST) if late else self._share
 
     def run(self, stop: threading.Event) -> None:
         """Identify until told to stop."""
-        while not stop.is_set():
-            held = None if self.pause else self._next()
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        worked = 0.0
+        while not stop.wait(max(worked * (1.0 / self._share - 1.0), 0.0 if worked else _IDLE_S)):
+            held = self._next()
+            begun = time.monotonic()
             if held is None:
-                stop.wait(_IDLE_S)
+                worked = 0.0
                 continue
+            self._share = min(_GROWS * self._share, 1.0)
             try:
                 self._identify(held)
             except Exception as error:  # a defect met by one aircraft must not stop the others
                 held.failed = f"{held.twin.name}: found a defect ({error}), its model is missing; report it"
                 _log.exception(held.failed)
+            worked = time.monotonic() - begun
 
     def _next(self) -> Held | None:
         found = [held for held in self._holding() if held.twin.prediction is not None and identify_due(held.twin)]

@@ -64,7 +64,12 @@ def happen(site: Site, name: str, rng: np.random.Generator) -> dict[str, Any]:
     limits = LIMITS.get(name, {})
     found["over"] = [key for key, most_of in limits.items() if not (found.get(key, np.inf) <= most_of)]
     others = set(range(site.uavs))
-    found |= {"fault": name, "usual_s": site.reader.usual(others, usual_since), "load": os.getloadavg()[0]}
+    found |= {
+        "epoch_regressions": site.reader.regressions,
+        "fault": name,
+        "usual_s": site.reader.usual(others, usual_since),
+        "load": os.getloadavg()[0],
+    }
     print(json.dumps(found), flush=True)
     while len(site.workers) < most:
         site.add()

@@ -29,7 +29,7 @@ class Reader:
         self.came: dict[int, list[Came]] = defaultdict(list)
         self.fits: dict[int, float] = {}  # mean fit of the model in force, as published last
         self.windows: dict[int, float] = {}
-        self.whole: dict[int, tuple[float, str]] = {}  # since when one worker holds it with its telemetry of before
+        self.whole: dict[str, dict[int, float]] = {}  # by worker: since when it holds which, not bare
         self.regressions = self.fenced = self.back = 0
         bus.subscribe(Prediction, self._prediction)
         bus.subscribe(Model, self._model)
@@ -55,9 +55,8 @@ class Reader:
     def _claim(self, claim: Claim, _: Stamp | None) -> None:
         now = time.monotonic()
         with self.lock:
-            for uav, _epoch in claim.held:
-                if uav not in claim.bare and self.whole.get(uav, (0.0, ""))[1] != claim.worker:
-                    self.whole[uav] = now, claim.worker
+            before = self.whole.get(claim.worker, {})
+            self.whole[claim.worker] = {uav: before.get(uav, now) for uav, _ in claim.held if uav not in claim.bare}
 
     def holders(self) -> dict[int, str]:
         """Ask who holds what."""
@@ -75,10 +74,9 @@ class Reader:
     def taken(self, uavs: set[int], since: float, was: str) -> float | None:
         """Give how long it took until all had another holder with a full window [s]; None: not yet."""
         with self.lock:
-            found = [self.whole.get(uav, (0.0, was)) for uav in uavs]
-        if any(worker == was or at < since for at, worker in found):
-            return None
-        return max((at - since for at, _ in found), default=0.0)
+            others = [held for worker, held in self.whole.items() if worker != was]
+        found = [max((held[uav] for held in others if uav in held), default=0.0) for uav in uavs]
+        return max((at - since for at in found), default=0.0) if all(at >= since for at in found) else None
 
     def gap(self, uavs: set[int], since: float) -> float:
         """Give the longest time without an accepted prediction of any of these, up to now [s]."""
