@@ -66,6 +66,10 @@ class Children(AbstractContextManager):
         """Name the children that ended well."""
         return [name for name, child in self._running.items() if child.poll() == 0]
 
+    def dead(self) -> list[str]:
+        """Name the children that failed."""
+        return [name for name, child in self._running.items() if child.poll()]
+
     def failed(self) -> list[tuple[int, str]]:
         """Give exit code and sentence of the children that failed; a refusal (2) is the child's own sentence."""
         found = []

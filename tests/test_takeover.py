@@ -1,14 +1,20 @@
 """Workers on one bus in memory, and on a real router: who takes over has window and model, and nobody is lost."""
 
+import os
+import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import flights as f
 import msgspec
 import pytest
+from conftest import ROOT
 
-from fleet.bus import MemoryBus, connect
+from fleet.bus import Bus, MemoryBus, connect
 from fleet.codec import Stamp
 from fleet.contract import Claim, Handover, History, Message, Mission, Model, Prediction, Sample, Status, Wanted
 from gateway.publish import Publisher
@@ -16,7 +22,7 @@ from twin_worker.claims.protocol import Claiming
 from twin_worker.claims.tree import pack
 from twin_worker.worker import Worker
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0  # an upper bound on a busy machine
 OTHER = "00000000000000aa"
 
 
@@ -192,3 +198,41 @@ def test_the_protocol_ignores_strangers(bus: MemoryBus) -> None:
     assert not claiming.claims.peers
     claiming._token(f"worker/{OTHER}/0-4/1", True)
     assert list(claiming.claims.peers) == [OTHER]
+
+
+def test_several_processes_share_a_range_and_one_that_dies_is_replaced(router: str) -> None:
+    """The command itself: two processes, one is killed, and there are two again."""
+    command = [sys.executable, "-m", "twin_worker", "--uavs=0-5", "--no-diagnosis", "--router", router]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with (
+        connect(router) as bus,
+        subprocess.Popen([*command, "--processes=2"], cwd=ROOT, env=env, stderr=subprocess.PIPE) as parent,
+    ):
+        try:
+            publisher = Publisher(bus)
+            publisher.publish(Status(uav=uav, t=f.T0) for uav in range(6))
+
+            def holders() -> set[str]:
+                return {claim.worker for claim, _ in bus.ask(Claim)}
+
+            wait(lambda: len(holders()) == 2 and not held_twice(bus) and count(bus) == 6)
+            before = holders()
+            children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
+            os.kill(int(children[0]), signal.SIGKILL)
+            wait(lambda: len(holders() - before) == 1 and not held_twice(bus) and count(bus) == 6)
+        finally:
+            parent.terminate()
+        assert b"worker" in parent.communicate(timeout=PATIENCE_S)[1] and parent.returncode == 0
+
+
+def claimed(bus: Bus) -> list[int]:
+    return [uav for claim, _ in bus.ask(Claim) for uav, _ in claim.held]
+
+
+def count(bus: Bus) -> int:
+    return len(set(claimed(bus)))
+
+
+def held_twice(bus: Bus) -> bool:
+    found = claimed(bus)
+    return len(found) > len(set(found))

@@ -9,6 +9,7 @@ from fleet.airframes import GENERIC, load
 from fleet.bus import ROUTER, connect
 from fleet.cli import guarded, id_range, parser_for, stop_on_signal
 from fleet.contract import FleetState
+from twin_worker.engine.many import run_many
 from twin_worker.engine.pace import read_pace
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ EXAMPLES = """
   twin_worker --uavs 0-49
   twin_worker --uavs 0-199 --pace identify=5,predict=5,ensemble=5,renew=0.1       many aircraft, ten times a second
   twin_worker --uavs 0-9 --airframe my_aircraft.toml       copy fleet/airframes/small_fixed_wing.toml and fill it in
+  twin_worker --uavs 0-49 --processes 4                    four that share the range, as on four machines
   twin_worker --uavs 50-99 --router tcp/192.168.1.10:7447
   twin_worker --uavs 0-9 --baseline skywalker.json         what `fleet calibrate` wrote; otherwise each one's own past
 """
@@ -81,6 +83,17 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _run_many(args: argparse.Namespace) -> int:
+    """Run several, each with the options given here.
+
+    Raises:
+        ValueError: when it is no number of processes.
+    """
+    if not 1 <= args.processes <= 256:
+        raise ValueError(f"--processes: found {args.processes}, expected 1 to 256; one for each core is a good choice")
+    return run_many(args.processes, [*args.options, "--processes=1"], stop_on_signal())
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the worker until it is told to stop."""
     parser = parser_for("twin_worker", "Identify, verify and predict each UAV of a range.", EXAMPLES)
@@ -119,8 +132,12 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--no-adapt", action="store_true", help="diagnose, but predict as if nothing was found")
     parser.add_argument("--no-diagnosis", action="store_true", help="do not diagnose at all")
+    parser.add_argument(
+        "--processes", type=int, default=1, metavar="N", help="workers on this machine that share the range (1)"
+    )
     args = parser.parse_args(argv)
-    return guarded("twin_worker", _run, args)
+    args.options = sys.argv[1:] if argv is None else argv
+    return guarded("twin_worker", _run if args.processes == 1 else _run_many, args)
 
 
 if __name__ == "__main__":

@@ -86,7 +86,7 @@ class Worker:
         for kind in SELDOM:
             self.bus.subscribe(kind, lambda message, _: self._hear(message), self._may_want)
         self.bus.subscribe(Prediction, self._overhear)
-        self.bus.subscribe(Model, self._twins.overhear, lambda uav: uav in self.uavs and uav not in self._held)
+        self.bus.subscribe(Model, self._overhear, lambda uav: uav in self.uavs and uav not in self._held)
         self.bus.answer(Prediction, self._predictions)
         self.bus.answer(Alert, lambda uav, *_: self._stamped((h, a) for h in self._asked(uav) for a in self.active(h)))
         self.bus.answer(Model, lambda uav, *_: self._stamped((h, h.twin.model) for h in self._asked(uav)))
@@ -112,11 +112,11 @@ class Worker:
         if self._twins.hear(message):
             self._news.set()
 
-    def _overhear(self, made: Prediction, stamp: Stamp | None) -> None:
-        """Keep what others predict of their aircraft; of two writers the higher claim is believed."""
-        self.claiming.overheard(made.uav, stamp)
-        if self._twins.overhear(made, stamp):
-            self.traffic.hear(made)
+    def _overhear(self, said: Prediction | Model, stamp: Stamp | None) -> None:
+        """Keep what others say of their aircraft; of two writers the higher claim is believed."""
+        self.claiming.overheard(said.uav, stamp)
+        if self._twins.overhear(said, stamp) and isinstance(said, Prediction):
+            self.traffic.hear(said)
 
     def take(self, uav: int, load: Load) -> None:
         """Keep what came with a twin from another worker."""

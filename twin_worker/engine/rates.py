@@ -35,7 +35,7 @@ class Rates:
         wanted = {Work.PREDICT: pace.predict, Work.IDENTIFY: pace.identify}
         found = {work: self.period(work, aircraft, now) for work in wanted}
         late = [
-            f"{work.value} every {found[work]:.0f} s instead of {wanted[work]:.0f} s"
+            f"{work.value} every {found[work]:.1f} s instead of {wanted[work]:.1f} s"
             for work in wanted
             if found[work] > _LATE * max(wanted[work], 1.0)
         ]

@@ -1,0 +1,125 @@
+"""What gives way where a core cannot keep up: pace, quota, what is said of it; and predictions renewed in between."""
+
+import argparse
+import copy
+
+import flights as f
+import msgspec
+import numpy as np
+import pytest
+
+from fleet.contract import Array, Prediction, Sample
+from fleet.frames import to_geodetic
+from twin_worker.engine import quota as clocked
+from twin_worker.engine.pace import Pace, Work, read_pace
+from twin_worker.engine.quota import Quota
+from twin_worker.engine.rates import OVER_S, Rates
+from twin_worker.renew import LATEST_S, renew
+from twin_worker.twin import Twin, advance
+
+
+def test_a_pace_is_read_and_refused_in_a_sentence() -> None:
+    assert read_pace("identify=5,renew=0.1") == Pace(identify=5.0, renew=0.1)
+    for odd in ("", "identify", "identify=0", "identify=x", "identify=nan", "speed=5", "predict=1e9"):
+        with pytest.raises(argparse.ArgumentTypeError, match=r"found .*, expected one of predict, identify"):
+            read_pace(odd)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    now = [0.0]
+    monkeypatch.setattr(clocked.time, "perf_counter", lambda: now[0])
+    return now
+
+
+def test_ensembles_give_way_before_flights_ahead_and_time_of_others_does_not_count(clock: list[float]) -> None:
+    quota = Quota(limit=1.0)
+    quota.sweep()
+    assert quota.grants(Work.ENSEMBLE)
+    clock[0] += 0.55
+    quota.settle()
+    clock[0] += 5.0  # telemetry
+    assert not quota.grants(Work.ENSEMBLE) and quota.grants(Work.IDENTIFY)
+    clock[0] += 0.2
+    assert not quota.grants(Work.IDENTIFY) and quota.grants(Work.PREDICT)
+    clock[0] += 0.3
+    assert not quota.grants(Work.PREDICT)
+    quota.sweep()
+    assert quota.grants(Work.PREDICT)
+    assert quota.refused == {Work.ENSEMBLE: 1, Work.IDENTIFY: 1, Work.PREDICT: 1}
+
+
+def test_who_has_no_prediction_yet_comes_first_and_without_a_limit_nobody_waits(clock: list[float]) -> None:
+    limited, free = Quota(limit=1.0), Quota()
+    for quota in (limited, free):
+        quota.sweep(hurry=True)
+        assert quota.grants(Work.PREDICT)
+    assert not limited.grants(Work.IDENTIFY) and free.grants(Work.IDENTIFY)
+    clock[0] += 1e6
+    assert free.grants(Work.ENSEMBLE)
+    free.aside = frozenset({Work.IDENTIFY})
+    assert not free.grants(Work.IDENTIFY)
+
+
+def test_what_is_shed_is_said() -> None:
+    rates, pace = Rates(), Pace(predict=1.0, identify=5.0)
+    for k in range(61):
+        rates.note(Work.PREDICT, float(k), 10)
+        if k % 3 == 0:
+            rates.note(Work.IDENTIFY, float(k))
+    assert rates.said(pace, 10, 60.0) == ["too many UAVs for this worker: identify every 27.3 s instead of 5.0 s"]
+    assert rates.said(pace, 2, 60.0) == []
+    assert Rates().said(pace, 10, 60.0) == [] and rates.period(Work.IDENTIFY, 10, 60.0 + 2 * OVER_S) == float("inf")
+
+
+def on(twin: Twin, seconds: float, off: np.ndarray) -> None:
+    """Let the aircraft be so far off the path that was foreseen."""
+    base = twin.base
+    path = [np.interp(seconds, base.ahead.numpy(), column) for column in base.path.numpy().T]
+    lat_lon_alt = to_geodetic(twin.origin, np.array([np.array(path) + off]))
+    t = base.t + seconds
+    twin.history.add(Sample(uav=1, t=t, position=f.rows([t], lat_lon_alt)))
+
+
+def test_a_renewed_prediction_begins_where_the_aircraft_is_and_comes_back_to_the_path(twin: Twin) -> None:
+    twin.base = twin.prediction
+    off = np.array([3.0, -4.0, 1.0])
+    on(twin, 2.5, off)
+    (made,) = renew(twin)
+    base = twin.base
+    assert made is twin.prediction and made.t == pytest.approx(base.t + 2.5)
+    far = made.ahead.numpy()[-1]
+    foreseen = np.column_stack(
+        [np.interp(2.5 + made.ahead.numpy(), base.ahead.numpy(), c) for c in base.path.numpy().T]
+    )
+    apart = made.path.numpy() - foreseen
+    assert apart[0] == pytest.approx(off, abs=0.05) and np.abs(apart[-1]).max() < 0.1
+    assert base.ahead.numpy()[-1] - 2.5 - 5.0 < far <= base.ahead.numpy()[-1] - 2.5
+    assert made.tube.shape == made.path.shape == (len(made.ahead.numpy()), 3)
+
+
+def test_nothing_is_renewed_that_is_old_void_or_lost(twin: Twin) -> None:
+    twin.base = twin.prediction
+    fresh = copy.deepcopy(twin)
+    on(fresh, 1.0, np.zeros(3))
+    assert renew(fresh)
+    for change in ({"base": None}, {"lost": True}, {"broken": True}, {"origin": None}):
+        odd = copy.deepcopy(fresh)
+        for name, value in change.items():
+            setattr(odd, name, value)
+        assert renew(odd) == []
+    on(twin, LATEST_S + 0.5, np.zeros(3))
+    assert renew(twin) == []
+    short = copy.deepcopy(fresh)
+    few = {name: Array.of(getattr(short.base, name).numpy()[:2]) for name in ("ahead", "path", "tube")}
+    short.base = msgspec.structs.replace(short.base, **few)
+    assert renew(short) == []
+
+
+def test_predictions_come_ten_times_a_second_where_that_is_asked_for(heard: tuple, twin: Twin) -> None:
+    twin.pace = Pace(predict=5.0, identify=1000.0, renew=0.1)
+    twin.identify_t = twin.data_t
+    rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 12.0], 12.0, 1e9)
+    made = [m for message in rest for m in advance(twin, (message,)) if isinstance(m, Prediction)]
+    per_s = len(made) / (made[-1].t - made[0].t)
+    assert 7.0 < per_s < 11.0
