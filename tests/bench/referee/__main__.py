@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 
 from fleet.cli import guarded, parser_for
+from fleet.contract import Claim
+from twin_worker.claims.owner import owners
 
 from . import faults
 from .site import PACE, Site, until
@@ -60,7 +62,9 @@ def happen(site: Site, name: str, rng: np.random.Generator) -> dict[str, Any]:
     try:
         found = faults.ALL[name](site, worker)
     except TimeoutError as error:
-        found = {"failed": str(error)}
+        claims = {claim.worker[-4:]: (sorted(uav for uav, _ in claim.held), claim.bare, claim.leaving)
+                  for claim, _ in site.reader.bus.ask(Claim)}  # fmt: skip
+        found = {"failed": str(error), "claims": claims}
     limits = LIMITS.get(name, {})
     found["over"] = [key for key, most_of in limits.items() if not (found.get(key, np.inf) <= most_of)]
     others = set(range(site.uavs))
@@ -73,21 +77,16 @@ def happen(site: Site, name: str, rng: np.random.Generator) -> dict[str, Any]:
     print(json.dumps(found), flush=True)
     while len(site.workers) < most:
         site.add()
-        settle(site)
     while len(site.workers) > most:
         faults.leave(site, site.workers[0])
+    settle(site)
     return found
 
 
 def settle(site: Site) -> None:
-    """Wait until every aircraft has a holder that lives and a prediction."""
-    names = {worker.name for worker in site.workers}
-
-    def whole() -> bool:
-        held = site.reader.holders()
-        return len(held) == site.uavs and set(held.values()) == names
-
-    until(whole, 120.0, "a holder of every aircraft")
+    """Wait until every aircraft is held by its owner."""
+    wanted = owners(range(site.uavs), {worker.name: range(site.uavs) for worker in site.workers})
+    until(lambda: site.reader.holders() == wanted, 120.0, "a holder of every aircraft")
 
 
 def _run(args: argparse.Namespace) -> int:

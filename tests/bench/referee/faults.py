@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from twin_worker.claims.owner import owners
+
 from .site import Site, Worker, until
 
 _PATIENCE_S = 30.0
@@ -14,6 +16,12 @@ _AFTER_S = 2.0  # looked at after it is over [s]
 
 def _held(site: Site, worker: Worker) -> set[int]:
     return {uav for uav, name in site.reader.holders().items() if name == worker.name}
+
+
+def _own(site: Site, worker: Worker) -> set[int]:
+    """Give what a worker should hold."""
+    everyone = {one.name: range(site.uavs) for one in site.workers}
+    return {uav for uav, name in owners(range(site.uavs), everyone).items() if name == worker.name}
 
 
 def _wait(seconds: float) -> None:
@@ -56,7 +64,7 @@ def freeze(site: Site, worker: Worker, seconds: float = 5.0) -> dict[str, Any]:
 def _back(site: Site, worker: Worker) -> dict[str, Any]:
     """Wait until a worker that is back holds what it owns again; give the longest gap meanwhile."""
     begun = time.monotonic()
-    until(lambda: len(_held(site, worker)) > 0.5 * site.uavs / len(site.workers), _PATIENCE_S, "a worker that is back")
+    until(lambda: _held(site, worker) == _own(site, worker), _PATIENCE_S, "a worker that is back")
     took = time.monotonic() - begun
     _wait(1.0)
     uavs = set(range(site.uavs))
@@ -80,7 +88,7 @@ def join(site: Site, _: Worker) -> dict[str, Any]:
     begun_all = time.monotonic()
     worker = site.add()
     begun = time.monotonic()
-    until(lambda: len(_held(site, worker)) > 0.5 * site.uavs / len(site.workers), _PATIENCE_S, "aircraft for it")
+    until(lambda: _held(site, worker) == _own(site, worker), _PATIENCE_S, "aircraft for it")
     _wait(_AFTER_S)
     uavs = _held(site, worker)
     found = {"aircraft": len(uavs), "gap_s": site.reader.gap(uavs, min(begun, begun_all + 1.0))}
