@@ -35,6 +35,7 @@ LIMITS = {  # by fault: what is measured, and the most that is allowed
     "delay": {"owners_changed": 0},
     "blink": {"owners_changed": 0},
 }
+ANNOUNCED_S = 1.2  # after which everyone has said what it holds now [s]
 RANDOM = ("kill", "freeze", "leave", "join", "cut", "stall", "delay", "blink", "restart_router")
 
 
@@ -87,6 +88,7 @@ def settle(site: Site) -> None:
     """Wait until every aircraft is held by its owner."""
     wanted = owners(range(site.uavs), {worker.name: range(site.uavs) for worker in site.workers})
     until(lambda: site.reader.holders() == wanted, 120.0, "a holder of every aircraft")
+    faults.wait(ANNOUNCED_S)
 
 
 def _run(args: argparse.Namespace) -> int:

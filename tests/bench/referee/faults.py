@@ -24,7 +24,8 @@ def _own(site: Site, worker: Worker) -> set[int]:
     return {uav for uav, name in owners(range(site.uavs), everyone).items() if name == worker.name}
 
 
-def _wait(seconds: float) -> None:
+def wait(seconds: float) -> None:
+    """Let time pass."""
     end = time.monotonic() + seconds
     until(lambda: time.monotonic() >= end, seconds + 1.0, "time")
 
@@ -33,7 +34,7 @@ def _taken_over(site: Site, uavs: set[int], was: str, begun: float) -> dict[str,
     """Wait until others hold these; give how long that took and the longest gap."""
     until(lambda: site.reader.taken(uavs, begun, was) is not None, _PATIENCE_S, f"new owners of {len(uavs)} aircraft")
     taken = site.reader.taken(uavs, begun, was)
-    _wait(_AFTER_S)
+    wait(_AFTER_S)
     return {"aircraft": len(uavs), "taken_s": taken, "gap_s": site.reader.gap(uavs, begun)}
 
 
@@ -55,7 +56,7 @@ def freeze(site: Site, worker: Worker, seconds: float = 5.0) -> dict[str, Any]:
     worker.signal(signal.SIGSTOP)
     try:
         found = _taken_over(site, uavs, was, begun)
-        _wait(max(begun + seconds - time.monotonic(), 0.0))
+        wait(max(begun + seconds - time.monotonic(), 0.0))
     finally:
         worker.signal(signal.SIGCONT)
     return found | {"back": _back(site, worker)}
@@ -66,7 +67,7 @@ def _back(site: Site, worker: Worker) -> dict[str, Any]:
     begun = time.monotonic()
     until(lambda: _held(site, worker) == _own(site, worker), _PATIENCE_S, "a worker that is back")
     took = time.monotonic() - begun
-    _wait(1.0)
+    wait(1.0)
     uavs = set(range(site.uavs))
     return {"s": took, "gap_s": site.reader.gap(uavs, begun)}
 
@@ -89,7 +90,7 @@ def join(site: Site, _: Worker) -> dict[str, Any]:
     worker = site.add()
     begun = time.monotonic()
     until(lambda: _held(site, worker) == _own(site, worker), _PATIENCE_S, "aircraft for it")
-    _wait(_AFTER_S)
+    wait(_AFTER_S)
     uavs = _held(site, worker)
     found = {"aircraft": len(uavs), "gap_s": site.reader.gap(uavs, min(begun, begun_all + 1.0))}
     return found | _fits(uavs, fits, site.reader.rows())
@@ -109,11 +110,11 @@ def restart_router(site: Site, _: Worker, seconds: float = 1.0) -> dict[str, Any
     begun = time.monotonic()
     site.router_process.kill()
     site.router_process.wait()
-    _wait(seconds)
+    wait(seconds)
     site.open_router()
     away = time.monotonic() - begun
     until(lambda: len(site.reader.holders()) == len(before), _PATIENCE_S, "everyone's return")
-    _wait(3.0)
+    wait(3.0)
     after = site.reader.holders()
     moved = sum(after.get(uav) != name for uav, name in before.items())
     return {"away_s": away, "gap_s": site.reader.gap(set(before), begun), "owners_changed": moved}
@@ -125,7 +126,7 @@ def cut(site: Site, worker: Worker, seconds: float = 3.0) -> dict[str, Any]:
     begun = time.monotonic()
     worker.way.cut = True
     found = _taken_over(site, uavs, was, begun)
-    _wait(max(begun + seconds - time.monotonic(), 0.0))
+    wait(max(begun + seconds - time.monotonic(), 0.0))
     worker.way.cut = False
     return found | {"back": _back(site, worker)}
 
@@ -136,7 +137,7 @@ def stall(site: Site, worker: Worker, seconds: float = 3.0) -> dict[str, Any]:
     begun = time.monotonic()
     worker.way.stalled = True
     found = _taken_over(site, uavs, was, begun)
-    _wait(max(begun + seconds - time.monotonic(), 0.0))
+    wait(max(begun + seconds - time.monotonic(), 0.0))
     worker.way.stalled = False
     return found | {"back": _back(site, worker)}
 
@@ -145,9 +146,9 @@ def delay(site: Site, worker: Worker, seconds: float = 3.0) -> dict[str, Any]:
     """Let everything come 150 ms late for a while: nobody is dead."""
     before, begun = site.reader.holders(), time.monotonic()
     worker.way.delay_s = 0.15
-    _wait(seconds)
+    wait(seconds)
     worker.way.delay_s = 0.0
-    _wait(1.0)
+    wait(1.0)
     moved = sum(site.reader.holders().get(uav) != name for uav, name in before.items())
     return {"owners_changed": moved, "gap_s": site.reader.gap(set(before), begun)}
 
@@ -156,9 +157,9 @@ def blink(site: Site, worker: Worker) -> dict[str, Any]:
     """Stop a worker for less than its lease."""
     before, begun = site.reader.holders(), time.monotonic()
     worker.signal(signal.SIGSTOP)
-    _wait(0.5)
+    wait(0.5)
     worker.signal(signal.SIGCONT)
-    _wait(2.0)
+    wait(2.0)
     moved = sum(site.reader.holders().get(uav) != name for uav, name in before.items())
     return {"owners_changed": moved, "gap_s": site.reader.gap(set(before), begun)}
 
