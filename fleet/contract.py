@@ -5,7 +5,7 @@
     parauav/{uav}/status                 Status       gateway  link, mode, rates, losses (1 Hz and on change)
     parauav/{uav}/mission                Mission      gateway  the route on board and the item in force
     parauav/{uav}/params                 Params       gateway  autopilot parameters
-    parauav/{uav}/history                History      gateway  only answers: the last minute of one aircraft
+    parauav/{uav}/history                History      gateway  only answers: the last minutes of one aircraft
     parauav/{uav}/model                  Model        worker   identified model with its verdict
     parauav/{uav}/prediction             Prediction   worker   mean path, tube, horizon; also answers queries
     parauav/{uav}/mismatch               Mismatch     worker   where, what physics, fit before and after; queries too
