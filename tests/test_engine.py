@@ -11,6 +11,7 @@ import pytest
 from fleet.contract import Array, Prediction, Sample
 from fleet.frames import to_geodetic
 from twin_worker.engine import quota as clocked
+from twin_worker.engine.learner import Learner
 from twin_worker.engine.pace import Pace, Work, read_pace
 from twin_worker.engine.quota import Quota
 from twin_worker.engine.rates import OVER_S, Rates
@@ -59,6 +60,16 @@ def test_who_has_no_prediction_yet_comes_first_and_without_a_limit_nobody_waits(
     assert free.grants(Work.ENSEMBLE)
     free.aside = frozenset({Work.IDENTIFY})
     assert not free.grants(Work.IDENTIFY)
+
+
+def test_identification_yields_to_late_telemetry_and_never_starves() -> None:
+    learner = Learner(list, lambda *_: None, Rates())
+    assert learner.rest(0.2) == 0.0
+    learner.yield_to_telemetry(late=True)
+    assert learner.rest(0.2) == pytest.approx(0.2)
+    for _ in range(1000):
+        learner.yield_to_telemetry(late=True)
+    assert 0.2 < learner.rest(0.05) < 0.5 and learner.rest(5.0) <= 1.0
 
 
 def test_what_is_shed_is_said() -> None:

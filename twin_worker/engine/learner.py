@@ -16,7 +16,8 @@ from twin_worker.twin import identify, identify_due
 _log = logging.getLogger(__name__)
 _IDLE_S = 0.05
 _NICE = 10  # how far it yields to what predicts, in this process and in others
-_LEAST, _GROWS = 0.05, 1.2  # share of its time that it may work: never less, and how it recovers after a pause [-]
+_LEAST, _GROWS = 0.1, 1.2  # share of its time that it may work: never less, and how it recovers after a pause [-]
+_REST_S = 1.0  # it pauses no longer, however long it worked: at any pace everyone's turn comes [s]
 Publish = Callable[[Message, Held], None]
 
 
@@ -39,12 +40,16 @@ class Learner:
         """Work less where telemetry is late; every piece of work after that may be followed sooner by the next."""
         self._share = max(0.5 * self._share, _LEAST) if late else self._share
 
+    def rest(self, worked: float) -> float:
+        """Give how long to pause after so long a piece of work [s]; after none it looks again soon."""
+        return min(worked * (1.0 / self._share - 1.0), _REST_S) if worked else _IDLE_S
+
     def run(self, stop: threading.Event) -> None:
         """Identify until told to stop."""
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         worked = 0.0
-        while not stop.wait(max(worked * (1.0 / self._share - 1.0), 0.0 if worked else _IDLE_S)):
+        while not stop.wait(self.rest(worked)):
             held = self._next()
             begun = time.monotonic()
             if held is None:
