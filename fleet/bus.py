@@ -46,7 +46,7 @@ class ZenohBus(AbstractContextManager):
         self.bad = 0
         self._session = session
         self._declared: list[Any] = []
-        self._publishers: dict[str, Any] = {}
+        self._publishers: dict[tuple[type, int], Any] = {}
         self._lock = threading.Lock()
 
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
@@ -56,13 +56,13 @@ class ZenohBus(AbstractContextManager):
 
     def put(self, wire: Wire, stamp: Stamp | None = None) -> None:
         """Send one message that is packed already."""
-        name = key(wire.kind, wire.uav if wire.kind in PER_UAV else f"{self.writer:016x}")
-        publisher = self._publishers.get(name)
+        publisher = self._publishers.get((wire.kind, wire.uav))
         if publisher is None:
             with self._lock:
-                if (publisher := self._publishers.get(name)) is None:
+                if (publisher := self._publishers.get((wire.kind, wire.uav))) is None:
+                    name = key(wire.kind, wire.uav if wire.kind in PER_UAV else f"{self.writer:016x}")
                     publisher = self._session.declare_publisher(name, encoding=encoding(wire.kind), **_care(wire.kind))
-                    self._publishers[name] = publisher
+                    self._publishers[wire.kind, wire.uav] = publisher
         publisher.put(wire.payload, attachment=pack_stamp(stamp) if stamp else None)
 
     @property

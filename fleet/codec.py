@@ -1,5 +1,6 @@
 """Messages to bytes and back: msgpack maps, a version in the encoding, an attachment of epoch and writer."""
 
+import math
 import struct
 from typing import Any, NamedTuple, TypeVar
 
@@ -26,6 +27,7 @@ class Wire(NamedTuple):
     kind: type  # from `fleet.contract`
     uav: int
     payload: bytes
+    t: float = math.nan  # what the message says of it, where that is known [s since 1970]
 
     def message(self) -> Any:
         """Unpack it."""

@@ -3,7 +3,9 @@
 import contextlib
 import threading
 from collections import deque
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from math import isfinite
+from typing import Any
 
 import msgspec
 
@@ -16,28 +18,28 @@ MOST = 512 << 20  # bytes over all aircraft; beyond, everybody's past becomes sh
 KINDS = (Sample, Status)
 
 
-class _Said(NamedTuple):
-    t: float  # fleet time [s since 1970]
-    kind: type
-    payload: bytes
-
-
 class _Past:
-    """What one aircraft said."""
+    """What one aircraft said: (fleet time [s since 1970], bytes), oldest first, by kind."""
 
-    def __init__(self) -> None:
-        self.said: deque[_Said] = deque()
+    def __init__(self, since: float) -> None:
+        self.said: dict[type, deque[tuple[float, bytes]]] = {kind: deque() for kind in KINDS}
         self.size = 0
-        self.since = 0.0  # nothing after it is left out [s since 1970]
+        self.since = since  # nothing after it is left out [s since 1970]
 
     def trim(self, before: float, most: int) -> int:
         """Forget what is older than `before` [s since 1970] or beyond `most` bytes; gives how much shorter it is."""
         size = self.size
-        while self.said and (self.said[0].t < before or self.size > most):
-            gone = self.said.popleft()
-            self.size -= len(gone.payload)
-            self.since = max(self.since, gone.t)
+        for said in self.said.values():
+            while said and said[0][0] < before:
+                self._forget(said)
+        while self.size > most:
+            self._forget(min(filter(None, self.said.values()), key=lambda said: said[0][0]))
         return size - self.size
+
+    def _forget(self, said: deque[tuple[float, bytes]]) -> None:
+        t, payload = said.popleft()
+        self.size -= len(payload)
+        self.since = max(self.since, t)
 
 
 class Keeper:
@@ -54,21 +56,26 @@ class Keeper:
         self._pasts: dict[int, _Past] = {}
         self._lock = threading.Lock()  # questions come on a thread of the bus
 
-    def keep(self, wire: Wire, t: float) -> None:
-        """Remember a packed message about fleet time `t` [s since 1970]."""
-        if wire.kind not in KINDS:
-            return
+    def keep(self, wires: Iterable[Wire]) -> None:
+        """Remember packed messages; those that do not say when they are of are left out."""
         with self._lock:
-            past = self._pasts.get(wire.uav)
-            if past is None:
-                past = self._pasts[wire.uav] = _Past()
-                past.since = t
-                self.size -= sum(
-                    one.trim(float("-inf"), self._most // len(self._pasts)) for one in self._pasts.values()
-                )
-            past.said.append(_Said(t, wire.kind, wire.payload))
-            past.size += len(wire.payload)
-            self.size += len(wire.payload) - past.trim(t - self._seconds, self._most // len(self._pasts))
+            for wire in wires:
+                if wire.kind in KINDS and isfinite(wire.t):
+                    self._keep(wire)
+
+    def _keep(self, wire: Wire) -> None:
+        past = self._pasts.get(wire.uav)
+        if past is None:
+            past = self._pasts[wire.uav] = _Past(wire.t)
+            self.size -= sum(one.trim(float("-inf"), self._share) for one in self._pasts.values())
+        size = len(wire.payload)
+        past.said[wire.kind].append((wire.t, wire.payload))
+        past.size += size
+        self.size += size - past.trim(wire.t - self._seconds, self._share)
+
+    @property
+    def _share(self) -> int:
+        return self._most // len(self._pasts)
 
     def answer(self, uav: int | None, settings: dict[str, str], payload: bytes) -> Answers:
         """Answer a question on the bus.
@@ -86,14 +93,13 @@ class Keeper:
             seconds = float(settings.get("seconds", seconds))
         with self._lock:
             past = self._pasts.get(uav)
-            if past is None or not past.said:
+            if past is None or not any(past.said.values()):
                 return []
-            said, since = list(past.said), past.since
-        newest = said[-1].t
+            said, since = {kind: list(told) for kind, told in past.said.items()}, past.since
+        newest = max(told[-1][0] for told in said.values() if told)
         first = newest - seconds
         told: dict[type, tuple[Any, ...]] = {
-            kind: tuple(msgspec.Raw(one.payload) for one in said if one.kind is kind and one.t >= first)
-            for kind in KINDS
+            kind: tuple(msgspec.Raw(payload) for t, payload in mine if t >= first) for kind, mine in said.items()
         }
         since = max(since, first)
         return [(History(uav=uav, t=newest, since=since, samples=told[Sample], statuses=told[Status]), None)]

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,7 @@ from fleet.bus import Answers, Bus
 from fleet.codec import Stamp, Wire, encode
 from fleet.contract import PER_UAV, Account, Alert, AlertKind, FleetState, History, Mission, Params, Status
 from fleet.telemetry.fleet_news import RESULTS
-from gateway.history import KINDS, Keeper
+from gateway.history import Keeper
 from gateway.router import Way
 
 KEPT = (Status, Mission, Params, Alert)
@@ -20,13 +20,6 @@ REPEAT_S = 10.0  # mission and parameters are said again, for those who missed t
 
 
 Told = tuple[Account | None, list[Status]]
-
-
-class _When(msgspec.Struct):
-    t: float
-
-
-_WHEN = msgspec.msgpack.Decoder(_When)
 
 
 class Publisher:
@@ -58,22 +51,21 @@ class Publisher:
             if kind in RESULTS and getattr(message, "kind", None) is not AlertKind.SECOND_SENDER:
                 message, stamp = self._claimed(message)
             self._keep(kind, (getattr(message, "uav", 0), str(getattr(message, "kind", ""))), message, stamp)
-            wire = Wire(kind, message.uav if kind in PER_UAV else -1, encode(message))
-            self.history.keep(wire, message.t)
-            self.way.send(wire, stamp)
+            wire = Wire(kind, message.uav if kind in PER_UAV else -1, encode(message), message.t)
+            self.history.keep([wire])
+            self.way.send([wire], stamp)
 
-    def put(self, wires: Iterable[Wire]) -> None:
+    def put(self, wires: Sequence[Wire]) -> None:
         """Put messages on the bus that are packed already; results of workers are never among them."""
         for wire in wires:
             self._keep(wire.kind, (wire.uav, ""), wire, None)
-            if wire.kind in KINDS:
-                self.history.keep(wire, _WHEN.decode(wire.payload).t)
-            self.way.send(wire)
+        self.history.keep(wires)
+        self.way.send(wires)
 
     def account(self, account: Account) -> None:
         """Put the counters on the bus."""
         self.told = account
-        self.way.send(Wire(Account, -1, encode(account)))
+        self.way.send([Wire(Account, -1, encode(account))])
 
     def newest(self) -> Told:
         """Give the newest counters, and the newest status of every aircraft by id."""

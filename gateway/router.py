@@ -3,7 +3,7 @@
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from fleet.bus import Bus
 from fleet.codec import Stamp, Wire
@@ -51,10 +51,11 @@ class Way:
             self._marks.popleft()
         return came
 
-    def send(self, wire: Wire, stamp: Stamp | None = None) -> None:
-        """Send one message, or count that nobody was there."""
-        if self._router:
+    def send(self, wires: Sequence[Wire], stamp: Stamp | None = None) -> None:
+        """Send messages, or count that nobody was there."""
+        if not self._router:
+            self.unsent += len(wires)
+            return
+        for wire in wires:
             self._bus.put(wire, stamp)
-            self.published += 1
-        else:
-            self.unsent += 1
+        self.published += len(wires)

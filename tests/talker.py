@@ -58,7 +58,7 @@ class Ears:
 
     def feed(self, data: bytes) -> list:
         frames = self.decoder.feed(Heard.of([(T0, None, data)]))
-        return [frames.message(i) for i in range(len(frames.at))]
+        return frames.messages(np.arange(len(frames.at)))
 
 
 def of(kind, messages, uav=None) -> list:

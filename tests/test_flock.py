@@ -104,12 +104,12 @@ def test_counts_go_with_time_and_wrap():
     counts.note(np.array([0, 1, 0, 0, 1, 1]), np.array([0, 0, 1, 1, 1, 1]), T0 + np.arange(6.0), seq)
     counts.upto(T0 + 3)
     assert counts.state[:, [RECEIVED, MISSED, SPOKE]].tolist() == [[3, 1, T0 + 3], [1, 0, T0 + 1]]
-    assert (counts.measured(0), counts.measured(0), counts.measured(1)) == ({"a": 1, "b": 2}, {}, {"a": 1})
+    assert (counts.rates(0, np.inf), counts.rates(1, 2.0), counts.rates(1, 1.0)) == ({}, {"a": 0.5}, {"a": 0.3})
     counts.upto(T0 + 9)
     assert counts.state[1, [RECEIVED, MISSED]].tolist() == [3, 3]
     counts.note(np.array([0]), counts.numbers(["c"]), np.array([T0 + 10]), None)
     counts.upto(T0 + 10)
-    assert counts.measured(0) == {"c": 1} and counts.state[0, MISSED] == 1
+    assert counts.rates(0, 2.0) == {"c": 0.5} and counts.state[0, MISSED] == 1
 
 
 def test_a_tick_of_many_gives_each_what_it_gives_alone():

@@ -43,7 +43,7 @@ def test_a_late_joiner_gets_what_was_published_in_order_and_no_more_than_was_ask
 
 def test_messages_packed_already_are_kept_too():
     publisher = Publisher(MemoryBus())
-    publisher.put([Wire(Sample, 3, encode(sample(3, T0 + k))) for k in range(200)])
+    publisher.put([Wire(Sample, 3, encode(sample(3, T0 + k)), T0 + k) for k in range(200)])
     (past,) = told(publisher.history, 3)
     assert len(past.samples) == 161 and past.t == T0 + 199
 
@@ -52,7 +52,7 @@ def test_memory_is_bounded_whatever_comes_and_what_is_left_out_is_said():
     keeper = Keeper(most=200_000)
     for k in range(2000):
         for uav in range(1 + k // 500):
-            keeper.keep(Wire(Sample, uav, bytes(500)), T0 + 0.01 * k)
+            keeper.keep([Wire(Sample, uav, bytes(500), T0 + 0.01 * k)])
             assert keeper.size <= 200_000
     assert keeper.size == 4 * 100 * 500
     (first, _), *_ = keeper.answer(0, {}, b"")

@@ -37,7 +37,7 @@ def test_every_message_is_published_unsent_or_unsure_and_the_way_back_is_noticed
             now[0] += 0.1
             came.append(way.look())
             for _ in range(3):
-                way.send(STATUS)
+                way.send([STATUS])
         return came
 
     assert not any(fly(10.0))

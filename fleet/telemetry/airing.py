@@ -146,11 +146,10 @@ class Airing:
     def _meet(self, frames: Frames) -> None:
         """Learn which aircraft there are; give them and their copies system ids."""
         new: set[int] = set()
-        for i in np.flatnonzero(frames.at[:, ID] == IDS["HEARTBEAT"]).tolist():
-            system = int(frames.at[i, SYSTEM])
-            if system not in self._systems and system not in new and system:
-                message = frames.message(i)
-                new.update([system] if message is not None and is_aircraft(message) else [])
+        for heartbeat in frames.messages(np.flatnonzero(frames.at[:, ID] == IDS["HEARTBEAT"])):
+            system = heartbeat.get_srcSystem()
+            if system not in self._systems and system and is_aircraft(heartbeat):
+                new.add(system)
         cast = {system: [self._ids.give((self, system, 0), system)] for system in sorted(new)}
         for copy in range(1, len(self._numbers)):
             for system, mine in cast.items():

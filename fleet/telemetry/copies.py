@@ -132,7 +132,7 @@ class Copies:
             told = one.copies(group)
         kind = type(message)
         for uav, payload in zip(ids.tolist(), told, strict=True):
-            yield Wire(kind, uav, payload)
+            yield Wire(kind, uav, payload, message.t + group.lag_s)
 
     def _one_by_one(self, message: Message, group: Group) -> list[bytes]:
         """Pack every copy by itself: of a mission, and of what names the aircraft in its sentence; both are rare."""

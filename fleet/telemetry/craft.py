@@ -16,7 +16,6 @@ from fleet.telemetry.timing import Timing
 LOST_S = 3.0  # silence after which the link is called lost [s]
 STATUS_S = 0.95  # between two messages; a little under the second, for it is asked every 0.1 s [s]
 REMEMBER_S = 30.0  # how long a sentence stands [s]
-SMOOTH = 0.4  # weight of the newest second in a rate
 SEVERE = 3  # texts up to this severity are an operator's business (MAV_SEVERITY_ERROR)
 MOST_TEXTS = 2_000
 
@@ -35,12 +34,13 @@ class Craft:
         self.uav, self.system, self.component, self.source = uav, system, component, source
         self.flock, self.number = flock, flock.add(uav)
         self.link = Link.LIVE
-        self.autopilot, self.vehicle, self.mode, self.armed = "generic", heartbeat.UNKNOWN, "", False
+        self.autopilot, self.mode, self.armed = "generic", "", False
+        self.kind = heartbeat.UNKNOWN  # of vehicle, as its heartbeat tells
         self.firmware = ""
         self.board = ""  # the autopilot's own number and version; empty: not told
         self.texts: deque[tuple[float, int, str]] = deque(maxlen=MOST_TEXTS)  # fleet time, severity, words
         self.params, self.route = ParamBook(uav), RouteBook(uav)
-        self.rates: dict[str, float] = {}
+        self._rates: dict[str, float] = {}
         self.timing = Timing(lambda: flock.clocks[self.number])
         self._waiting: list[tuple[float, Callable[..., None], tuple[Any, ...]]] = []
         self._done = 0  # of those waiting
@@ -49,6 +49,12 @@ class Craft:
         self._jumps = 0
         self._told: tuple[Any, ...] = ()
         self._told_at = float("-inf")
+
+    @property
+    def vehicle(self) -> str:
+        """Name the kind of vehicle; ArduPlane calls itself a fixed wing also where it can hover."""
+        hovers = self.kind == heartbeat.FIXED_WING and self.params.values.get("Q_ENABLE", 0.0) > 0
+        return heartbeat.QUADPLANE if hovers else self.kind
 
     @property
     def heard(self) -> float:
@@ -72,6 +78,7 @@ class Craft:
         self._waiting.append((arrival, what, arguments))
         if not in_order:
             self._waiting.sort(key=lambda waiting: waiting[0])
+        self.flock.look[self.number] = min(arrival, self.flock.look[self.number])
 
     def take(self, now: float) -> list[Status | Mission | Params]:
         """Hand over what is new at `now` [s since 1970] and no row: route, parameters, status."""
@@ -80,7 +87,15 @@ class Craft:
             self._done += 1
             what(*arguments, arrival)
         found = (self.route.take(now), self.params.take(now), self._status(now))
+        self.flock.look[self.number] = self._next(now)
         return [message for message in found if message is not None]
+
+    def _next(self, now: float) -> float:
+        """Tell when to look again at the latest, `now` where the link is lost [s since 1970]."""
+        if self.link is Link.LOST:
+            return now
+        queued = self._waiting[self._done][0] if self._done < len(self._waiting) else float("inf")
+        return min(queued, self._told_at + STATUS_S, float(self.flock.counts.state[self.number, SPOKE]) + LOST_S)
 
     def say(self, sentence: str, now: float) -> None:
         """Leave a sentence for the operator; it stands for half a minute."""
@@ -88,14 +103,14 @@ class Craft:
 
     def meet(self, message: Any) -> None:
         """Learn from a heartbeat what speaks here."""
-        self.autopilot, self.vehicle = heartbeat.autopilot(message), heartbeat.vehicle(message)
+        self.autopilot, self.kind = heartbeat.autopilot(message), heartbeat.vehicle(message)
 
     def hear(self, message: Any, now: float) -> None:
         """Take one MAVLink message that is no row."""
         name = message.get_type()
         if name == "HEARTBEAT":
             self.meet(message)
-            self._fly(heartbeat.mode(message), heartbeat.armed(message))
+            self.mode, self.armed = heartbeat.mode(message), heartbeat.armed(message)
         elif name == "PARAM_VALUE":
             self.params.hear(message, self.autopilot, now)
         elif name in MESSAGES:
@@ -116,9 +131,9 @@ class Craft:
     def told(self, said: Said, now: float) -> None:
         """Take what an onboard log says that is no row."""
         if said.what == "mode":
-            self._fly(said.value, self.armed)
+            self.mode = said.value
         elif said.what == "armed":
-            self._fly(self.mode, said.value)
+            self.armed = said.value
         elif said.what == "param":
             self.params.put(*said.value)
         elif said.what == "mission":
@@ -131,11 +146,6 @@ class Craft:
         """Count rows whose values cannot be."""
         self._refused += count
         self.say(f"{name} with a value that is not finite or out of range was refused; check the sensor", now)
-
-    def _fly(self, mode: str, armed: bool) -> None:
-        self.mode, self.armed = mode, armed
-        if self.vehicle == heartbeat.FIXED_WING and self.params.values.get("Q_ENABLE", 0.0) > 0:
-            self.vehicle = heartbeat.QUADPLANE  # ArduPlane calls itself a fixed wing all the same
 
     def _read(self, severity: int, words: str, now: float) -> None:
         self.texts.append((now, severity, words))
@@ -159,7 +169,7 @@ class Craft:
         if state == self._told and 0 <= passed < STATUS_S:
             return None
         if not 0 <= passed < STATUS_S:
-            self._measure(passed)
+            self._rates = self.flock.counts.rates(self.number, passed)
             self._told_at = now
         self._told = state
         return Status(
@@ -170,7 +180,7 @@ class Craft:
             armed=self.armed,
             autopilot=self.autopilot,
             vehicle=self.vehicle,
-            rates_hz={name: round(hz, 2) for name, hz in self.rates.items() if hz > 0.005},
+            rates_hz=self._rates,
             received=int(counted[RECEIVED]),
             missed=int(counted[MISSED]),
             rejected=self._rejected(),
@@ -182,13 +192,6 @@ class Craft:
     def _rejected(self) -> int:
         flood = int(self.flock.shelves.refused[self.number])
         return self._refused + flood + self.params.rejected + self.route.rejected
-
-    def _measure(self, passed: float) -> None:
-        counts = self.flock.counts.measured(self.number)
-        if 0 < passed < float("inf"):
-            for name in {**self.rates, **counts}:
-                hz = counts.get(name, 0) / passed
-                self.rates[name] = hz if name not in self.rates else (1 - SMOOTH) * self.rates[name] + SMOOTH * hz
 
     def _words(self, now: float) -> str:
         if self.link is Link.LOST:

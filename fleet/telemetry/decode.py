@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from fleet.telemetry import scan as s
 from fleet.telemetry.deal import deal, gather
 from fleet.telemetry.heard import Heard, tight
+from fleet.telemetry.objects import objects
 
 MOST_SENDERS = 512  # addresses whose cut frames are remembered on one link
 _NAMES = {number: kind.msgname for number, kind in dialect.mavlink_map.items()}
@@ -28,13 +29,17 @@ class Frames(NamedTuple):
     sender: np.ndarray  # number of the sender in `senders`, (n,)
     senders: tuple[Hashable, ...] = (None,)
 
-    def message(self, i: int) -> Any | None:
-        """Give frame `i` as pymavlink would; None where it cannot be one, e.g. text that is no text."""
-        frame = bytearray(self.buf[self.at[i, s.START] : self.at[i, s.STOP]].tobytes())
-        try:
-            return _PARSER.decode(frame)
-        except (dialect.MAVError, ValueError, IndexError):
-            return None
+    def messages(self, which: np.ndarray) -> list[Any]:
+        """Give frames, by number, as pymavlink would, (k,)."""
+        found: list[Any] = [None] * len(which)
+        numbers = self.at[which, s.ID]
+        for number in np.unique(numbers).tolist():
+            mine = np.flatnonzero(numbers == number)
+            said, name = which[mine], _NAMES[number]
+            who = self.at[said][:, [s.SYSTEM, s.COMPONENT]].T.tolist()
+            for k, one in zip(mine.tolist(), objects(name, self.fields(said, name).rows, *who), strict=True):
+                found[k] = one
+        return found
 
     def only(self, which: np.ndarray) -> "Frames":
         """Give some of the frames, by number or by mask."""
@@ -49,9 +54,6 @@ class Frames(NamedTuple):
     def dealt(self) -> "Dealt":
         """Sort all frames by message."""
         return Dealt(self)
-
-
-_PARSER = dialect.MAVLink(None)
 
 
 def joined(parts: Sequence[Frames]) -> Frames:

@@ -18,7 +18,7 @@ from fleet.telemetry.flock.flock import Flock
 from fleet.telemetry.heard import Heard, merged
 from fleet.telemetry.heartbeat import is_aircraft
 from fleet.telemetry.route import MESSAGES
-from fleet.telemetry.scan import COMPONENT, EXTRA, ID, PAYLOAD, SEQ, SIZE, SYSTEM
+from fleet.telemetry.scan import COMPONENT, EXTRA, ID, SEQ, SYSTEM
 from fleet.telemetry.timing import time
 
 MOST_UAVS = 2_000  # over all links
@@ -31,9 +31,6 @@ EARLY = MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # said once, so worth keepi
 SINGLE = np.zeros(len(EXTRA), bool)  # by message id: heard one by one; all others are rows, or only counted
 SINGLE[[IDS[name] for name in (*EARLY, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
 SINGLE[IDS["MISSION_CURRENT"]] = True  # a row too
-OFTEN = np.zeros(len(EXTRA), bool)  # of those: said again and again, and mostly the same
-OFTEN[[IDS["HEARTBEAT"], IDS["MISSION_CURRENT"]]] = True
-MOST_OFTEN = 4096  # messages of that kind remembered
 Claims = dict[int, Craft]
 """Which aircraft holds a UAV id, over all links of a gateway."""
 Admit = Callable[[Frames, Counter[str]], Frames]
@@ -60,7 +57,6 @@ class Intake:
         self.flock = Flock(KINDS)
         self._claims: Claims = {} if claims is None else claims
         self._speakers = np.full(1 << 16, -1)  # number of the aircraft by system and component
-        self._often: dict[tuple[Any, ...], Any] = {}
         self._most, self._admit = most, admit
         self._heard: list[Heard] = []
         self._sorted: list[Frames] = []  # admitted, not yet digested
@@ -113,15 +109,14 @@ class Intake:
 
     def overhear(self, frames: Frames) -> None:
         """Take what ground stations said to the aircraft of this link; nobody is met here, and nobody taken over."""
-        which = np.flatnonzero(SINGLE[frames.at[:, ID]]).tolist()
-        if which:
+        which = np.flatnonzero(SINGLE[frames.at[:, ID]])
+        if len(which):
             self._digest_sorted()  # who is spoken to may just have been heard for the first time
-        for i in which:
-            system, component = frames.at[i, (SYSTEM, COMPONENT)].tolist()
-            craft, arrival, message = self.crafts.get(system), float(frames.arrival[i]), frames.message(i)
-            if craft is not None and craft.component == component:
+        for i, message in zip(which.tolist(), frames.messages(which), strict=True):
+            craft, arrival = self.crafts.get(message.get_srcSystem()), float(frames.arrival[i])
+            if craft is not None and craft.component == message.get_srcComponent():
                 self._alarm(craft, arrival, frames.senders[frames.sender[i]])
-            elif message is not None and message.get_type() in MESSAGES:
+            elif message.get_type() in MESSAGES:
                 target = self.crafts.get(getattr(message, "target_system", 0))
                 if target is not None:
                     target.queue(arrival, target.overhear, message)
@@ -145,22 +140,24 @@ class Intake:
 
     def _take(self, now: float) -> list[News | Wire]:
         news: list[News | Wire] = [alert for one in self._collisions.values() for alert in one.take(now)]
-        samples = self.flock.take(now)
-        for craft in self.crafts.values():
+        samples, crafts, due = self.flock.take(now), list(self.crafts.values()), set(self.flock.due(now))
+        for number in sorted(due.union(samples)):
+            craft = crafts[number]
             if self._claims.get(craft.uav) is craft:
-                if craft.number in samples:
-                    news.append(samples[craft.number])
-                news += craft.take(now)
+                if number in samples:
+                    news.append(samples[number])
+                if number in due:
+                    news += craft.take(now)
         return news
 
     def digest(self, frames: Frames) -> None:
         """Work through a batch of frames; what they say is handed over by `take`."""
         if not len(frames.at):
             return
-        for i in np.flatnonzero(SINGLE[frames.at[:, ID]]).tolist():
-            message = self._single(frames, i)
-            if message is not None:
-                self._route(i, float(frames.arrival[i]), message, frames.senders[frames.sender[i]])
+        which = np.flatnonzero(SINGLE[frames.at[:, ID]])
+        said = (which.tolist(), frames.arrival[which].tolist(), frames.messages(which), frames.sender[which].tolist())
+        for i, arrival, message, sender in zip(*said, strict=True):
+            self._route(i, arrival, message, frames.senders[sender])
         owner = self._owners(frames)
         self._born.clear()
         mine = np.flatnonzero(owner >= 0)
@@ -168,18 +165,6 @@ class Intake:
             self.flock.counts.note(owner[mine], kinds(frames)[mine], frames.arrival[mine], frames.at[mine, SEQ])
             lay(frames, owner, list(self.crafts.values()), self.flock)
             time(frames, owner, [craft.timing for craft in self.crafts.values()])
-
-    def _single(self, frames: Frames, i: int) -> Any | None:
-        """Give frame `i` as pymavlink would; what is said over and over is read once."""
-        payload, size, number = frames.at[i, [PAYLOAD, SIZE, ID]].tolist()
-        if not OFTEN[number]:
-            return frames.message(i)
-        said = (*frames.at[i, [SYSTEM, COMPONENT]].tolist(), number, frames.buf[payload : payload + size].tobytes())
-        if said not in self._often:
-            if len(self._often) >= MOST_OFTEN:
-                self._often.clear()
-            self._often[said] = frames.message(i)
-        return self._often[said]
 
     def _owners(self, frames: Frames) -> np.ndarray:
         """Tell whose each frame is: number of the aircraft, -1: nobody's, (n,)."""

@@ -18,7 +18,7 @@ UNDATED_S = 946_684_800.0  # 2000-01-01, where a log never heard of the date [s 
 def craft_of(log: OnboardLog, offset: int) -> Craft:
     """Make the aircraft that wrote this log; UAV id = its MAVLink system id + `offset`."""
     craft = Craft(Flock(), log.system + offset, log.system, 1)
-    craft.autopilot, craft.vehicle, craft.firmware = log.autopilot, log.vehicle, log.firmware
+    craft.autopilot, craft.kind, craft.firmware = log.autopilot, log.vehicle, log.firmware
     return craft
 
 

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import numba as nb
 import numpy as np
 
+SMOOTH = 0.4  # weight of the newest stretch in a rate
+LEAST_HZ = 0.005  # slower is not told [Hz]
 NOBODY = -1.0  # sequence number before any message
 
 HEARD, SPOKE, RECEIVED, MISSED, MISSING, SEQ, COLUMNS = range(7)
@@ -21,8 +23,10 @@ class Counts:
 
     def __init__(self, names: Sequence[str] = ()) -> None:
         self.state = np.empty((0, COLUMNS))  # a row per aircraft
-        self._kinds = np.empty((0, len(names)), np.int64)  # since the last `measured`
+        self._kinds = np.empty((0, len(names)), np.int64)  # since the last `rates`
+        self._hz = np.empty((0, len(names)))  # of each kind, smoothed; nan: never heard
         self._number = {name: k for k, name in enumerate(names)}
+        self._names = list(names)
         self._waiting = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0))
 
     def add(self) -> None:
@@ -30,12 +34,14 @@ class Counts:
         new = np.array([[-np.inf, -np.inf, 0.0, 0.0, 0.0, NOBODY]])
         self.state = np.concatenate([self.state, new])
         self._kinds = np.concatenate([self._kinds, np.zeros((1, len(self._number)), np.int64)])
+        self._hz = np.concatenate([self._hz, np.full((1, len(self._number)), np.nan)])
 
     def numbers(self, names: Sequence[str]) -> np.ndarray:
         """Number kinds by name, new ones too, (n,)."""
         found = np.array([self._number.setdefault(name, len(self._number)) for name in names], np.int64)
-        more = len(self._number) - self._kinds.shape[1]
-        self._kinds = np.pad(self._kinds, ((0, 0), (0, more)))
+        more = ((0, 0), (0, len(self._number) - self._kinds.shape[1]))
+        self._kinds, self._hz = np.pad(self._kinds, more), np.pad(self._hz, more, constant_values=np.nan)
+        self._names = list(self._number)
         return found
 
     def note(self, owner: np.ndarray, kind: np.ndarray, arrival: np.ndarray, seq: np.ndarray | None) -> None:
@@ -57,14 +63,22 @@ class Counts:
         if len(self._waiting[0]) and (done := _count(self.state, self._kinds, *self._waiting, now)):
             self._waiting = tuple(one[done:] for one in self._waiting)  # type: ignore[assignment]
 
-    def measured(self, number: int) -> dict[str, int]:
-        """Give how many messages of each kind were counted since this was last asked for one aircraft."""
-        row = self._kinds[number]
-        found = np.flatnonzero(row)
-        names = list(self._number) if len(found) else []
-        counts = {names[k]: n for k, n in zip(found.tolist(), row[found].tolist(), strict=True)}
-        row[found] = 0
-        return counts
+    def rates(self, number: int, passed: float) -> dict[str, float]:
+        """Give how often each kind comes from one aircraft [Hz], smoothed; `passed` since this was last asked [s]."""
+        found = _smooth(self._kinds[number], self._hz[number], passed)
+        names = self._names
+        return {names[k]: round(hz, 2) for k, hz in zip(found.tolist(), self._hz[number][found].tolist(), strict=True)}
+
+
+@nb.njit(cache=True, nogil=True)
+def _smooth(kinds, hz, passed):
+    """Take counts up into rates, unless the time passed is none; gives the kinds worth telling."""
+    for k in range(len(kinds)):
+        if 0 < passed < np.inf and (kinds[k] or not np.isnan(hz[k])):
+            new = kinds[k] / passed
+            hz[k] = new if np.isnan(hz[k]) else (1 - SMOOTH) * hz[k] + SMOOTH * new
+        kinds[k] = 0
+    return np.flatnonzero(hz > LEAST_HZ)
 
 
 @nb.njit(cache=True, nogil=True)

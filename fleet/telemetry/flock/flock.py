@@ -45,12 +45,14 @@ class Flock:
     def __init__(self, names: Sequence[str] = ()) -> None:
         self.counts, self.shelves = Counts(names), Shelves()
         self.clocks = np.empty((0, *clock.new_clocks().shape))
+        self.look = np.empty(0)  # when each has something to tell beside rows, at the latest (m,) [s since 1970]
         self._memory = np.empty((0, *new_memory().shape))
 
     def add(self, uav: int) -> int:
         """Take in one more aircraft; gives its number."""
         self.counts.add()
         self.shelves.add(uav)
+        self.look = np.append(self.look, -np.inf)
         self.clocks = np.concatenate([self.clocks, clock.new_clocks()[None]])
         self._memory = np.concatenate([self._memory, new_memory()[None]])
         return len(self.clocks) - 1
@@ -80,8 +82,12 @@ class Flock:
         wide = np.pad(x, ((0, 0), (0, WIDEST - x.shape[1])))
         self.shelves.lay(np.full(len(t), number * len(FIELDS) + FIELDS.index(field)), t, t, wide)
 
+    def due(self, now: float) -> list[int]:
+        """Number the aircraft that have something to tell beside rows, at `now` [s since 1970]."""
+        return np.flatnonzero(self.look <= now).tolist()
+
     def take(self, now: float) -> dict[int, Wire]:
         """Hand over the samples of what was heard up to `now` [s since 1970], by number of the aircraft."""
         self.counts.upto(now)
         uavs = self.shelves.uavs
-        return {number: Wire(Sample, int(uavs[number]), told) for number, told in self.shelves.take(now)}
+        return {number: Wire(Sample, int(uavs[number]), told, t) for number, told, t in self.shelves.take(now)}

