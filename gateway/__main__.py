@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import gc
 import logging
 import sys
 from pathlib import Path
@@ -29,6 +30,7 @@ from gateway.recorded import Replay
 from gateway.spec import read_forward, read_spec
 
 SWITCH_S = 5e-4  # how long a receiving thread waits while messages are made [s]
+GARBAGE = 50_000  # objects made before cycles are looked for; messages make thousands a tick, and no cycles
 DEFAULT_LINK = "udpin:127.0.0.1:14550"
 EXAMPLES = """
   gateway                                              listen on loopback, port 14550
@@ -69,6 +71,8 @@ def run(args: argparse.Namespace) -> int:
     stop = stop_on_signal()
     sys.setswitchinterval(SWITCH_S)
     warm_up()
+    gc.freeze()
+    gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
     with connect(args.router, patient=budget is not None) as bus, contextlib.ExitStack() as held:
         links: list[Link] = []
         ids = Ids()

@@ -52,6 +52,7 @@ class Keeper:
 
     def __init__(self, seconds: float = SECONDS, most: int = MOST) -> None:
         self.size = 0  # bytes kept
+        self._share = most  # of one aircraft [bytes]
         self._seconds, self._most = seconds, most
         self._pasts: dict[int, _Past] = {}
         self._lock = threading.Lock()  # questions come on a thread of the bus
@@ -67,15 +68,12 @@ class Keeper:
         past = self._pasts.get(wire.uav)
         if past is None:
             past = self._pasts[wire.uav] = _Past(wire.t)
+            self._share = self._most // len(self._pasts)
             self.size -= sum(one.trim(float("-inf"), self._share) for one in self._pasts.values())
         size = len(wire.payload)
         past.said[wire.kind].append((wire.t, wire.payload))
         past.size += size
         self.size += size - past.trim(wire.t - self._seconds, self._share)
-
-    @property
-    def _share(self) -> int:
-        return self._most // len(self._pasts)
 
     def answer(self, uav: int | None, settings: dict[str, str], payload: bytes) -> Answers:
         """Answer a question on the bus.

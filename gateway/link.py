@@ -11,6 +11,7 @@ from fleet.telemetry.heard import Heard
 from gateway.spec import Spec
 
 QUEUE = 20_000  # batches between receiving and decoding
+QUEUE_BYTES = 64 << 20  # in them
 POLL_S = 0.2  # how soon a receiving thread notices the end [s]
 _T0 = time.time() - time.monotonic()
 
@@ -29,6 +30,11 @@ class Batch(NamedTuple):
     copies: Sequence[Wire] = ()
     gone: Hashable = None  # a sender that took its leave: whoever comes next may have its place
     ended: bool = False
+
+    @property
+    def size(self) -> int:
+        """Tell how many bytes were heard."""
+        return len(self.heard.buf) if self.heard is not None else 0
 
 
 class Link(Protocol):

@@ -44,7 +44,9 @@ def test_packed_samples_are_the_bytes_of_the_message(seed, uavs):
             want[number] = encode(made(uav, laid))
     order = np.argsort(times, kind="stable")
     shelves.lay(np.array(keys, np.int64)[order], np.array(times)[order], np.array(times)[order], _wide(values)[order])
-    assert dict(shelves.take(np.inf)) == want
+    told = shelves.take(np.inf)
+    assert {number: payload for number, payload, _ in told} == want
+    assert [t for *_, t in told] == [decode(Sample, payload).t for _, payload, _ in told]
     assert shelves.take(np.inf) == []
 
 
@@ -57,7 +59,7 @@ def test_a_flood_of_one_kind_is_cut_and_counted():
     shelves.add(3)
     t = T0 + np.arange(MOST_ROWS + 7) * 1e-3
     shelves.lay(np.zeros(len(t), np.int64), t, t, np.ones((len(t), 8)))
-    ((number, told),) = shelves.take(np.inf)
+    ((number, told, _),) = shelves.take(np.inf)
     assert (number, shelves.refused.tolist(), told) == (
         0,
         [7],
@@ -81,7 +83,7 @@ def test_rows_come_as_far_as_they_had_arrived_whatever_comes_between(seed):
         for k, at in zip(key.tolist(), t.tolist(), strict=True):
             heard.setdefault(divmod(k, len(FIELDS)), []).append(at)
         until = now + float(rng.random())
-        for number, told in shelves.take(until):
+        for number, told, _ in shelves.take(until):
             sample = decode(Sample, told)
             assert sample.uav == shelves.uavs[number]
             for field, name in enumerate(FIELDS):

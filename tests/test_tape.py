@@ -185,6 +185,18 @@ def test_what_no_longer_fits_into_the_queue_is_recorded_all_the_same(tmp_path):
     assert recorder.account()[0].frames == 2 and tapped.qsize() == 1
 
 
+def test_the_queue_is_bounded_in_bytes_too_and_has_room_again_once_something_was_taken():
+    heard = Batch(0, Heard.of([(T0, "air", frames(1)[0])]))
+    tapped = Tapped(100, None, most_bytes=3 * heard.size)
+    for _ in range(3):
+        tapped.put_nowait(heard)
+    with pytest.raises(module.queue.Full):
+        tapped.put_nowait(heard)
+    tapped.put_nowait(Batch(0, ended=True))
+    assert tapped.get_nowait() == heard
+    tapped.put_nowait(heard)
+
+
 @pytest.mark.parametrize(("text", "size"), [("500M", 5e8), ("10G", 1e10), ("1.5k", 1500), ("7", 7), ("2GB", 2e9)])
 def test_a_size_is_read(text, size):
     assert read_size(text, "--record-budget") == size

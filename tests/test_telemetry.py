@@ -34,18 +34,23 @@ def test_every_row_names_a_message_and_fills_its_columns():
         assert np.isfinite(own_seconds(row, fields)).all()
 
 
-def test_fields_are_those_of_pymavlink_for_every_message():
+def test_fields_and_messages_are_those_of_pymavlink_for_every_message():
     rng = np.random.default_rng(5)
     for number, kind in mav.mavlink_map.items():
-        payload = rng.bytes(kind.unpacker.size)
-        frames = Decoder().feed(Heard.of([(T0, None, _frame(7, kind, payload))]))
+        said = _frame(7, kind, rng.bytes(kind.unpacker.size))
+        frames = Decoder().feed(Heard.of([(T0, None, said)]))
         assert len(frames.at) == 1, kind.msgname
-        heard, fields = frames.message(0), frames.fields(np.array([0]), kind.msgname)
+        expected, (got,) = mav.MAVLink(None).decode(bytearray(said)), frames.messages(np.array([0]))
+        fields = frames.fields(np.array([0]), kind.msgname)
         assert fields.rows.dtype.itemsize == kind.unpacker.size
-        for name, letter in zip(kind.fieldnames, kind.fieldtypes, strict=True) if heard is not None else ():
+        for name, letter in zip(kind.fieldnames, kind.fieldtypes, strict=True):
             if letter != "char":
-                np.testing.assert_array_equal(np.ravel(getattr(fields, name)), np.ravel(getattr(heard, name)))
-        assert number == IDS[kind.msgname]
+                np.testing.assert_array_equal(np.ravel(getattr(fields, name)), np.ravel(getattr(expected, name)))
+                np.testing.assert_array_equal(np.ravel(getattr(got, name)), np.ravel(getattr(expected, name)))
+            else:
+                assert getattr(got, name) == getattr(expected, name)
+        assert (number, got.get_type()) == (IDS[kind.msgname], kind.msgname)
+        assert (got.get_srcSystem(), got.get_srcComponent()) == (expected.get_srcSystem(), expected.get_srcComponent())
 
 
 def test_attitude_is_in_radians():

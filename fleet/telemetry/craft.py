@@ -40,7 +40,7 @@ class Craft:
         self.board = ""  # the autopilot's own number and version; empty: not told
         self.texts: deque[tuple[float, int, str]] = deque(maxlen=MOST_TEXTS)  # fleet time, severity, words
         self.params, self.route = ParamBook(uav), RouteBook(uav)
-        self._rates: dict[str, float] = {}
+        self.rates: dict[str, float] = {}
         self.timing = Timing(lambda: flock.clocks[self.number])
         self._waiting: list[tuple[float, Callable[..., None], tuple[Any, ...]]] = []
         self._done = 0  # of those waiting
@@ -169,7 +169,7 @@ class Craft:
         if state == self._told and 0 <= passed < STATUS_S:
             return None
         if not 0 <= passed < STATUS_S:
-            self._rates = self.flock.counts.rates(self.number, passed)
+            self.rates = self.flock.counts.rates(self.number, passed)
             self._told_at = now
         self._told = state
         return Status(
@@ -180,7 +180,7 @@ class Craft:
             armed=self.armed,
             autopilot=self.autopilot,
             vehicle=self.vehicle,
-            rates_hz=self._rates,
+            rates_hz=self.rates,
             received=int(counted[RECEIVED]),
             missed=int(counted[MISSED]),
             rejected=self._rejected(),

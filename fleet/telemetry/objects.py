@@ -18,18 +18,18 @@ class _Said:
         """Name the message."""
         return self.NAME
 
-    def get_srcSystem(self) -> int:  # noqa: N802
+    def get_srcSystem(self) -> int:
         """Give the MAVLink system id of who said it."""
         return self[-2]  # type: ignore[index, no-any-return]
 
-    def get_srcComponent(self) -> int:  # noqa: N802
+    def get_srcComponent(self) -> int:
         """Give the MAVLink component id of who said it."""
         return self[-1]  # type: ignore[index, no-any-return]
 
 
 @cache
 def _kind(name: str, fields: tuple[str, ...]) -> type:
-    plain = namedtuple(name, (*fields, "system", "component"))  # type: ignore[misc]  # noqa: PYI024
+    plain = namedtuple(name, (*fields, "system", "component"))  # type: ignore[misc]
     return type(name, (_Said, plain), {"__slots__": (), "NAME": name})
 
 

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Hashable
 from typing import Protocol
 
+import numba as nb
 import numpy as np
 
 from fleet.telemetry.heard import Heard, tight
@@ -96,6 +97,7 @@ class Bulk:
         self._lengths = self._column(_Message.length.offset)
         self._name_sizes = self._column(_Message.header.offset + _Header.name_size.offset)
         self._known: dict[bytes, Hashable] = {}
+        numbered(self._names[:0], self._name_sizes[:0])  # compiles before anything comes
 
     def _column(self, offset: int) -> np.ndarray:
         stride = ctypes.sizeof(_Message)
@@ -110,15 +112,9 @@ class Bulk:
         arrival = np.full(count, wall())
         lengths = self._lengths[:count].astype(np.int64)
         buf, stop = tight(self._slots, self._starts[:count], lengths)
-        sender, senders = self._senders(count)
-        return Heard(buf, stop - lengths, stop, arrival, sender, senders)
-
-    def _senders(self, count: int) -> tuple[np.ndarray, tuple[Hashable, ...]]:
-        raw, sizes = self._names[:count].tobytes(), self._name_sizes[:count].tolist()
-        names = [raw[i * _ADDRESS : i * _ADDRESS + size] for i, size in enumerate(sizes)]
-        number: dict[bytes, int] = {}
-        sender = np.array([number.setdefault(name, len(number)) for name in names], np.int64)
-        return sender, tuple(self._address(name) for name in number)
+        sender, first = numbered(self._names[:count], self._name_sizes[:count])
+        names = [self._names[i, : self._name_sizes[i]].tobytes() for i in first.tolist()]
+        return Heard(buf, stop - lengths, stop, arrival, sender, tuple(map(self._address, names)))
 
     def _address(self, raw: bytes) -> Hashable:
         if raw not in self._known:
@@ -126,6 +122,29 @@ class Bulk:
                 self._known.clear()
             self._known[raw] = read_address(raw)
         return self._known[raw]
+
+
+@nb.njit(cache=True, nogil=True)
+def numbered(names, sizes):
+    """Number addresses in the order they come: number of each one, (n,), and which was the first of each, (k,)."""
+    number, first, k = np.empty(len(names), np.int64), np.empty(len(names), np.int64), 0
+    for i in range(len(names)):
+        at = 0
+        while at < k and not _equal(names[first[at]], names[i], sizes[first[at]], sizes[i]):
+            at += 1
+        if at == k:
+            first[k] = i
+            k += 1
+        number[i] = at
+    return number, first[:k]
+
+
+@nb.njit(cache=True, nogil=True)
+def _equal(a, b, size_a, size_b):
+    same = size_a == size_b
+    for k in range(min(size_a, size_b)):
+        same &= a[k] == b[k]
+    return same
 
 
 def read_address(raw: bytes) -> Hashable:

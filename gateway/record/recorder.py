@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from fleet.telemetry.heard import Heard
 from fleet.telemetry.scan import STAMP
-from gateway.link import Batch
+from gateway.link import QUEUE_BYTES, Batch
 from gateway.record.cut import FRAMES, Cutter
 from gateway.record.tape import Budget, Tape
 
@@ -119,14 +119,34 @@ class Recorder(AbstractContextManager):
 
 
 class Tapped(queue.Queue[Batch]):
-    """The queue between receiving and decoding, recorded on its way in, what does not fit included."""
+    """The queue between receiving and decoding, recorded on its way in, what does not fit included.
 
-    def __init__(self, most: int, recorder: Recorder | None) -> None:
+    Args:
+        most: batches
+        most_bytes: heard, in them
+    """
+
+    def __init__(self, most: int, recorder: Recorder | None, most_bytes: int = QUEUE_BYTES) -> None:
         super().__init__(most)
-        self._recorder = recorder
+        self._recorder, self._size, self._most_bytes = recorder, 0, most_bytes
 
     def put(self, item: Batch, block: bool = True, timeout: float | None = None) -> None:
-        """Record what was heard, then queue it."""
+        """Record what was heard, then queue it.
+
+        Raises:
+            queue.Full: when it finds no room.
+        """
         if self._recorder is not None and item.heard is not None:
             self._recorder.hear(item.link, item.heard)
+        if item.size and self._size + item.size > self._most_bytes:
+            raise queue.Full
         super().put(item, block, timeout)
+
+    def _put(self, item: Batch) -> None:
+        self._size += item.size
+        super()._put(item)
+
+    def _get(self) -> Batch:
+        item = super()._get()
+        self._size -= item.size
+        return item

@@ -65,20 +65,20 @@ class Counts:
 
     def rates(self, number: int, passed: float) -> dict[str, float]:
         """Give how often each kind comes from one aircraft [Hz], smoothed; `passed` since this was last asked [s]."""
-        found = _smooth(self._kinds[number], self._hz[number], passed)
-        names = self._names
-        return {names[k]: round(hz, 2) for k, hz in zip(found.tolist(), self._hz[number][found].tolist(), strict=True)}
+        found, hz = _smooth(self._kinds[number], self._hz[number], passed)
+        return dict(zip(map(self._names.__getitem__, found.tolist()), hz.tolist(), strict=True))
 
 
 @nb.njit(cache=True, nogil=True)
 def _smooth(kinds, hz, passed):
-    """Take counts up into rates, unless the time passed is none; gives the kinds worth telling."""
+    """Take counts up into rates, unless the time passed is none; gives the kinds worth telling and their rates."""
     for k in range(len(kinds)):
         if 0 < passed < np.inf and (kinds[k] or not np.isnan(hz[k])):
             new = kinds[k] / passed
             hz[k] = new if np.isnan(hz[k]) else (1 - SMOOTH) * hz[k] + SMOOTH * new
         kinds[k] = 0
-    return np.flatnonzero(hz > LEAST_HZ)
+    found = np.flatnonzero(hz > LEAST_HZ)
+    return found, np.round(hz[found], 2)
 
 
 @nb.njit(cache=True, nogil=True)

@@ -137,5 +137,5 @@ def samples(uavs: np.ndarray, start: np.ndarray, stop: np.ndarray, t: np.ndarray
     out = np.empty(size, np.uint8)
     owners, ends, ts = _samples(out, uavs, start, stop, t, values, WIDTHS, WHOLE, _BEGIN, *_NAMES, *_WORDS)
     told, stops = out[: ends[-1]].tobytes() if len(ends) else b"", ends.tolist()
-    found = zip(owners.tolist(), [0, *stops], stops, ts.tolist())  # noqa: B905: one start too many
+    found = zip(owners.tolist(), [0, *stops][:-1], stops, ts.tolist(), strict=True)
     return [(owner, told[start:stop], t) for owner, start, stop, t in found]
