@@ -10,12 +10,13 @@ from typing import Any, TypeVar
 
 import zenoh
 
+from fleet.access.entry import ROUTER, Entry, endpoint
+from fleet.access.knock import knock, reachable
+from fleet.access.roles import ROOT
 from fleet.codec import Stamp, Wire, decode, encode, encoding, pack_stamp, unpack_stamp
 from fleet.contract import PER_UAV, Claim
 from fleet.memory_bus import MemoryBus
 from fleet.talk import (
-    ROOT,
-    ROUTER,
     Answer,
     Answers,
     Bus,
@@ -201,76 +202,53 @@ def _parameters(query: zenoh.Query) -> dict[str, str]:
     return {name: value for name, _, value in pairs}
 
 
-def _config(mode: str, *, connect: list[str], listen: list[str]) -> zenoh.Config:
+def _config(settings: dict[str, Any]) -> zenoh.Config:
     config = zenoh.Config()
-    settings: dict[str, Any] = {
-        "mode": mode,
-        "connect/endpoints": connect,
-        "listen/endpoints": listen,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
-        "connect/timeout_ms": 0 if mode == "router" else -1,
-        "connect/exit_on_failure": False,
-        "transport/link/tx/lease": 1000,
-        "transport/link/tx/keep_alive": 4,
-    }
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))
     return config
 
 
-def reachable(router: str = ROUTER) -> bool:
-    """Tell whether something accepts connections at a `tcp/host:port` endpoint."""
-    host, port = endpoint(router)
-    try:
-        with socket.create_connection((host, port), timeout=0.5):
-            return True
-    except OSError:
-        return False
+def _entry(router: str | Entry) -> Entry:
+    return router if isinstance(router, Entry) else Entry(router)
 
 
-def endpoint(router: str) -> tuple[str, int]:
-    """Split `tcp/127.0.0.1:7447` into host and port.
-
-    Raises:
-        ValueError: when it is no tcp or tls endpoint.
-    """
-    kind, _, rest = router.partition("/")
-    host, _, port = rest.rpartition(":")
-    if kind not in ("tcp", "tls") or not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise ValueError(f"--router: found {router!r}, expected e.g. {ROUTER}; name protocol, host and port")
-    return host.strip("[]"), int(port)
-
-
-def _family(router: str) -> socket.AddressFamily:
-    return socket.AF_INET6 if ":" in endpoint(router)[0] else socket.AF_INET
-
-
-def connect(router: str = ROUTER, *, patient: bool = False) -> ZenohBus:
+def connect(router: str | Entry = ROUTER, *, patient: bool = False) -> ZenohBus:
     """Join the bus through a router; `patient` begins also without one and joins it when it comes.
 
     Raises:
-        ConnectionError: when nobody answers there; start `zenohd` or `fleet up`.
+        ConnectionError: when nobody answers there, or it refuses us; start `zenohd` or `fleet up`.
+        ValueError: when what we show is missing, expired or open to others.
     """
-    if reachable(router):
-        return ZenohBus(zenoh.open(_config("client", connect=[router], listen=[])))
+    entry = _entry(router)
+    if reachable(entry.at):
+        knock(entry)
+        try:
+            return ZenohBus(zenoh.open(_config(entry.session())))
+        except zenoh.ZError:
+            words = f"the password of {entry.role}" if entry.passwords else "a Zenoh router that asks for no password"
+            raise ConnectionError(
+                f"router {entry.at}: found no way in, expected {words} to do; look at it with `fleet doctor`"
+            ) from None
     if not patient:
         raise ConnectionError(
-            f"router {router}: nobody answers; start `zenohd` or `fleet up`, or name another --router"
+            f"router {entry.at}: nobody answers; start `zenohd` or `fleet up`, or name another --router"
         )
-    return ZenohBus(zenoh.open(_config("peer", connect=[router], listen=[])))  # a client would wait in `open`
+    return ZenohBus(zenoh.open(_config(entry.session(patient=True))))
 
 
-def open_router(router: str = ROUTER) -> zenoh.Session:
+def open_router(router: str | Entry = ROUTER) -> zenoh.Session:
     """Be the router: a Zenoh session in router mode that listens at `router`; close it when done.
 
     Raises:
         ConnectionError: when `router` is not an address of this machine, or taken; Zenoh itself would try for ever.
+        ValueError: when its certificate is missing, expired or open to others.
     """
+    entry = _entry(router)
+    family = socket.AF_INET6 if ":" in endpoint(entry.at)[0] else socket.AF_INET
     try:
-        socket.create_server(endpoint(router), family=_family(router)).close()
+        socket.create_server(endpoint(entry.at), family=family).close()
     except OSError as error:
         reason = f"nobody answers and none can be opened here ({error.strerror or error})"
-        raise ConnectionError(f"router {router}: {reason}; start `zenohd` there or name another --router") from None
-    return zenoh.open(_config("router", connect=[], listen=[router]))
+        raise ConnectionError(f"router {entry.at}: {reason}; start `zenohd` there or name another --router") from None
+    return zenoh.open(_config(entry.router()))

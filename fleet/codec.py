@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
+from fleet.access.roles import SAID
 from fleet.contract import TOPICS
 
 M = TypeVar("M")
@@ -52,11 +53,13 @@ def decode(kind: type[M], payload: bytes, named: str = "") -> M:
         payload: msgpack bytes
         named: the Zenoh encoding it came with; empty skips the version check
     Raises:
-        ValueError: when the version is another or the bytes do not fit; upgrade the older of the two sides.
+        ValueError: when the version is another, or the bytes are too many or do not fit; upgrade the older side.
     """
     expected = encoding(kind)
     if named and named != expected:
         raise ValueError(f"{kind.__name__}: found encoding {named!r}, expected {expected!r}; upgrade the older side")
+    if len(payload) > (most := SAID[kind.topic].most):  # type: ignore[attr-defined]
+        raise ValueError(f"{kind.__name__}: found {len(payload):,} bytes, expected at most {most:,}; send less")
     try:
         return _UNPACK[kind.topic].decode(payload)  # type: ignore[attr-defined]
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from typing import Any, Protocol, TypeVar
 
+from fleet.access.roles import ROOT
 from fleet.codec import Stamp, Wire
 from fleet.contract import PER_UAV
 
@@ -14,9 +15,6 @@ Answers = Iterable[tuple[Any, Stamp | None]]
 Answer = Callable[[int | None, dict[str, str], bytes], Answers]
 Token = Callable[[str, bool], None]
 Wants = Callable[[int], bool]
-
-ROOT = "parauav"
-ROUTER = "tcp/127.0.0.1:7447"
 
 
 def key(kind: type, who: int | str) -> str:

@@ -9,9 +9,11 @@ from pathlib import Path
 
 from rich.console import Console
 
+from fleet.access.roles import GATEWAY
 from fleet.bars import shown
-from fleet.bus import ROUTER, connect
+from fleet.bus import connect
 from fleet.cli import guarded, parser_for, stop_on_signal
+from fleet.config import entry, router_arguments
 from fleet.telemetry.ids import Ids
 from fleet.telemetry.intake import MOST_UAVS
 from fleet.telemetry.warm import warm_up
@@ -73,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     warm_up()
     gc.freeze()
     gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
-    with connect(args.router, patient=budget is not None) as bus, contextlib.ExitStack() as held:
+    with connect(entry(args, GATEWAY), patient=budget is not None) as bus, contextlib.ExitStack() as held:
         links: list[Link] = []
         ids = Ids()
         for spec in specs:
@@ -123,7 +125,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
     parser.add_argument("--most-uavs", type=int, default=MOST_UAVS, metavar="N", help=f"no more aircraft ({MOST_UAVS})")
     parser.add_argument("--keys", type=Path, metavar="FILE", help="keys of signed links, for its owner's eyes only")
-    parser.add_argument("--router", default=ROUTER, help=f"where the bus is ({ROUTER})")
+    router_arguments(parser)
     parser.add_argument("--listen-only", action="store_true", help="send nothing at all to the aircraft")
     parser.add_argument(
         "--budget",

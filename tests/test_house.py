@@ -13,6 +13,7 @@ PACKAGES = ("fleet", "gateway", "twin_worker", "viewer")
 ROOMS = (  # inside fleet a room imports only from rooms above it, and from itself
     ("frames",),
     ("contract",),
+    ("access",),
     ("codec",),
     ("talk",),
     ("fence", "memory_bus"),

@@ -5,9 +5,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fleet.access.roles import WORKER
 from fleet.airframes import GENERIC, load
-from fleet.bus import ROUTER, connect
+from fleet.bus import connect
 from fleet.cli import guarded, id_range, parser_for, stop_on_signal
+from fleet.config import entry, router_arguments
 from fleet.contract import FleetState
 from twin_worker.engine.many import run_many
 from twin_worker.engine.pace import read_pace
@@ -55,7 +57,7 @@ def _bases(given: list[str]) -> "dict[int, Baseline]":
 def _run(args: argparse.Namespace) -> int:
     airframe, bases = load(args.airframe), _bases(args.baseline)
     stop = stop_on_signal()
-    with connect(args.router) as bus:
+    with connect(entry(args, WORKER)) as bus:
         bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
         from twin_worker.conflict.separation import Separation
         from twin_worker.mismatch.background import Background
@@ -98,7 +100,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run the worker until it is told to stop."""
     parser = parser_for("twin_worker", "Identify, verify and predict each UAV of a range.", EXAMPLES)
     parser.add_argument("--uavs", type=id_range, default=range(50), metavar="LO-HI", help="ids to hold (0-49)")
-    parser.add_argument("--router", default=ROUTER, help=f"Zenoh router ({ROUTER})")
+    router_arguments(parser)
     methods = ("auto", "dynamics", "hybrid", "paper")
     parser.add_argument(
         "--method",

@@ -3,8 +3,10 @@
 import argparse
 import sys
 
-from fleet.bus import ROUTER, connect
+from fleet.access.roles import VIEWER
+from fleet.bus import connect
 from fleet.cli import guarded, parser_for, stop_on_signal
+from fleet.config import entry, router_arguments
 from viewer.app import App, quiet, serve
 
 EXAMPLES = """
@@ -24,7 +26,7 @@ def main(argv: list[str] | None = None) -> int:
         help="address to serve on (default 127.0.0.1: this machine only; there is no password, so put an "
         "authenticating reverse proxy before anything wider)",
     )
-    parser.add_argument("--router", default=ROUTER, help=f"Zenoh router to join (default {ROUTER})")
+    router_arguments(parser)
     parser.add_argument("--light", action="store_true", help="light colours, for bright surroundings")
     return guarded("viewer", run, parser.parse_args(argv))
 
@@ -39,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     if not 0 < args.port < 65536:
         raise ValueError(f"--port: found {args.port}, expected 1 to 65535; name another")
     stop = stop_on_signal()
-    with connect(args.router) as bus:
+    with connect(entry(args, VIEWER)) as bus:
         server = serve(args.host, args.port)
         try:
             app = App(bus, server, light=args.light)

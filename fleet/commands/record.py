@@ -14,9 +14,10 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from fleet.bus import ROUTER, Bus, connect
+from fleet.bus import Bus, connect
 from fleet.cli import stop_on_signal
 from fleet.codec import Stamp, encode, encoding
+from fleet.config import entry, router_arguments
 from fleet.contract import TOPICS, Sample
 from fleet.telemetry.fleet_log import Record
 
@@ -36,14 +37,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help=f"recording to write, {SUFFIX}")
     parser.add_argument("--for", dest="seconds", type=float, default=0.0, metavar="S", help="how long (until Ctrl-C)")
     parser.add_argument("--overwrite", action="store_true", help="replace FILE where it exists")
-    parser.add_argument("--router", default=ROUTER, help=f"where the bus is ({ROUTER})")
+    router_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Record until told to stop; exit code 1 where messages had to be dropped."""
     _check(args)
     stop = stop_on_signal()
-    with connect(args.router) as bus, _opened(args.file, args.overwrite) as file:
+    with connect(entry(args)) as bus, _opened(args.file, args.overwrite) as file:
         recorder = Recorder(bus, file)
         recorder.listen()
         _record(recorder, args, stop)

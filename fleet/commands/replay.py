@@ -7,9 +7,9 @@ from pathlib import Path
 from urllib.parse import quote
 
 from fleet.bars import shown
-from fleet.bus import ROUTER
 from fleet.children import run_until
 from fleet.cli import stop_on_signal
+from fleet.config import passed_on, router_arguments
 from fleet.telemetry.airing import MOST_ON_A_LINK, Airing, address, shared
 from fleet.telemetry.ids import Ids
 from fleet.telemetry.pace import read_speed
@@ -39,7 +39,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         f"repeatable: the copies are shared out, at most {MOST_ON_A_LINK} aircraft each",
     )
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
-    parser.add_argument("--router", default=ROUTER, help=f"where the bus is ({ROUTER})")
+    router_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     if args.to:
         return _send(args)
     options = [f"--link={link(name, args)}" for name in args.file]
-    options += ["--router", args.router, f"--offset={args.offset}", "--listen-only"]
+    options += [*passed_on(args), f"--offset={args.offset}", "--listen-only"]
     return run_until(stop_on_signal(), "gateway", *options)
 
 

@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from fleet.bus import ROUTER, Bus, connect
+from fleet.bus import Bus, connect
+from fleet.config import entry, router_arguments
 from fleet.contract import FleetRow, FleetState, State, Status
 
 EXAMPLES = """
@@ -21,13 +22,13 @@ EXAMPLES = """
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--router", default=ROUTER, help=f"Zenoh router ({ROUTER})")
+    router_arguments(parser)
     parser.add_argument("--json", action="store_true", help="a list of objects instead of a table")
 
 
 def run(args: argparse.Namespace) -> int:
     """Ask the fleet once and print it; exit code 1 where no UAV is known."""
-    with connect(args.router) as bus:
+    with connect(entry(args)) as bus:
         rows = fleet_rows(bus)
     if args.json:
         json.dump(as_objects(rows), sys.stdout, indent=1)

@@ -12,13 +12,14 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from fleet.bus import ROUTER, Bus, connect, open_router, reachable
+from fleet.bus import Bus, connect, open_router, reachable
 from fleet.children import Children
 from fleet.cli import stop_on_signal
 from fleet.commands.fly import AIRCRAFT, AUTOPILOTS, fault_arguments, faults_of
 from fleet.commands.replay import check as check_playing
 from fleet.commands.replay import link
 from fleet.commands.status import as_objects, fleet_rows, table
+from fleet.config import entry, passed_on, router_arguments
 from fleet.contract import FleetRow, FleetState, State
 
 EXAMPLES = """
@@ -56,7 +57,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-viewer", action="store_true", help="without the web page")
     parser.add_argument("--port", type=int, default=8080, help="port of the web page (8080)")
     parser.add_argument("--seed", type=int, default=1, help="seed of the simulated aircraft (1)")
-    parser.add_argument("--router", default=ROUTER, help=f"Zenoh router, opened here if none is there ({ROUTER})")
+    router_arguments(parser)
     parser.add_argument(
         "--baseline",
         action="append",
@@ -71,9 +72,10 @@ def run(args: argparse.Namespace) -> int:
     """Start everything, show it, stop it; exit code 1 where a part died, 2 where it refused what it was told."""
     _check(args)
     stop = stop_on_signal()
-    router = None if reachable(args.router) else open_router(args.router)
+    at = entry(args)
+    router = None if reachable(at.at) else open_router(at)
     try:
-        with connect(args.router) as bus, Children() as children:
+        with connect(at) as bus, Children() as children:
             _start(children, args)
             return _watch(bus, children, args, stop)
     finally:
@@ -119,7 +121,7 @@ def _check_free(mavlink: str) -> None:
 
 
 def _start(children: Children, args: argparse.Namespace) -> None:
-    router = ["--router", args.router]
+    router = passed_on(args)
     if not args.results:
         ids = "0-999999" if args.replay else "0-249"
         base = [f"--baseline={text}" for text in args.baseline]

@@ -9,7 +9,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from fleet.bus import ROUTER, Bus, connect
+from fleet.bus import Bus, connect
+from fleet.config import entry, router_arguments
 from fleet.contract import Prediction, WhatIf, WhatIfStart
 from fleet.frames import to_geodetic, to_ned
 from fleet.telemetry.waypoints import read_waypoints
@@ -35,7 +36,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--wind", type=_numbers, metavar="N,E", help="another wind, where it blows to [m/s]")
     parser.add_argument("--param", action="append", default=[], metavar="NAME=VALUE", help="another parameter; repeat")
     parser.add_argument("--json", action="store_true", help="the whole prediction, in degrees and metres")
-    parser.add_argument("--router", default=ROUTER, help=f"Zenoh router ({ROUTER})")
+    router_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -45,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         ValueError: when the question makes no sense, or is refused; the sentence says why.
     """
     asked = question(args)
-    with connect(args.router) as bus:
+    with connect(entry(args)) as bus:
         made, usual = ask(bus, args.uav, asked), next((p for p, _ in bus.ask(Prediction, args.uav)), None)
     if made is None:
         print(f"uav {args.uav}: no worker answers; is it flying? See `fleet status`", file=sys.stderr)

@@ -1,0 +1,1 @@
+"""Who may join the bus, as what, and how much each may say."""
