@@ -100,9 +100,11 @@ class ZenohBus(AbstractContextManager):
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
                     for message, stamp in asked_for(uav, reply(uav, _parameters(query), payload)):
-                        who = message.uav if kind in PER_UAV else f"{self.writer:016x}"
+                        name = key(kind, message.uav if kind in PER_UAV else f"{self.writer:016x}")
+                        if not query.key_expr.intersects(name):
+                            continue  # a stranger's key, such as parauav/1$*/status
                         query.reply(
-                            key(kind, who),
+                            name,
                             encode(message),
                             encoding=encoding(kind),
                             attachment=pack_stamp(stamp) if stamp else None,
@@ -158,6 +160,9 @@ class ZenohBus(AbstractContextManager):
             message: Any = decode(kind, sample.payload.to_bytes(), str(sample.encoding))
         except ValueError:
             self.bad += 1
+            return None
+        if kind in PER_UAV and message.uav != uav_in(str(sample.key_expr)):
+            self.bad += 1  # whoever may write about one aircraft must not write about another, or about none
             return None
         return message, _stamp(sample)
 

@@ -9,6 +9,8 @@ import time
 from collections import deque
 from contextlib import AbstractContextManager
 
+from fleet.plain import plain
+
 PARENT = "PARAUAV_PARENT"  # process id of the parent that started this process as its child
 _PATIENCE_S = 8.0  # between the request to stop and the end of patience [s]
 _ALONE_S = 10.0  # the same for a child that is all its parent waits for [s]
@@ -56,7 +58,7 @@ class Children(AbstractContextManager):
         assert child.stdout is not None
         for line in child.stdout:
             if line.strip():
-                self._words[name].append(line.rstrip())
+                self._words[name].append(plain(line.rstrip()))
 
     def words(self) -> list[str]:
         """Give each child's last line."""

@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 from fleet import __version__, commands
 from fleet.children import PARENT
+from fleet.plain import plain
 
 GRACE_S = 30.0  # an orphan may take so long to end by its own door [s]
 
@@ -35,7 +36,7 @@ def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
     try:
         return run(args)
     except (ValueError, OSError) as error:
-        print(f"{prog}: {error}", file=sys.stderr)
+        print(f"{prog}: {plain(str(error))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 0

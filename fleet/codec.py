@@ -57,13 +57,21 @@ def decode(kind: type[M], payload: bytes, named: str = "") -> M:
     """
     expected = encoding(kind)
     if named and named != expected:
-        raise ValueError(f"{kind.__name__}: found encoding {named!r}, expected {expected!r}; upgrade the older side")
+        raise ValueError(
+            f"{kind.__name__}: found encoding {_short(repr(named))}, expected {expected!r}; upgrade the older side"
+        )
     if len(payload) > (most := SAID[kind.topic].most):  # type: ignore[attr-defined]
         raise ValueError(f"{kind.__name__}: found {len(payload):,} bytes, expected at most {most:,}; send less")
     try:
         return _UNPACK[kind.topic].decode(payload)  # type: ignore[attr-defined]
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{kind.__name__}: found {len(payload)} bytes that do not fit ({error}); resend") from None
+        what = f"{len(payload)} bytes that do not fit ({_short(str(error))})"
+        raise ValueError(f"{kind.__name__}: found {what}; resend") from None
+
+
+def _short(text: str) -> str:
+    """Leave out the middle of what may be a stranger's text of any length."""
+    return text if len(text) <= 200 else f"{text[:80]} … {text[-80:]}"
 
 
 def pack_stamp(stamp: Stamp) -> bytes:

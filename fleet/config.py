@@ -45,11 +45,11 @@ def _read(path: Path) -> dict[str, str]:
             f"--config: found {path} is no TOML ({error}), expected [router] and a few keys; see deploy/fleet.toml"
         ) from None
     router = told.pop("router", {})
-    if told or not isinstance(router, dict) or any(name not in KEYS for name in router):
-        strange = [*told, *(name for name in router if name not in KEYS)]
+    strange = [*told, *(name for name in router if name not in KEYS)] if isinstance(router, dict) else ["router"]
+    if strange:
         raise ValueError(
-            f"--config: found {', '.join(map(repr, strange))} in {path}, expected [router] with "
-            f"{', '.join(KEYS)} at most; correct it"
+            f"--config: found {', '.join(map(repr, strange))} in {path}, expected [router] with {', '.join(KEYS)} at "
+            "most; correct it"
         )
     if not all(isinstance(value, str) and value for value in router.values()):
         raise ValueError(f"--config: found a value that is no text in {path}, expected texts; put it in quotes")

@@ -8,6 +8,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from fleet.plain import plain
 from fleet.telemetry.findings import File, Findings, Kind, mode_seconds
 
 _MOST_EVENTS = 14
@@ -34,11 +35,6 @@ def table(file: File) -> RenderableType:
     if file.twin and "sentence" in file.twin:
         parts.append(Text(f"  twin: {plain(str(file.twin['sentence']))}", style="red"))
     return Group(*parts)
-
-
-def plain(text: str) -> str:
-    """Keep what can be printed: what an aircraft says must not steer the terminal."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def lines(told: Findings) -> list[tuple[str, str]]:

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from fleet.bars import alongside
 from fleet.contract import Account, Link, Status
+from fleet.plain import plain
 from gateway.publish import Told
 from gateway.record.size import in_words
 
@@ -89,7 +90,7 @@ def drawn(account: Account, statuses: list[Status]) -> Group:
         _links(account),
         *([_uavs(statuses)] if statuses else []),
     ]
-    return Group(*parts, *(Text(f"! {one}") for one in said))
+    return Group(*parts, *(Text(f"! {plain(one)}") for one in said))
 
 
 def _links(account: Account) -> Table:
@@ -106,7 +107,8 @@ def _links(account: Account) -> Table:
         )
         taped = in_words(link.recorded) + (f" (-{in_words(link.unrecorded)})" if link.unrecorded else "")
         rates = (in_words(link.bytes_s), f"{link.messages_hz:.0f}")
-        table.add_row(escape(link.link), *rates, *map(str, numbers), taped if link.recorded or link.unrecorded else "-")
+        kept = taped if link.recorded or link.unrecorded else "-"
+        table.add_row(escape(plain(link.link)), *rates, *map(str, numbers), kept)
     return table
 
 
@@ -120,7 +122,7 @@ def _uavs(statuses: list[Status]) -> Table:
         later = f"{s.latency_s * 1e3:.0f} ({s.latency_worst_s * 1e3:.0f})"
         trip = "-" if s.round_trip_s is None else f"{s.round_trip_s * 1e3:.0f}"
         counts = (f"{sum(s.rates_hz.values()):.0f}", str(s.received), str(s.missed), str(s.rejected))
-        table.add_row(str(s.uav), s.link.value, escape(s.mode), *counts, later, trip, escape(s.sentence))
+        table.add_row(str(s.uav), s.link.value, escape(plain(s.mode)), *counts, later, trip, escape(plain(s.sentence)))
     if len(statuses) > len(shown):
         table.caption = f"{len(statuses) - len(shown)} more are well"
     return table

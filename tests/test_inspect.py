@@ -13,7 +13,8 @@ from fleet.cli import main
 from fleet.commands import inspect
 from fleet.contract import Link, Mission, Params, Status
 from fleet.page.ink import drawn, mode_colours
-from fleet.sheet import plain, table
+from fleet.plain import plain
+from fleet.sheet import table
 from fleet.telemetry import abilities as needs
 from fleet.telemetry.abilities import abilities
 from fleet.telemetry.findings import Facts, File, Findings, findings, happened

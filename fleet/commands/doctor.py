@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from fleet.bus import ROUTER, endpoint, reachable
+from fleet.bus import endpoint, reachable
+from fleet.config import entry, router_arguments
 
 EXAMPLES = """
   fleet doctor
@@ -34,12 +35,12 @@ class Finding(NamedTuple):
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--router", default=ROUTER, help=f"Zenoh router to look for (default {ROUTER})")
+    router_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print every finding; exit code 1 when one of them is BAD."""
-    found = [python(), *packages(), compile_cache(), router(args.router), mavlink_port(), chromium(), recordings()]
+    found = [python(), *packages(), compile_cache(), router(entry(args).at), mavlink_port(), chromium(), recordings()]
     for grade, what, sentence in found:
         print(f"{grade:5} {what:14} {sentence}")
     return int(any(finding.grade == "BAD" for finding in found))

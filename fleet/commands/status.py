@@ -12,6 +12,7 @@ from rich.table import Table
 from fleet.bus import Bus, connect
 from fleet.config import entry, router_arguments
 from fleet.contract import FleetRow, FleetState, State, Status
+from fleet.plain import plain
 
 EXAMPLES = """
   fleet status
@@ -68,7 +69,7 @@ def table(rows: list[FleetRow]) -> Table:
         fit = f"{sum(row.fit.values()) / len(row.fit):.0f}" if row.fit else "-"
         horizon = f"{row.horizon_s:.0f}" if row.horizon_s else "-"
         age = "-" if row.sample_age_s is None else f"{row.sample_age_s:.1f}"
-        found = [f"▲ mismatch: {escape(row.mismatch)}"] if row.mismatch else []
-        said = "\n".join((*(f"! {escape(alert)}" for alert in row.alerts), *found, escape(row.verdict)))
+        found = [f"▲ mismatch: {escape(plain(row.mismatch))}"] if row.mismatch else []
+        said = "\n".join((*(f"! {escape(plain(alert))}" for alert in row.alerts), *found, escape(plain(row.verdict))))
         out.add_row(str(row.uav), row.state.value, fit, horizon, age, said)
     return out

@@ -21,6 +21,7 @@ from fleet.commands.replay import link
 from fleet.commands.status import as_objects, fleet_rows, table
 from fleet.config import entry, passed_on, router_arguments
 from fleet.contract import FleetRow, FleetState, State
+from fleet.plain import plain
 
 EXAMPLES = """
   fleet up --uavs 8
@@ -145,7 +146,9 @@ def _start(children: Children, args: argparse.Namespace) -> None:
 def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threading.Event) -> int:
     """Show the fleet once a second until told to stop, a part dies or the time is over."""
     said: list[str] = [""]  # by the worker, the newest last; none is lost between two looks
-    bus.subscribe(FleetState, lambda state, _: said.append(state.sentence) if state.sentence != said[-1] else None)
+    bus.subscribe(
+        FleetState, lambda state, _: said.append(plain(state.sentence)) if plain(state.sentence) != said[-1] else None
+    )
     rows: list[FleetRow] = []
     first = None
     show = _Show(Console(stderr=True))

@@ -13,6 +13,7 @@ from fleet.bus import Bus, connect
 from fleet.config import entry, router_arguments
 from fleet.contract import Prediction, WhatIf, WhatIfStart
 from fleet.frames import to_geodetic, to_ned
+from fleet.plain import plain
 from fleet.telemetry.waypoints import read_waypoints
 
 EXAMPLES = """
@@ -113,13 +114,13 @@ def ask(bus: Bus, uav: int, asked: WhatIf) -> Prediction | None:
 
 def as_object(made: Prediction) -> dict[str, object]:
     """Give a prediction for JSON: places instead of arrays."""
-    plain = msgspec.to_builtins(made, builtin_types=(bytes,))
+    out = msgspec.to_builtins(made, builtin_types=(bytes,))
     places = to_geodetic(made.ned_origin(), made.path.numpy())
     for name in ("ahead", "path", "tube"):
-        plain[name] = np.round(getattr(made, name).numpy().astype(float), 3).tolist()
-    plain["held"] = made.held if made.held == made.held else None
-    plain["places"] = [[lat * 1e-7, lon * 1e-7, alt * 1e-3] for lat, lon, alt in places.tolist()]
-    return plain
+        out[name] = np.round(getattr(made, name).numpy().astype(float), 3).tolist()
+    out["held"] = made.held if made.held == made.held else None
+    out["places"] = [[lat * 1e-7, lon * 1e-7, alt * 1e-3] for lat, lon, alt in places.tolist()]
+    return out
 
 
 def text(made: Prediction, usual: Prediction | None) -> str:
@@ -128,7 +129,7 @@ def text(made: Prediction, usual: Prediction | None) -> str:
     places = to_geodetic(made.ned_origin(), path)
     flown = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     off = _apart(made, usual)
-    lines = [made.sentence, f"{made.method} · {made.law} · horizon {made.horizon_s:.0f} s"]
+    lines = [plain(made.sentence), f"{plain(made.method)} · {plain(made.law)} · horizon {made.horizon_s:.0f} s"]
     lines.append("   in s    latitude   longitude  alt m   flown m  tube m  from usual m")
     for at in (s for s in _SHOWN_S if s <= ahead[-1]):
         k = int(np.argmin(np.abs(ahead - at)))

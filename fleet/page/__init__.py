@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from fleet.page import panels
 from fleet.page.ground import ground_track
 from fleet.page.ink import BAD, GOOD, GRID, INK, MUTED, mode_colours
-from fleet.sheet import lines, plain
+from fleet.plain import plain
+from fleet.sheet import lines
 from fleet.telemetry.findings import Facts, Findings
 from fleet.telemetry.survey import Survey, spells
 

@@ -4,7 +4,7 @@ from html import escape
 from pathlib import Path
 
 from fleet.page.ink import BAD, GOOD, GRID, INK, LINES, MUTED, ROUTE
-from fleet.sheet import plain
+from fleet.plain import plain
 
 _GUARD = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # nothing is fetched, nothing runs
 _COLOURS = {"ink": INK, "muted": MUTED, "line": GRID, "good": GOOD, "bad": BAD, "doubt": LINES[3], "odd": ROUTE}

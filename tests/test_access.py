@@ -1,0 +1,199 @@
+"""The way onto the bus: `--router` and `--config`, papers and passwords, a site's certificates and their renewal."""
+
+import argparse
+import importlib
+import pkgutil
+import shutil
+import ssl
+import subprocess
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from conftest import ROOT, unused_port
+
+from fleet import commands
+from fleet.access.entry import Entry
+from fleet.access.knock import knock
+from fleet.access.papers import ending, papers_of, password_of
+from fleet.access.roles import ROLES, ROUTER_ROLE
+from fleet.access.rules import PASSWORD, access_control
+from fleet.bus import ROUTER, connect, open_router
+from fleet.config import entry, passed_on, router_arguments
+from gateway import __main__ as gateway
+from tests.bench.security.site import SCRIPT, expired, make_papers, make_passwords
+from twin_worker import __main__ as twin_worker
+from viewer import __main__ as viewer
+
+OFF_THE_BUS = {"assess", "calibrate", "diagnose", "effects", "fly", "inspect", "paper", "prove", "schema"}
+
+
+@pytest.fixture(scope="module")
+def papers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A site's certificates."""
+    return make_papers(tmp_path_factory.mktemp("site") / "certificates", "127.0.0.1", "router.example")
+
+
+def told(*options: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    router_arguments(parser)
+    return parser.parse_args(options)
+
+
+def written(folder: Path, text: str) -> str:
+    (folder / "fleet.toml").write_text(text)
+    return f"--config={folder / 'fleet.toml'}"
+
+
+# --- what is told ----------------------------------------------------------------------------------------------------
+
+
+def test_without_options_it_is_loopback_in_the_clear() -> None:
+    assert entry(told()) == Entry(ROUTER, "tools", None, None)
+    assert passed_on(told()) == []
+
+
+def test_the_example_of_deploy_says_what_it_explains(papers: Path) -> None:
+    given = told(f"--config={ROOT / 'deploy' / 'fleet.toml'}")
+    assert entry(given, "worker") == Entry("tls/127.0.0.1:7447", "worker", ROOT / "deploy" / "certificates")
+    assert passed_on(given) == [f"--config={ROOT / 'deploy' / 'fleet.toml'}"]
+
+
+def test_the_command_line_wins_over_the_file(tmp_path: Path) -> None:
+    file = written(tmp_path, '[router]\nat = "tcp/10.0.0.1:7447"\npasswords = "words"\n')
+    assert entry(told(file)) == Entry("tcp/10.0.0.1:7447", "tools", None, tmp_path / "words")
+    both = told(file, "--router=tcp/10.0.0.2:7447")
+    assert entry(both).at == "tcp/10.0.0.2:7447"
+    assert passed_on(both) == ["--router=tcp/10.0.0.2:7447", file]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("[router", "is no TOML"),
+        ("[gateway]\nlink = 1", "found 'gateway' in"),
+        ('[router]\nca = "x"', "found 'ca' in .* at, certificates, passwords at most"),
+        ("[router]\nat = 7447", "a value that is no text"),
+        ('[router]\nat = "udp/x:1"', "--router: found 'udp/x:1'"),
+        ('[router]\nat = "tls/x:1"', "tls/x:1 without certificates"),
+        ('[router]\ncertificates = "c"', "tcp/127.0.0.1:7447 with certificates"),
+        ("router = 3", "expected \\[router\\]"),
+    ],
+)
+def test_a_file_that_makes_no_sense_is_refused_in_a_sentence(tmp_path: Path, text: str, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        entry(told(written(tmp_path, text)))
+
+
+def parsers() -> dict[str, argparse.ArgumentParser]:
+    """Every verb of `fleet` that joins the bus."""
+    found = {}
+    for module in pkgutil.iter_modules(commands.__path__):
+        if module.name not in OFF_THE_BUS:
+            found[module.name] = argparse.ArgumentParser()
+            importlib.import_module(f"fleet.commands.{module.name}").arguments(found[module.name])
+    return found
+
+
+def test_every_command_on_the_bus_takes_the_same_two_options(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    for name, parser in parsers().items():
+        assert "--config FILE" in parser.format_help() and "--router ENDPOINT" in parser.format_help(), name
+    for module in (gateway, twin_worker, viewer):
+        with pytest.raises(SystemExit):
+            module.main(["--help"])
+        help_ = capsys.readouterr().out
+        assert "--config FILE" in help_ and "--router ENDPOINT" in help_
+
+
+# --- papers and passwords --------------------------------------------------------------------------------------------
+
+
+def test_papers_are_found_private_and_in_time(papers: Path, tmp_path: Path) -> None:
+    found = papers_of(papers, "worker")
+    assert found.certificate == papers / "worker.pem"
+    assert timedelta(days=89) < ending(found.certificate) - datetime.now(UTC) < timedelta(days=91)
+    with pytest.raises(ValueError, match=r"found no .*pilot\.pem, expected it for the role pilot"):
+        papers_of(papers, "pilot")
+    mine = Path(shutil.copytree(papers, tmp_path / "mine"))
+    (mine / "worker.key").chmod(0o644)
+    with pytest.raises(ValueError, match=r"worker\.key with mode 0644, .* chmod 640"):
+        papers_of(mine, "worker")
+    (mine / "worker.key").chmod(0o640)
+    assert papers_of(mine, "worker")
+    with pytest.raises(ValueError, match=r"expired on .* renew it: certificates\.sh role"):
+        papers_of(expired(papers, "worker", tmp_path / "old"), "worker")
+    (mine / "viewer.pem").write_text("no certificate")
+    with pytest.raises(ValueError, match="found no certificate in"):
+        papers_of(mine, "viewer")
+
+
+def test_a_password_is_a_line_of_a_private_file(tmp_path: Path) -> None:
+    file = make_passwords(tmp_path)
+    assert len({password_of(file, role) for role in (*ROLES, ROUTER_ROLE)}) == 5
+    with pytest.raises(ValueError, match="found none for the role pilot"):
+        password_of(file, "pilot")
+    file.chmod(0o604)
+    with pytest.raises(ValueError, match="mode 0604"):
+        password_of(file, "worker")
+
+
+def test_a_secret_is_in_no_representation(papers: Path) -> None:
+    passwords = make_passwords(papers)
+    at = Entry("tcp/127.0.0.1:7447", "worker", None, passwords)
+    assert password_of(passwords, "worker") not in repr(at)
+    assert at.session()["transport/auth/usrpwd/password"] == password_of(passwords, "worker")
+    assert at.router()["access_control"] == access_control(PASSWORD)
+
+
+def test_a_wrong_password_is_said(papers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fleet.access.entry._REFUSED_MS", 300)
+    at = f"tcp/127.0.0.1:{unused_port()}"
+    site, other = make_passwords(papers), make_passwords(tmp_path)
+    refused = pytest.raises(ConnectionError, match="found no way in, expected the password of viewer to do")
+    with open_router(Entry(at, passwords=site)), refused:
+        connect(Entry(at, "viewer", None, other))
+
+
+# --- the script ------------------------------------------------------------------------------------------------------
+
+
+def script(*words: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["sh", str(SCRIPT), *map(str, words)], capture_output=True, text=True, check=False)
+
+
+def test_an_authority_is_replaced_without_anyone_being_shut_out(tmp_path: Path) -> None:
+    site = make_papers(tmp_path / "site", "127.0.0.1")
+    old = Path(shutil.copytree(site, tmp_path / "machine-a"))
+    at = f"tls/127.0.0.1:{unused_port()}"
+    assert script("next-ca", site).returncode == 0
+    assert (site / "ca.pem").read_text().count("BEGIN CERTIFICATE") == 2
+    assert script("role", site, "viewer", "worker").returncode == 0
+    with open_router(Entry(at, certificates=site)):  # the router trusts both, shows its old certificate
+        knock(Entry(at, "worker", old))
+        knock(Entry(at, "worker", site))
+    assert script("router", site, "127.0.0.1").returncode == 0 and script("drop-ca", site).returncode == 0
+    with open_router(Entry(at, certificates=site)):
+        knock(Entry(at, "worker", site))
+        with pytest.raises(ConnectionError, match="not to be believed"):
+            knock(Entry(at, "worker", old))
+        shutil.copy(site / "ca.pem", old)
+        with pytest.raises(ConnectionError, match="refuses us as worker"):
+            knock(Entry(at, "worker", old))
+
+
+def test_the_script_refuses_what_would_lose_something(papers: Path, tmp_path: Path) -> None:
+    before = (papers / "ca.key").read_bytes()
+    again = script("ca", papers)
+    assert again.returncode == 2 and "found" in again.stderr and (papers / "ca.key").read_bytes() == before
+    assert "found role 'pilot'" in script("role", papers, "pilot").stderr
+    assert "make it first: ca" in script("role", tmp_path, "worker").stderr
+    assert script("router", papers).returncode == 2 and script().returncode == 2
+    shown = script("show", papers).stdout
+    assert all(f"{role}.pem: subject=CN = {role}" in shown for role in (*ROLES, ROUTER_ROLE))
+    assert not [path.name for path in papers.iterdir() if path.suffix in (".new", ".csr", ".ext")]
+    assert {(papers / f"{role}.key").stat().st_mode & 0o777 for role in (*ROLES, "ca")} == {0o600}
+
+
+def test_the_router_is_known_by_all_its_names(papers: Path) -> None:
+    decoded = ssl._ssl._test_decode_cert(str(papers / "router.pem"))  # type: ignore[attr-defined]
+    assert decoded["subjectAltName"] == (("IP Address", "127.0.0.1"), ("DNS", "router.example"))
