@@ -38,6 +38,7 @@ from msgspec import Meta
 from fleet.frames import Origin
 
 DTYPES = ("<f4", "<f8", "<i4", "<i8", "|u1")
+_SIZES = {name: np.dtype(name).itemsize for name in DTYPES}
 MAX_ITEMS = 1_000  # mission items accepted from outside
 
 
@@ -60,9 +61,10 @@ class Array(msgspec.Struct, frozen=True):
         Raises:
             ValueError: when dtype, shape and byte count disagree; the sender must repair it.
         """
-        if self.dtype not in DTYPES or len(self.shape) > 4 or not all(0 <= n < 2**31 for n in self.shape):
+        size, shape = _SIZES.get(self.dtype), self.shape
+        if size is None or len(shape) > 4 or (shape and not 0 <= min(shape) <= max(shape) < 2**31):
             raise ValueError(f"array: found dtype {self.dtype!r} shape {self.shape}, expected one of {DTYPES}; resend")
-        want = prod(self.shape) * np.dtype(self.dtype).itemsize
+        want = prod(shape) * size
         if want != len(self.data):
             raise ValueError(f"array: found {len(self.data)} bytes, shape {self.shape} needs {want}; resend")
         return np.frombuffer(self.data, self.dtype).reshape(self.shape)

@@ -68,7 +68,7 @@ def test_hostile_missions(craft, items, autopilot):
 
 @pytest.mark.parametrize("seq", [0.0, -7.0, 65535.0, 1e4, NAN, INF])
 def test_items_in_force_that_are_none(craft, seq):
-    craft.history._chunks["leg"].clear()
+    craft.history.put("leg", np.empty(0), np.empty((0, 1)))
     leg = rows([craft.data_t - 1.0], [[seq]])
     assert not craft.history.add(Sample(uav=7, t=craft.data_t, leg=leg))
     assert predictions(asked(craft))

@@ -28,7 +28,7 @@ from twin_worker.engine.quota import Quota
 from twin_worker.events.note import Note
 from twin_worker.events.watch import Ground
 from twin_worker.greybox import Grey
-from twin_worker.history import History
+from twin_worker.history import History, Kept
 from twin_worker.horizon import Made, Record, Trust
 from twin_worker.hybrid.energy import Ridge
 from twin_worker.hybrid.fit import Hybrid
@@ -78,6 +78,13 @@ def _spline(parts: tuple[np.ndarray, np.ndarray]) -> CubicSpline:
     return CubicSpline.construct_fast(coefficients, x, extrapolate=True, axis=0)
 
 
+def _kept(parts: tuple[np.ndarray, np.ndarray]) -> Kept:
+    t, x = parts
+    if t.ndim != 1 or x.ndim != 2 or len(t) != len(x) or {t.dtype, x.dtype} != {np.dtype(float)}:
+        raise TypeError(f"rows of {x.shape} at {t.shape}")
+    return Kept(t, x)
+
+
 _WIRE = (c.Status, c.Mission, c.Params, c.Sample, c.Model, c.Prediction, c.Mismatch, c.Alert, c.Verdict, c.Item)
 _NAMED = (c.State, c.Event, c.AlertKind, Origin)
 _OURS = (
@@ -89,6 +96,7 @@ CARRIED: Known = {
     **{one.__name__: one for one in (*_WIRE, *_NAMED, *_OURS) if one is not Book},
     "Book": Book,
     "KalmanFilter": (KalmanFilter, Special(_parts, _filter)),
+    "Kept": (Kept, Special(lambda one: (one.t[: one.n], one.x[: one.n]), _kept)),
     "CubicSpline": (CubicSpline, Special(lambda one: (one.x, one.c), _spline)),
     "Quota": (Quota, Special(lambda _: None, lambda _: None)),  # the next driver has its own
     "Tables": (Tables, Special(lambda _: None, lambda _: load_tables())),  # everyone has them
