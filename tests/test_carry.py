@@ -69,7 +69,7 @@ HOSTILE = (
     ["e", "State", "no such"],
     ["n", "State", 1],
     ["x", "CubicSpline", ["t", ["a", "<f8", [2], bytes(16)], ["a", "<f8", [9, 9], bytes(648)]]],
-    ["x", "KalmanFilter", ["d", "predict", 1]],
+    ["x", "Kept", ["t", ["a", "<f8", [2], bytes(16)], ["a", "<f8", [1, 3], bytes(24)]]],
     ["x", "Twin", None],
     ["a", "|O8", [1], bytes(8)],
     ["a", "<f8", [1 << 60], b""],

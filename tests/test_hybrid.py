@@ -187,7 +187,7 @@ def test_the_spread_grows_and_rougher_air_widens_it():
     start = set_out(now)
     assert isinstance(start, Start)
     ahead = np.arange(0.0, 61.0)
-    now.wind._filter.P *= 1e-3  # as after minutes of flight
+    now.wind.P *= 1e-3  # as after minutes of flight
     now.wind._surprise = 0.2
     one = ensemble.spread(now, start, known(), ahead, np.random.default_rng(0))
     now.wind._surprise = 9.0

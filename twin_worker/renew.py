@@ -1,15 +1,42 @@
 """A prediction between two flights ahead: the path of the last one, begun at the newest position."""
 
+from math import exp
+
 import msgspec
 import numpy as np
 
 from fleet.contract import Array, Message
 from fleet.frames import to_ned
+from fleet.physics.kernel import kernel
 from twin_worker.memory import Twin
 from twin_worker.predict import LEAST_AHEAD_S
 
 LATEST_S = 10.0  # after a flight ahead it is renewed no longer [s]
 _BACK_S = 10.0  # in which an aircraft is back on the path that was foreseen [s]
+
+
+@kernel
+def shifted(ahead: np.ndarray, path: np.ndarray, passed: float, at: np.ndarray, out: np.ndarray) -> None:
+    """Fill in the rest of a path from where the aircraft is now.
+
+    Args:
+        ahead, path: look-aheads, rising, and positions, (n,) and (n, 3) [s, m]
+        passed: time since it began [s]
+        at: where the aircraft is, (3,) [m]
+        out: positions `ahead` from now, (k, 3) [m]; the last at most `passed` before the path's end
+    """
+    off, k = np.zeros(3), 0
+    for i in range(len(out)):
+        t = passed + ahead[i]
+        while k < len(ahead) - 2 and ahead[k + 1] < t:
+            k += 1
+        share = min(max((t - ahead[k]) / (ahead[k + 1] - ahead[k]), 0.0), 1.0)
+        fade = exp(-ahead[i] / _BACK_S)
+        for j in range(3):
+            there = path[k, j] + share * (path[k + 1, j] - path[k, j])
+            if i == 0:
+                off[j] = at[j] - there
+            out[i, j] = there + fade * off[j]
 
 
 def renew(twin: Twin) -> list[Message]:
@@ -23,21 +50,19 @@ def renew(twin: Twin) -> list[Message]:
     t, rows = twin.history.rows("position", max(base.t, twin.history.newest - 1.0))
     if not len(t) or not 0.0 < (passed := float(t[-1]) - base.t) < LATEST_S:
         return []
-    ahead = base.ahead.numpy().astype(float)
-    keep = ahead <= ahead[-1] - passed
-    ahead = ahead[keep]
-    if not len(ahead) or ahead[-1] < LEAST_AHEAD_S:
+    ahead = base.ahead.numpy()
+    n = int(ahead.searchsorted(float(ahead[-1]) - passed, side="right"))
+    if not n or ahead[n - 1] < LEAST_AHEAD_S:
         return []
-    at, path = base.ahead.numpy().astype(float), base.path.numpy().astype(float)
-    on = np.column_stack([np.interp(passed + ahead, at, column) for column in path.T])
-    off = to_ned(twin.origin, *rows[-1:].T)[0] - on[0]
+    out = np.empty((n, 3), np.float32)
+    shifted(ahead, base.path.numpy(), passed, to_ned(twin.origin, *rows[-1]), out)  # type: ignore[call-arg]
     twin.prediction = msgspec.structs.replace(
         base,
         t=float(t[-1]),
         state=twin.state,
-        ahead=Array.of(ahead),
-        path=Array.of(on + np.exp(-ahead / _BACK_S)[:, None] * off),
-        tube=Array.of(base.tube.numpy()[keep]),
+        ahead=Array(base.ahead.dtype, (n,), base.ahead.data[: ahead.itemsize * n]),
+        path=Array("<f4", (n, 3), out.tobytes()),
+        tube=Array(base.tube.dtype, (n, 3), base.tube.data[: ahead.itemsize * 3 * n]),
         controller=None,
     )
     return [twin.prediction]

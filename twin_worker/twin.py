@@ -1,6 +1,7 @@
 """THE loop of one aircraft, `advance(twin, messages, now)`. Data time only: no bus, no thread, no wall clock."""
 
 from collections.abc import Iterable, Iterator
+from math import isfinite
 
 import numpy as np
 
@@ -71,7 +72,7 @@ def _heard(message: Message) -> float:
 
 def _turn(twin: Twin, now: float) -> list[Message]:
     """Do whatever is due at data time `now`; it may lie before the last turn, where that ran ahead of late data."""
-    if twin.origin is None or not np.isfinite([twin.history.newest, now]).all():
+    if twin.origin is None or not (isfinite(twin.history.newest) and isfinite(now)):
         return []
     twin.turned_t = now
     results = _watch_link(twin, now)
@@ -97,8 +98,8 @@ def _turn(twin: Twin, now: float) -> list[Message]:
 
 def identify_due(twin: Twin) -> bool:
     """Tell whether an identification is due at the data time of the last turn."""
-    ready = twin.origin is not None and np.isfinite([twin.history.newest, twin.turned_t]).all()
-    return bool(ready) and not twin.lost and _due(twin.turned_t, twin.identify_t, twin.pace.identify)
+    ready = twin.origin is not None and isfinite(twin.history.newest) and isfinite(twin.turned_t)
+    return ready and not twin.lost and _due(twin.turned_t, twin.identify_t, twin.pace.identify)
 
 
 def identify(twin: Twin) -> list[Message]:

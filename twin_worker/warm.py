@@ -15,6 +15,8 @@ from twin_worker.conflict.traffic import Traffic
 from twin_worker.coupled import identify
 from twin_worker.hybrid import lags
 from twin_worker.identify import AXES, identify_axis
+from twin_worker.renew import shifted
+from twin_worker.wind import WindFilter
 
 _SPEED = 22.0  # [m/s]
 _ITEMS = tuple(
@@ -47,6 +49,7 @@ def warm_up() -> None:
     greybox.follow(grey_ctl, par, legs, grey, np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0]), np.zeros(2), 0.1, ahead)  # type: ignore
     segments, told = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
     _meet(origin)
+    _go_on()
     copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), told, 0.1, ahead)  # type: ignore
 
 
@@ -78,6 +81,13 @@ def _meet(origin: Origin) -> None:
         )
         traffic.hear(made)
     traffic.judge(0, 1e9)
+
+
+def _go_on() -> None:
+    """Renew a prediction, and feed the wind filter."""
+    ahead, path = (Array.of(values).numpy() for values in (np.arange(5.0), np.zeros((5, 3))))
+    shifted(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
+    WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, 0.0)
 
 
 def _flight(seconds: float = 20.0, dt: float = 0.04) -> Window:

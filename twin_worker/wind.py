@@ -1,9 +1,10 @@
 """Wind and airspeed scale from ground velocity, airspeed and heading: a Kalman filter on the wind triangle."""
 
-from math import atan2, cos, exp, hypot, sin, sqrt
+from math import atan2, cos, exp, hypot, inf, isfinite, sin, sqrt
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
+
+from fleet.physics.kernel import kernel
 
 DRIFT, DRIFT_S = 0.6, 60.0  # slow change of the wind: standard deviation, correlation time [m/s, s]
 GUST, GUST_S = 0.8, 7.0  # turbulence along the flight, likewise
@@ -15,6 +16,68 @@ _CALM, _ROUGH = 0.05, 10.0  # least and most mean squared innovation that is bel
 _START = np.array([0.03, 0.03, 6.0, 6.0, DRIFT, DRIFT, GUST, GUST])
 
 
+@kernel
+def _take(x: np.ndarray, P: np.ndarray, dt: float, c: float, s: float, north: float, east: float, gate: float) -> float:
+    """Foretell state and covariance by dt and correct them by one ground velocity, unless it surprises too much.
+
+    Args:
+        x, P: state (8,) and covariance (8, 8), changed in place
+        dt: since the row before [s]
+        c, s: reported velocity through the air, level, along north and east by the heading [m/s]
+        north, east: ground velocity [m/s]
+        gate: surprise from which nothing is corrected
+    Returns:
+        the squared normalised innovation
+    Source: Bar-Shalom 2001, 5.2.4 (Joseph's form).
+    """
+    keep, H, HP, y = np.ones(8), np.zeros((2, 8)), np.zeros((2, 8)), np.empty(2)
+    for i in range(2):
+        keep[4 + i], keep[6 + i] = exp(-dt / DRIFT_S), exp(-dt / GUST_S)
+        H[i, 2 + i] = H[i, 4 + i] = H[i, 6 + i] = 1.0
+    H[0, 0], H[0, 1], H[1, 0], H[1, 1] = c, -s, s, c
+    y[0], y[1] = north, east
+    for i in range(8):
+        x[i] *= keep[i]
+        for j in range(8):
+            P[i, j] *= keep[i] * keep[j]
+        walk = 1e-8 if i < 2 else _WANDER**2 * dt if i < 4 else _START[i] ** 2 * (1.0 - keep[i] ** 2)
+        P[i, i] += walk
+    for k in range(2):
+        for i in range(8):
+            y[k] -= H[k, i] * x[i]
+            for j in range(8):
+                HP[k, i] += H[k, j] * P[j, i]
+    S00 = S01 = S11 = 0.0
+    for i in range(8):
+        S00, S01, S11 = S00 + HP[0, i] * H[0, i], S01 + HP[0, i] * H[1, i], S11 + HP[1, i] * H[1, i]
+    S00, S11 = S00 + _SIGMA**2, S11 + _SIGMA**2
+    det = S00 * S11 - S01 * S01
+    a, b = (S11 * y[0] - S01 * y[1]) / det, (S00 * y[1] - S01 * y[0]) / det
+    surprise = y[0] * a + y[1] * b
+    if surprise < gate:
+        _correct(x, P, H, HP, np.array((a, b)), np.array((S11 / det, -S01 / det, S00 / det)))
+    return surprise
+
+
+@kernel
+def _correct(x: np.ndarray, P: np.ndarray, H: np.ndarray, HP: np.ndarray, pull: np.ndarray, inv: np.ndarray) -> None:
+    K, A, AP = np.empty((8, 2)), np.eye(8), np.zeros((8, 8))
+    for i in range(8):
+        x[i] += HP[0, i] * pull[0] + HP[1, i] * pull[1]
+        K[i, 0], K[i, 1] = HP[0, i] * inv[0] + HP[1, i] * inv[1], HP[0, i] * inv[1] + HP[1, i] * inv[2]
+        for j in range(8):
+            A[i, j] -= K[i, 0] * H[0, j] + K[i, 1] * H[1, j]
+    for i in range(8):
+        for k in range(8):
+            for j in range(8):
+                AP[i, j] += A[i, k] * P[k, j]
+    for i in range(8):
+        for j in range(8):
+            P[i, j] = _SIGMA**2 * (K[i, 0] * K[j, 0] + K[i, 1] * K[j, 1])
+            for k in range(8):
+                P[i, j] += AP[i, k] * A[j, k]
+
+
 class WindFilter:
     """States a, b, mean, drift, gust of  v = Va cos(gamma) (a e(psi) + b e(psi + 90 deg)) + mean + drift + gust.
 
@@ -24,40 +87,29 @@ class WindFilter:
     """
 
     def __init__(self) -> None:
-        filt = KalmanFilter(dim_x=8, dim_z=2)
-        filt.x = np.array([1.0, *np.zeros(7)])
-        filt.P = np.diag(_START**2)
-        filt.R = np.eye(2) * _SIGMA**2
-        self._filter = filt
+        self.x, self.P = np.array([1.0, *np.zeros(7)]), np.diag(_START**2)
         self._rows = 0
         self._surprise = 1.0
         self.t = -np.inf
 
     def update(self, t: float, ground: np.ndarray, Va: float, psi: float) -> None:
         """Take one row: ground velocity NED (3,) [m/s], reported airspeed [m/s], heading [rad]."""
-        dt = min(t - self.t, 5.0) if np.isfinite(self.t) else 0.2
+        dt = min(t - self.t, 5.0) if isfinite(self.t) else 0.2
         if dt <= 0 or Va < 3.0:
             return
         self.t = t
         level = Va * sqrt(max(1 - (ground[2] / Va) ** 2, 0.25))
-        c, s = level * cos(psi), level * sin(psi)
-        H = np.hstack([[[c, -s], [s, c]], np.tile(np.eye(2), 3)])
-        filt = self._filter
-        keep = np.array([1.0, 1.0, 1.0, 1.0, *[exp(-dt / DRIFT_S)] * 2, *[exp(-dt / GUST_S)] * 2])
-        walk = np.array([1e-8, 1e-8, _WANDER**2 * dt, _WANDER**2 * dt, *(_START[4:] ** 2 * (1 - keep[4:] ** 2))])
-        filt.predict(F=np.diag(keep), Q=np.diag(walk))
-        y = ground[:2] - H @ filt.x
-        S = H @ filt.P @ H.T + filt.R
         self._rows += 1
-        surprise = float(y @ np.linalg.solve(S, y))
-        self._surprise += dt / _SURPRISE_S * (min(surprise, _GATE) / len(y) - self._surprise)
-        if self._rows < 50 or surprise < _GATE:
-            filt.update(ground[:2], H=H)
+        gate = inf if self._rows < 50 else _GATE
+        along, across = level * cos(psi), level * sin(psi)
+        told = float(ground[0]), float(ground[1])
+        surprise = _take(self.x, self.P, dt, along, across, *told, gate)  # type: ignore[call-arg]
+        self._surprise += dt / _SURPRISE_S * (min(surprise, _GATE) / 2 - self._surprise)
 
     def blow(self, t: float, wind: np.ndarray) -> None:
         """Believe this wind at time `t` [s since 1970], NED, (3,) [m/s]."""
         self.t = t
-        self._filter.x[2:6] = *wind[:2], 0.0, 0.0  # mean, and no drift from it
+        self.x[2:6] = *wind[:2], 0.0, 0.0  # mean, and no drift from it
 
     def jump(self, wind: np.ndarray, scale: float, doubt: float) -> None:
         """Let wind and airspeed sensor change at once, by what is known only up to a share `doubt`.
@@ -67,7 +119,7 @@ class WindFilter:
             scale: true over reported airspeed from now on, over what it was [-]
             doubt: standard deviation, as a share of the change
         """
-        x, P = self._filter.x, self._filter.P
+        x, P = self.x, self.P
         x[2:4] += wind[:2]
         P[[2, 3], [2, 3]] += (doubt * wind[:2]) ** 2
         P[[0, 1], [0, 1]] += (doubt * (scale - 1.0) * x[:2]) ** 2
@@ -76,12 +128,12 @@ class WindFilter:
     @property
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Give a, b, mean, drift and gust, north before east, (8,) [-, m/s], and their covariance, (8, 8)."""
-        return self._filter.x.copy(), self._filter.P.copy()
+        return self.x.copy(), self.P.copy()
 
     @property
     def wind(self) -> np.ndarray:
         """Give the wind without its gusts, NED, the direction it blows to, (3,) [m/s]."""
-        x = self._filter.x
+        x = self.x
         return np.array([x[2] + x[4], x[3] + x[5], 0.0])
 
     @property
@@ -92,16 +144,16 @@ class WindFilter:
     @property
     def scale(self) -> float:
         """Give true over reported airspeed [-]."""
-        return hypot(self._filter.x[0], self._filter.x[1])
+        return hypot(self.x[0], self.x[1])
 
     @property
     def heading_bias(self) -> float:
         """Give air-velocity direction minus reported heading [rad]."""
-        return atan2(self._filter.x[1], self._filter.x[0])
+        return atan2(self.x[1], self.x[0])
 
     @property
     def sigma(self) -> float:
         """Give the standard deviation of the larger component of the wind without gusts [m/s]."""
-        P = self._filter.P
+        P = self.P
         both = P[2:4, 2:4] + P[2:4, 4:6] + P[4:6, 2:4] + P[4:6, 4:6]
         return sqrt(max(both[0, 0], both[1, 1]))

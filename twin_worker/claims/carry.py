@@ -1,10 +1,8 @@
 """One aircraft's whole twin as bytes, from worker to worker: who takes over goes on as the other would have."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 from scipy.interpolate import CubicSpline
 
 from fleet import contract as c
@@ -58,19 +56,6 @@ class Load:
     mismatch: Mismatch | None = None
 
 
-def _filter(parts: dict[str, Any]) -> KalmanFilter:
-    out = KalmanFilter(dim_x=8, dim_z=2)
-    for name, value in parts.items():
-        if type(value) is not type(getattr(out, name)) and value is not None:
-            raise TypeError(f"a filter with {name}")
-        setattr(out, name, value)
-    return out
-
-
-def _parts(one: KalmanFilter) -> dict[str, Any]:
-    return {name: getattr(one, name) for name in ("x", "P", "R")}
-
-
 def _spline(parts: tuple[np.ndarray, np.ndarray]) -> CubicSpline:
     x, coefficients = parts
     if coefficients.ndim != 3 or coefficients.shape[:2] != (4, len(x) - 1):
@@ -95,7 +80,6 @@ _OURS = (
 CARRIED: Known = {
     **{one.__name__: one for one in (*_WIRE, *_NAMED, *_OURS) if one is not Book},
     "Book": Book,
-    "KalmanFilter": (KalmanFilter, Special(_parts, _filter)),
     "Kept": (Kept, Special(lambda one: (one.t[: one.n], one.x[: one.n]), _kept)),
     "CubicSpline": (CubicSpline, Special(lambda one: (one.x, one.c), _spline)),
     "Quota": (Quota, Special(lambda _: None, lambda _: None)),  # the next driver has its own

@@ -36,7 +36,12 @@ def go_on(twin: Twin, made: Prediction) -> None:
 
     It keeps the origin of the local frame, too.
     """
-    if made.ahead.shape[0] < 2 or made.path.shape != (made.ahead.shape[0], 3) or made.path.shape != made.tube.shape:
+    try:
+        n = len(made.ahead.numpy())
+        shapes = [(each.dtype, each.numpy().shape) for each in (made.ahead, made.path, made.tube)]
+    except (ValueError, TypeError):
+        return
+    if n < 2 or shapes != [("<f4", (n,)), *[("<f4", (n, 3))] * 2]:
         return
     twin.origin, twin.prediction, twin.base = made.ned_origin(), made, made
 

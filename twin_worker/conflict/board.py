@@ -1,6 +1,7 @@
 """The newest prediction of every aircraft, side by side, so that one judgement reads them all at once."""
 
 from dataclasses import dataclass, field
+from math import inf
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from twin_worker.conflict.forecast import LONGEST_S, STEP, Forecast, forecast
 
 _ROWS = int(LONGEST_S / STEP) + 1
 _MOST = 4_096  # aircraft on one board; more are a stranger's
+_NEWS_S = 0.5  # what follows the last that was heard sooner says nothing new: pairs are judged once a second [s]
 _FAR = np.array([1e4, 1e4, -1e4])  # corner whose image gives the scale from one NED frame to another [m]
 
 
@@ -19,6 +21,7 @@ class Board:
 
     _slots: dict[int, int] = field(default_factory=dict)  # slot by UAV id
     _news: dict[int, Prediction] = field(default_factory=dict)  # heard, not yet laid
+    _heard: dict[int, float] = field(default_factory=dict)  # when the newest was made [s since 1970]
     _laid: list[Forecast | None] = field(default_factory=list)
     first: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     rows: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -31,8 +34,11 @@ class Board:
 
     def hear(self, made: Prediction) -> None:
         """Keep the newest prediction of each aircraft; safe to call from another thread."""
+        last = self._heard.get(made.uav, -inf)
+        if last < made.t < last + _NEWS_S:
+            return
         if made.uav in self._slots or len(self._slots) + len(self._news) < _MOST:
-            self._news[made.uav] = made
+            self._heard[made.uav], self._news[made.uav] = made.t, made
 
     def settle(self) -> None:
         """Lay what was heard since into its slots; what cannot be judged empties its slot."""

@@ -10,6 +10,7 @@ cross turned to NED by the direction of the path at each time. The covariance gr
 ahead weighs little by itself and no horizon cuts it off.
 """
 
+from functools import lru_cache
 from math import isfinite
 from typing import NamedTuple
 
@@ -59,6 +60,7 @@ class Forecast(NamedTuple):
         return Origin(*map(int, to_geodetic(self.made.ned_origin(), self.path[k])))
 
 
+@lru_cache(maxsize=64)
 def axis_z(quantile: float) -> float:
     """Give the half-axis of a tube that holds `quantile`, in standard deviations of one axis."""
     return float(norm.ppf((1 + quantile ** (1 / 3)) / 2))
