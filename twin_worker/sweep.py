@@ -11,7 +11,7 @@ Source: Jategaonkar 2015, section 4.6 (output error, sensitivity equations); exa
 import numpy as np
 
 from fleet.physics.dynamics import LOST, N_X, jacobian, step
-from fleet.physics.kernel import kernel
+from fleet.physics.kernel import bare, kernel
 from fleet.physics.wrench import N_AERO, N_PAR, ROW, WIND
 
 GROUP = 4  # samples a residual; 2 ** DOUBLINGS
@@ -19,7 +19,7 @@ _DOUBLINGS = 2
 N_COLUMN = N_PAR + N_X
 
 
-@kernel
+@bare
 def _times(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
     for i in range(N_X):
         for j in range(N_X):
@@ -52,7 +52,7 @@ def _transition(F: np.ndarray, dt: float, Phi: np.ndarray, Gamma: np.ndarray, wo
         Phi[:] = keep
 
 
-@kernel
+@bare
 def _carry(
     S: np.ndarray, Phi: np.ndarray, Gamma: np.ndarray, term: np.ndarray, by_wind: np.ndarray, out: np.ndarray
 ) -> None:

@@ -22,7 +22,7 @@ from fleet.autopilots.arduplane.guide import fly as fly_arduplane
 from fleet.autopilots.arduplane.guide import settle
 from fleet.autopilots.arduplane.guide import shift as shift_arduplane
 from fleet.autopilots.arduplane.params import Row, find
-from fleet.autopilots.arduplane.state import LEG, kernel
+from fleet.autopilots.arduplane.state import LEG, kernel, making
 from fleet.autopilots.slots import ARDUPLANE, LAW, PX4, TEXTBOOK, W_E, W_N, padded
 
 inlined = nb.njit(cache=True, error_model="numpy", inline="always")
@@ -89,7 +89,7 @@ def mark(par: np.ndarray) -> float:
     return par[par.shape[0] + LAW]
 
 
-@kernel
+@making
 def init(
     par: np.ndarray,
     legs: np.ndarray,
@@ -111,7 +111,7 @@ def init(
     return arduplane.init(par, legs, k, start, p, v, euler, Va, theta_c, delta_t)
 
 
-@kernel
+@making
 def engage(
     par: np.ndarray,
     legs: np.ndarray,

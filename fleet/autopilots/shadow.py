@@ -10,7 +10,7 @@ import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import state as S
-from fleet.autopilots.arduplane.state import kernel
+from fleet.autopilots.arduplane.state import kernel, making
 from fleet.autopilots.laws import begin, engage, fly, shift, stabilise
 from fleet.frames import wrap
 from fleet.mission import SEQ
@@ -30,12 +30,12 @@ def _find(ctl: np.ndarray, legs: np.ndarray, seq: float) -> int:
     return -1
 
 
-@kernel
+@making
 def _usable(p: np.ndarray, v: np.ndarray, euler: np.ndarray) -> bool:
     return bool(np.all(np.isfinite(p)) and np.all(np.isfinite(v)) and np.all(np.isfinite(euler)))
 
 
-@kernel
+@making
 def shadow(
     par: np.ndarray,
     legs: np.ndarray,
@@ -96,21 +96,21 @@ def shadow(
     return ctl, sqrt(_mean(miss[:, 5] ** 2, nan))
 
 
-@kernel
+@making
 def _mean(values: np.ndarray, otherwise: float) -> float:
     """Give the mean of what is finite."""
     kept = values[np.isfinite(values)]
     return np.mean(kept) if kept.size else otherwise
 
 
-@kernel
+@making
 def _median(values: np.ndarray, otherwise: float) -> float:
     """Give the median of what is finite; a surface's short kick at a misdated command leaves it alone."""
     kept = values[np.isfinite(values)]
     return np.median(kept) if kept.size else otherwise
 
 
-@kernel
+@making
 def _usual(miss: np.ndarray) -> np.ndarray:
     """Give the usual miss of pitch, throttle and surfaces; 0 where none is known, (5,)."""
     out = np.empty(5)

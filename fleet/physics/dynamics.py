@@ -15,7 +15,7 @@ from math import cos, sin
 import numpy as np
 
 from fleet.frames import G
-from fleet.physics.kernel import kernel
+from fleet.physics.kernel import bare, kernel
 from fleet.physics.wrench import WIND, slopes, terms, wrench
 
 N_X = 9
@@ -23,7 +23,7 @@ STEEP = 1.5  # pitch beyond is not integrated: cos(theta) is kept from zero [rad
 LOST = 1e4  # a state beyond has left every envelope
 
 
-@kernel
+@bare
 def rates_of_change(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, out: np.ndarray) -> None:
     """Fill in x', (9,)."""
     u, v, w, p, q, r = x[0], x[1], x[2], x[3], x[4], x[5]
@@ -42,7 +42,7 @@ def rates_of_change(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.nd
     out[8] = turn
 
 
-@kernel
+@bare
 def step(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, dt: float, work: np.ndarray) -> None:
     """Advance x by dt with delta held: Runge-Kutta of order four.
 

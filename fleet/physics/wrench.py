@@ -14,7 +14,7 @@ Source: Beard & McLain 2012, section 5.5 (dimensional derivatives); Klein & More
 
 import numpy as np
 
-from fleet.physics.kernel import inlined, kernel
+from fleet.physics.kernel import bare, inlined, kernel
 
 NAMES = (
     *("X_0", "X_u", "X_w", "X_de", "X_dt", "X_ww"),
@@ -61,7 +61,7 @@ def wrench(par, u_a, v_a, w_a, p, q, r, delta, at):  # type: ignore[no-untyped-d
     )
 
 
-@kernel
+@bare
 def terms(u_a: float, v_a: float, w_a: float, rates: np.ndarray, delta: np.ndarray, at: np.ndarray, out: np.ndarray):  # type: ignore[no-untyped-def]
     """Fill in what each derivative is multiplied by, (35,) in the order of `NAMES`; arguments as for `wrench`."""
     s = min(max(u_a / at[0], SLOW), FAST)

@@ -7,12 +7,12 @@ from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.arduplane import state as S
 from fleet.autopilots.arduplane.attitude import FULL
-from fleet.autopilots.arduplane.state import kernel
+from fleet.autopilots.arduplane.state import kernel, making
 from fleet.frames import G
 from fleet.mission import VA_C
 
 
-@kernel
+@making
 def init(
     par: np.ndarray,
     legs: np.ndarray,

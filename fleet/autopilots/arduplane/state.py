@@ -5,7 +5,10 @@ The slots up to N_LEG belong to the leg being flown; the shadow run winds them b
 
 import numba as nb
 
-kernel = nb.njit(cache=True, error_model="numpy")  # no fastmath: nan means "no airspeed sensor"; nothing raises inside
+# no fastmath: nan means "no airspeed sensor"; nothing raises inside
+making = nb.njit(cache=True, error_model="numpy", nogil=True)
+# these make no array: counting who holds which took half their time
+kernel = nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]
 
 # the leg
 LEG = 0  # index of the current leg

@@ -7,7 +7,7 @@ import numpy as np
 from fleet.autopilots.arduplane import demand
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import state as S
-from fleet.autopilots.arduplane.state import kernel
+from fleet.autopilots.arduplane.state import kernel, making
 from fleet.autopilots.px4_fixedwing import npfg, path, tecs
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import state as X
@@ -15,7 +15,7 @@ from fleet.autopilots.px4_fixedwing.attitude import scaler
 from fleet.mission import VA_C
 
 
-@kernel
+@making
 def init(
     par: np.ndarray,
     legs: np.ndarray,

@@ -11,7 +11,7 @@ from fleet.autopilots.arduplane import demand
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import state as S
 from fleet.autopilots.arduplane.l1 import clip
-from fleet.autopilots.arduplane.state import kernel
+from fleet.autopilots.arduplane.state import kernel, making
 from fleet.autopilots.textbook import params as P
 from fleet.autopilots.textbook import path
 from fleet.autopilots.textbook import state as X
@@ -22,7 +22,7 @@ _CLIMB_S = 4.0  # a height error is worked off in such a time at first [s]
 _NEAR = 10.0  # height error the proportional and integral parts see at most [m]
 
 
-@kernel
+@making
 def init(
     par: np.ndarray,
     legs: np.ndarray,
