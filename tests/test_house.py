@@ -128,8 +128,8 @@ def arguments(path: str, tree: ast.AST, text: str) -> Iterator[str]:
     for node in ast.walk(tree):
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             continue
-        if any(re.search(r"\b(njit|kernel|inlined)\b", ast.unparse(decorator)) for decorator in node.decorator_list):
-            continue  # compiled (`kernel` and `inlined` are njit with options): takes flat numbers and arrays
+        if any(re.search(r"\b(njit|kernel|inlined|bare|making)\b", ast.unparse(decorator)) for decorator in node.decorator_list):
+            continue  # compiled (the other names are njit with options): takes flat numbers and arrays
         if path.startswith("tests/") and node.name.startswith("test_"):
             continue  # pytest fills these in by name
         names = [a.arg for a in (*node.args.posonlyargs, *node.args.args) if a.arg not in ("self", "cls")]
