@@ -565,6 +565,8 @@ class FleetState(msgspec.Struct, frozen=True, kw_only=True):
     t: Annotated[float, Meta(description="fleet time of the rows [s since 1970]")]
     rows: tuple[FleetRow, ...] = ()
     sentence: Annotated[str, Meta(description="e.g. compiling the twin's physics, once")] = ""
+    done: Annotated[dict[str, int], Meta(description="heavy work since it began: predict, identify, ensemble")] = {}
+    shed: Annotated[int, Meta(description="messages of aircraft it holds now that it could not keep for them")] = 0
 
 
 class LinkAccount(msgspec.Struct, frozen=True, kw_only=True):

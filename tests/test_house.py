@@ -128,7 +128,10 @@ def arguments(path: str, tree: ast.AST, text: str) -> Iterator[str]:
     for node in ast.walk(tree):
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             continue
-        if any(re.search(r"\b(njit|kernel|inlined|bare|making)\b", ast.unparse(decorator)) for decorator in node.decorator_list):
+        if any(
+            re.search(r"\b(njit|kernel|inlined|bare|making)\b", ast.unparse(decorator))
+            for decorator in node.decorator_list
+        ):
             continue  # compiled (the other names are njit with options): takes flat numbers and arrays
         if path.startswith("tests/") and node.name.startswith("test_"):
             continue  # pytest fills these in by name

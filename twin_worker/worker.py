@@ -172,8 +172,9 @@ class Worker:
         self.learner.yield_to_telemetry(late)
         if self.claiming.threaded:
             self.quota.limit = LEAST_S if late else SWEEP_S
-        if done := self.quota.done.pop(Work.PREDICT, 0):
-            self.rates.note(Work.PREDICT, now, done)
+        for work in (Work.PREDICT, Work.ENSEMBLE):
+            if done := self.quota.done.pop(work, 0):
+                self.rates.note(work, now, done)
 
     def _publish(self, result: Message, held: Held) -> None:
         """Publish under the claim in force; what is held no longer, or not surely, is kept back."""
@@ -207,7 +208,9 @@ class Worker:
         said = [f"{shed} messages shed: too many UAVs for this worker"] if shed else []
         said += self.rates.said(self.pace, len(self.holding()), time.monotonic())
         said += [held.failed for held in self.holding() if held.failed]
-        return FleetState(t=time.time(), rows=tuple(rows), sentence=self.sentence or " ".join(said[:3]))
+        done = {work.value: n for work, n in self.rates.total.items()}
+        sentence = self.sentence or " ".join(said[:3])
+        return FleetState(t=time.time(), rows=tuple(rows), sentence=sentence, done=done, shed=shed)
 
     def run(self, stop: threading.Event) -> None:
         """Join, turn until told to stop, publishing the fleet table once a second; then hand everything over."""

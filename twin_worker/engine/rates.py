@@ -1,6 +1,6 @@
 """How often heavy work is really done, and what to say where that is too seldom."""
 
-from collections import deque
+from collections import Counter, deque
 
 from twin_worker.engine.pace import Pace, Work
 
@@ -10,16 +10,18 @@ _MOST = 20_000
 
 
 class Rates:
-    """What one worker did lately."""
+    """What one worker did lately, and in all."""
 
     def __init__(self) -> None:
         self._done: dict[Work, deque[float]] = {work: deque(maxlen=_MOST) for work in Work}
         self._since: float | None = None
+        self.total: Counter[Work] = Counter()
 
     def note(self, work: Work, now: float, times: int = 1) -> None:
         """Note work done at `now`, monotonic [s]."""
         self._since = now if self._since is None else self._since
         self._done[work].extend([now] * times)
+        self.total[work] += times
 
     def period(self, work: Work, aircraft: int, now: float) -> float:
         """Give how often each of so many aircraft got it [s]; 0: not known yet, inf: never."""

@@ -35,6 +35,7 @@ LIMITS = {  # by fault: what is measured, and the most that is allowed
     "delay": {"owners_changed": 0},
     "blink": {"owners_changed": 0},
 }
+_WARM = 0.95  # share of the aircraft that must have a model before the first fault [-]
 ANNOUNCED_S = 1.2  # after which everyone has said what it holds now [s]
 RANDOM = ("kill", "freeze", "leave", "join", "cut", "stall", "delay", "blink", "restart_router")
 
@@ -59,7 +60,8 @@ def happen(site: Site, name: str, rng: np.random.Generator) -> dict[str, Any]:
         faults.leave(site, site.workers[0])
     site.reader.forget()
     usual_since = time.monotonic()
-    worker = site.workers[int(rng.integers(len(site.workers)))]
+    able = [one for one in site.workers if one.way is not None or faults.ALL[name] not in faults.ON_THE_WAY]
+    worker = able[int(rng.integers(len(able)))]
     try:
         found = faults.ALL[name](site, worker)
     except TimeoutError as error:
@@ -93,13 +95,13 @@ def settle(site: Site) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     rng = np.random.default_rng(args.seed)
-    with Site(args.uavs, args.router, args.zenohd, args.pace) as site:
+    with Site(args.uavs, args.router, zenohd=args.zenohd, pace=args.pace, ways=args.ways) as site:
         site.wanted = args.workers
         try:
             site.open(args.recording, args.workers)
             settle(site)
-            warm = time.monotonic() + args.warm
-            until(lambda: time.monotonic() > warm, args.warm + 1.0, "time")
+            begun = time.monotonic()
+            until(lambda: len(site.reader.fits) >= _WARM * args.uavs or time.monotonic() - begun > args.warm, 1e6, "")
             print(f"{args.uavs} aircraft, {args.workers} workers: begun", file=sys.stderr, flush=True)
             steps = at_random(site, args.random, rng) if args.random else one_by_one(site, args.only, args.repeat, rng)
             rows = list(steps)
@@ -135,7 +137,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", default=list(faults.ALL), choices=list(faults.ALL))
     parser.add_argument("--repeat", type=int, default=1)
     parser.add_argument("--random", type=int, default=0, metavar="N", help="instead: so many faults at random")
-    parser.add_argument("--warm", type=float, default=30.0, help="between the first prediction and the first fault [s]")
+    parser.add_argument("--warm", type=float, default=180.0, help="models are waited for no longer than so [s]")
+    parser.add_argument("--ways", type=int, default=1, help="workers whose way to the router can be cut")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write what was measured")
     parser.add_argument("--words", action="store_true", help="show what the processes said")

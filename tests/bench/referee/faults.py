@@ -124,6 +124,7 @@ def cut(site: Site, worker: Worker, seconds: float = 3.0) -> dict[str, Any]:
     """Cut a worker off from the router, and mend the way."""
     uavs, was = _held(site, worker), worker.name
     begun = time.monotonic()
+    assert worker.way is not None
     worker.way.cut = True
     found = _taken_over(site, uavs, was, begun)
     wait(max(begun + seconds - time.monotonic(), 0.0))
@@ -135,6 +136,7 @@ def stall(site: Site, worker: Worker, seconds: float = 3.0) -> dict[str, Any]:
     """Let nothing through between a worker and the router, without a word to either."""
     uavs, was = _held(site, worker), worker.name
     begun = time.monotonic()
+    assert worker.way is not None
     worker.way.stalled = True
     found = _taken_over(site, uavs, was, begun)
     wait(max(begun + seconds - time.monotonic(), 0.0))
@@ -144,6 +146,7 @@ def stall(site: Site, worker: Worker, seconds: float = 3.0) -> dict[str, Any]:
 
 def delay(site: Site, worker: Worker, seconds: float = 3.0) -> dict[str, Any]:
     """Let everything come 150 ms late for a while: nobody is dead."""
+    assert worker.way is not None
     before, begun = site.reader.holders(), time.monotonic()
     worker.way.delay_s = 0.15
     wait(seconds)
@@ -165,3 +168,4 @@ def blink(site: Site, worker: Worker) -> dict[str, Any]:
 
 
 ALL = {one.__name__: one for one in (kill, freeze, leave, join, restart_router, cut, stall, delay, blink)}
+ON_THE_WAY = (cut, stall, delay)  # for a worker that has a way of its own

@@ -39,13 +39,26 @@ def until(condition: Callable[[], object], patience_s: float, what: str) -> floa
     return time.monotonic() - begun
 
 
-class Worker:
-    """One worker process and its way to the router."""
+def cpu_s(pid: int) -> float:
+    """Give the processor time that a process has used so far, all its threads [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
-    def __init__(self, site: "Site") -> None:
-        self.way = Forwarder(endpoint(site.router))
+
+def fly(path: Path, seconds: float = 1200.0) -> Path:
+    """Fly one pretend aircraft in wind and turbulence, and record it."""
+    to_tlog(path, [PretendUav(0, 3, wind=3.0, turbulence=2)], seconds=seconds, loss=0.01, seed=3)
+    return path
+
+
+class Worker:
+    """One worker process, and its way to the router where it has one of its own."""
+
+    def __init__(self, site: "Site", way: Forwarder | None) -> None:
+        self.way = way
+        router = site.router if way is None else f"tcp/127.0.0.1:{way.port}"
         command = ("twin_worker", "--uavs", f"0-{site.uavs - 1}", "--no-diagnosis", "--pace", site.pace)
-        self.process = site.start(*command, "--router", f"tcp/127.0.0.1:{self.way.port}", name="worker")
+        self.process = site.start(*command, "--router", router, name="worker")
         self._said = site.log_of(self.process)
 
     @property
@@ -58,11 +71,18 @@ class Worker:
         """Send a signal."""
         self.process.send_signal(number)
 
+    def end(self) -> None:
+        """End it without a word."""
+        if self.process.poll() is None:
+            self.signal(signal.SIGKILL)
+        self.process.wait()
+        if self.way is not None:
+            self.way.__exit__()
+
     @property
     def cpu_s(self) -> float:
         """Give the processor time used so far [s]."""
-        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        return cpu_s(self.process.pid)
 
     @property
     def rss_mb(self) -> float:
@@ -76,11 +96,13 @@ class Site(AbstractContextManager):
     Args:
         uavs: aircraft
         zenohd: the real router; None: a session of ours in router mode
-        recording: a flight to play; None: one is flown first
+        ways: so many workers reach the router by a way that can be cut
     """
 
-    def __init__(self, uavs: int, router: str = ROUTER, zenohd: str | None = None, pace: str = PACE) -> None:
-        self.uavs, self.router, self.zenohd, self.pace = uavs, router, zenohd, pace
+    def __init__(
+        self, uavs: int, router: str = ROUTER, *, zenohd: str | None = None, pace: str = PACE, ways: int = 0
+    ) -> None:
+        self.uavs, self.router, self.zenohd, self.pace, self.ways = uavs, router, zenohd, pace, ways
         self.workers: list[Worker] = []
         self.wanted = 0  # workers that there should be
         self.reader: Reader = None  # type: ignore[assignment]
@@ -90,12 +112,16 @@ class Site(AbstractContextManager):
         self._log = Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
 
     def open(self, recording: Path | None, workers: int) -> None:
-        """Start router, reader, workers and, once these can take over, the gateway."""
+        """Start router, reader, workers and, once these can take over, the gateway.
+
+        Args:
+            recording: a flight to play; None: one is flown first
+            workers: how many
+        """
         self.open_router()
         self.reader = Reader(self._stack.enter_context(connect(self.router)))
         if recording is None:
-            recording = self._log / "flight.tlog"
-            to_tlog(recording, [PretendUav(0, 3, wind=3.0, turbulence=2)], seconds=1200, loss=0.01, seed=3)
+            recording = fly(self._log / "flight.tlog")
         for _ in range(workers):
             self.add()
         link = f"--link=replay:{recording}?copies={self.uavs}"
@@ -113,7 +139,8 @@ class Site(AbstractContextManager):
 
     def add(self) -> Worker:
         """Start a worker, and wait until it may claim."""
-        worker = Worker(self)
+        ways = sum(worker.way is not None for worker in self.workers)
+        worker = Worker(self, Forwarder(endpoint(self.router)) if ways < self.ways else None)
         self.workers.append(worker)
         until(lambda: worker.name or worker.process.poll() is not None, 300.0, "a worker")
         return worker
@@ -121,9 +148,7 @@ class Site(AbstractContextManager):
     def lose(self, worker: Worker) -> None:
         """Count a worker no longer."""
         self.workers.remove(worker)
-        worker.signal(signal.SIGKILL)
-        worker.process.wait()
-        worker.way.__exit__()
+        worker.end()
 
     def start(self, module: str, *options: str, name: str) -> subprocess.Popen:
         """Start `python -m module options…`."""
@@ -153,5 +178,5 @@ class Site(AbstractContextManager):
                 child.kill()
                 child.wait()
         for worker in self.workers:
-            worker.way.__exit__()
+            worker.end()
         self._stack.close()
