@@ -50,7 +50,8 @@ class Publisher:
             stamp = None
             if kind in RESULTS and getattr(message, "kind", None) is not AlertKind.SECOND_SENDER:
                 message, stamp = self._claimed(message)
-            self._keep(kind, (getattr(message, "uav", 0), str(getattr(message, "kind", ""))), message, stamp)
+            if kind in self._latest:
+                self._keep(kind, (getattr(message, "uav", 0), str(getattr(message, "kind", ""))), message, stamp)
             wire = Wire(kind, message.uav if kind in PER_UAV else -1, encode(message), message.t)
             self.history.keep([wire])
             self.way.send([wire], stamp)
@@ -58,7 +59,8 @@ class Publisher:
     def put(self, wires: Sequence[Wire]) -> None:
         """Put messages on the bus that are packed already; results of workers are never among them."""
         for wire in wires:
-            self._keep(wire.kind, (wire.uav, ""), wire, None)
+            if wire.kind in self._latest:
+                self._keep(wire.kind, (wire.uav, ""), wire, None)
         self.history.keep(wires)
         self.way.send(wires)
 
@@ -82,9 +84,8 @@ class Publisher:
                 (self.put if isinstance(message, Wire) else self.publish)([message])
 
     def _keep(self, kind: type, who: Hashable, message: Any, stamp: Stamp | None) -> None:
-        if kind in self._latest:
-            with self._lock:
-                self._latest[kind][who] = message, stamp
+        with self._lock:
+            self._latest[kind][who] = message, stamp
 
     def _claimed(self, message: Any) -> tuple[Any, Stamp]:
         """Claim the aircraft anew with every recorded result, so that no worker that computes its own is believed."""

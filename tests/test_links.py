@@ -6,6 +6,7 @@ import pty
 import queue
 import socket
 import threading
+import time
 import tty
 
 import numpy as np
@@ -267,7 +268,7 @@ def test_what_was_sent_is_what_was_counted_however_far_decoding_falls_behind(mon
     bus.subscribe(Account, hear)
     pump = Pump([link], bus, listen_only=True)
     busy, take = threading.Event(), pump.take
-    monkeypatch.setattr(pump, "take", lambda batch: (busy.wait(0.05), take(batch)))
+    monkeypatch.setattr(pump, "take", lambda batch: (busy.wait(0.2), take(batch)))
     thread = threading.Thread(target=pump.run, args=(stop,))
     thread.start()
     with udp() as air:
@@ -294,3 +295,26 @@ def test_messages_to_a_link_that_is_down_are_counted_every_one():
     pump._tell()
     assert len(questions) > 1
     assert accounts[-1].refused == {"not sent: nobody at the far end, or no room": len(questions)}
+
+
+def test_a_datagram_came_when_the_system_got_it_not_when_it_was_fetched():
+    with udp() as sock, udp() as air:
+        bulk, begun = receive.Bulk(sock), wall()
+        air.sendto(HELLO, sock.getsockname())
+        air.sendto(HELLO, sock.getsockname())
+        sent = wall()
+        until(lambda: wall() > sent + 0.05)
+        heard = bulk.take()
+    assert len(heard.start) == 2 and (np.diff(heard.arrival) >= 0).all()
+    assert begun - 5e-3 <= heard.arrival[0] <= heard.arrival[1] <= sent + 5e-3
+
+
+def test_a_system_clock_that_was_set_makes_no_datagram_early_or_very_late(monkeypatch):
+    with udp() as sock, udp() as air:
+        bulk = receive.Bulk(sock)
+        for step in (3600.0, -3600.0):
+            with monkeypatch.context() as patched:
+                patched.setattr(receive.time, "time", lambda step=step: time.time_ns() * 1e-9 + step)
+                air.sendto(HELLO, sock.getsockname())
+                (arrival,) = bulk.take().arrival
+            assert wall() - 1.5 < arrival <= wall()

@@ -54,7 +54,7 @@ class Timing:
     def told(self, now: float) -> dict[str, Any]:
         """Give the fields of `Status` that tell of time; `now` is fleet time [s since 1970]."""
         boot = self._clocks()[c.BOOT]
-        self._look(now)
+        self._look(boot, now)
         worst, boot[c.WORST] = float(boot[c.WORST]), 0.0
         return {
             "clock_offset_s": float(boot[c.OFFSET]),
@@ -72,10 +72,10 @@ class Timing:
             return None
         return float(self._filter.x[1, 0])
 
-    def _look(self, now: float) -> None:
+    def _look(self, boot: np.ndarray, now: float) -> None:
         """Filter offset and drift: x = (offset, drift), x' = F x, z = offset."""
-        boot, passed = self._clocks()[c.BOOT], now - self._looked
-        if np.isnan(boot[c.NEWEST]) or 0 <= passed < EVERY_S:
+        passed = now - self._looked
+        if 0 <= passed < EVERY_S or np.isnan(boot[c.NEWEST]):
             return
         self._looked = now
         if self._filter is None or boot[c.JUMPS] != self._jumps or not passed < 10 * EVERY_S:

@@ -1,11 +1,12 @@
 """Datagrams off a socket, as many at once as there are: `recvmmsg` on Linux, one by one elsewhere.
 
-Source: recvmmsg(2), udp(7); structures as in <sys/socket.h> of 64-bit Linux.
+Source: recvmmsg(2), udp(7), socket(7), cmsg(3); structures as in <sys/socket.h> of 64-bit Linux.
 """
 
 import ctypes
 import socket
 import sys
+import time
 from collections.abc import Hashable
 from typing import Protocol
 
@@ -15,9 +16,13 @@ import numpy as np
 from fleet.telemetry.heard import Heard, tight
 from gateway.link import wall
 
-MOST = 512  # datagrams taken at once
+MOST = 1024  # datagrams taken at once
 LONGEST = 65_536  # no datagram is longer [bytes]
 _ADDRESS = 28  # bytes of an IPv6 socket address; IPv4 takes 16
+_STAMPS = 35  # SO_TIMESTAMPNS: the system says when a datagram came, however late it is fetched
+_STAMP = 4  # numbers of such a word: length, kind, seconds, nanoseconds
+_STAMPED = socket.SOL_SOCKET | _STAMPS << 32
+_LATEST_S = 1.0  # a datagram fetched later than that counts as this late: the system's clock was set
 _MOST_KNOWN = 4096  # addresses whose reading is remembered
 _DONTWAIT = getattr(socket, "MSG_DONTWAIT", 0)
 
@@ -88,14 +93,19 @@ class Bulk:
         self._call.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
         self._slots = np.zeros(MOST * LONGEST, np.uint8)
         self._names = np.zeros((MOST, _ADDRESS), np.uint8)
+        self._stamps = np.zeros((MOST, _STAMP), np.int64)
+        self._newest = 0.0  # arrival [s since 1970]
         self._starts = np.arange(MOST) * LONGEST
         self._vectors, self._messages = (_Vector * MOST)(), (_Message * MOST)()
         for i, (vector, message) in enumerate(zip(self._vectors, self._messages, strict=True)):
             vector.base, vector.size = self._slots.ctypes.data + i * LONGEST, LONGEST
             message.header.name = self._names.ctypes.data + i * _ADDRESS
             message.header.vectors, message.header.vector_count = ctypes.addressof(vector), 1
+            message.header.control = self._stamps.ctypes.data + i * self._stamps.strides[0]
+        sock.setsockopt(socket.SOL_SOCKET, _STAMPS, 1)
         self._lengths = self._column(_Message.length.offset)
         self._name_sizes = self._column(_Message.header.offset + _Header.name_size.offset)
+        self._stamp_sizes = self._column(_Message.header.offset + _Header.control_size.offset)
         self._known: dict[bytes, Hashable] = {}
         numbered(self._names[:0], self._name_sizes[:0])  # compiles before anything comes
 
@@ -105,16 +115,24 @@ class Bulk:
 
     def take(self) -> Heard | None:
         """Give the datagrams that wait; None where there are none."""
-        self._name_sizes[:] = _ADDRESS
+        self._name_sizes[:], self._stamp_sizes[:] = _ADDRESS, self._stamps.itemsize * _STAMP
         count = self._call(self._sock.fileno(), ctypes.addressof(self._messages), MOST, _DONTWAIT, None)
         if count <= 0:  # nothing there, or an earlier answer found nobody
             return None
-        arrival = np.full(count, wall())
         lengths = self._lengths[:count].astype(np.int64)
         buf, stop = tight(self._slots, self._starts[:count], lengths)
         sender, first = numbered(self._names[:count], self._name_sizes[:count])
         names = [self._names[i, : self._name_sizes[i]].tobytes() for i in first.tolist()]
-        return Heard(buf, stop - lengths, stop, arrival, sender, tuple(map(self._address, names)))
+        return Heard(buf, stop - lengths, stop, self._arrivals(count), sender, tuple(map(self._address, names)))
+
+    def _arrivals(self, count: int) -> np.ndarray:
+        """Tell when datagrams came, never falling, (n,) [s since 1970]; where the system does not say so: now."""
+        now, told = wall(), self._stamps[:count]
+        stamped = (self._stamp_sizes[:count] > 0) & (told[:, 1] == _STAMPED)
+        late = np.where(stamped, time.time() - told[:, 2] - told[:, 3] * 1e-9, 0.0)
+        found = np.maximum.accumulate(np.maximum(now - np.clip(late, 0.0, _LATEST_S), self._newest))
+        self._newest = float(found[-1])
+        return found
 
     def _address(self, raw: bytes) -> Hashable:
         if raw not in self._known:

@@ -13,9 +13,9 @@ from gateway.links.backoff import BackOff
 from gateway.links.receive import receiver
 from gateway.spec import Spec
 
-BUFFER = 1 << 22  # asked of the system [bytes]
+BUFFER = 1 << 24  # asked of the system: half a second of 250 aircraft [bytes]
 _FORCE = 33  # SO_RCVBUFFORCE: beyond the system's limit, where that is allowed
-_LONGEST_NAP_S = 0.005
+_LONGEST_NAP_S = 0.02
 _FILL = 4e8  # bytes of buffer a flood of 300,000 datagrams a second takes [bytes/s]
 
 _log = logging.getLogger(__name__)

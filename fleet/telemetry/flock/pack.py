@@ -39,10 +39,10 @@ _WORDS = _chunks(
 
 @nb.njit(cache=True, nogil=True)
 def _put(out, at, told, start, stop):
-    for i in range(start, stop):
-        out[at] = told[i]
-        at += 1
-    return at
+    to, start, n = nb.uint64(at), nb.uint64(start), nb.uint64(stop - start)  # no index from the end: twice as fast
+    for i in range(n):
+        out[to + i] = told[start + i]
+    return at + stop - start
 
 
 @nb.njit(cache=True, nogil=True)
