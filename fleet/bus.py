@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import zenoh
 
 from fleet.access.entry import ROUTER, Entry, endpoint
-from fleet.access.knock import knock, reachable
+from fleet.access.knock import answers, reachable
 from fleet.access.roles import ROOT
 from fleet.codec import Stamp, Wire, decode, encode, encoding, pack_stamp, unpack_stamp
 from fleet.contract import PER_UAV, Claim
@@ -226,8 +226,7 @@ def connect(router: str | Entry = ROUTER, *, patient: bool = False) -> ZenohBus:
         ValueError: when what we show is missing, expired or open to others.
     """
     entry = _entry(router)
-    if reachable(entry.at):
-        knock(entry)
+    if answers(entry):
         try:
             return ZenohBus(zenoh.open(_config(entry.session())))
         except zenoh.ZError:

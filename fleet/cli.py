@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from fleet import __version__, commands
 from fleet.children import PARENT
-from fleet.plain import plain
+from fleet.logs import begin, fail
 
 GRACE_S = 30.0  # an orphan may take so long to end by its own door [s]
 
@@ -33,10 +33,11 @@ def parser_for(prog: str, summary: str, examples: str) -> argparse.ArgumentParse
 
 def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
     """Run a command; an expected failure becomes one sentence and exit code 2, Ctrl-C a clean 0."""
+    begin(prog, as_json=getattr(args, "log_json", False))
     try:
         return run(args)
     except (ValueError, OSError) as error:
-        print(f"{prog}: {plain(str(error))}", file=sys.stderr)
+        fail(prog, str(error))
         return 2
     except KeyboardInterrupt:
         return 0

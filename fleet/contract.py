@@ -618,6 +618,9 @@ class Account(msgspec.Struct, frozen=True, kw_only=True):
     unsure: Annotated[int, Meta(description="published in the second before a router was missed")] = 0
     removed: Annotated[int, Meta(description="recordings removed to stay within the budget")] = 0
     history_bytes: Annotated[int, Meta(description="kept for late joiners")] = 0
+    now: Annotated[float, Meta(description="when it was counted, by the gateway's own clock [s since 1970]")] = 0.0
+    machine: Annotated[str, Meta(description="name of the machine it runs on")] = ""
+    code: Annotated[str, Meta(description="hash of the sources it runs")] = ""
 
 
 class Claim(msgspec.Struct, frozen=True, kw_only=True):
@@ -634,6 +637,8 @@ class Claim(msgspec.Struct, frozen=True, kw_only=True):
     held: Annotated[tuple[tuple[int, int], ...], Meta(description="UAV id and epoch of each aircraft held")] = ()
     bare: Annotated[tuple[int, ...], Meta(description="of these, whose telemetry of before is not there yet")] = ()
     leaving: Annotated[bool, Meta(description="true: it hands over everything and goes")] = False
+    machine: Annotated[str, Meta(description="name of the machine it runs on")] = ""
+    code: Annotated[str, Meta(description="hash of the sources it runs")] = ""
     seen: Annotated[
         tuple[tuple[int, int, str], ...],
         Meta(description="to queries only: UAV id, epoch and writer of the highest claim it knows of"),

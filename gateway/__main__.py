@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import gc
-import logging
 import sys
 from pathlib import Path
 
@@ -14,6 +13,8 @@ from fleet.bars import shown
 from fleet.bus import connect
 from fleet.cli import guarded, parser_for, stop_on_signal
 from fleet.config import entry, router_arguments
+from fleet.logs import log_arguments, say
+from fleet.metrics import served
 from fleet.telemetry.ids import Ids
 from fleet.telemetry.intake import MOST_UAVS
 from fleet.telemetry.warm import warm_up
@@ -21,7 +22,7 @@ from gateway.board import posted
 from gateway.gate import gates_of
 from gateway.link import Link
 from gateway.links.opening import open_link
-from gateway.metrics import served
+from gateway.metrics import counters
 from gateway.onboard.cache import Cache
 from gateway.onboard.rates import BUDGET
 from gateway.pump import Pump
@@ -103,18 +104,17 @@ def run(args: argparse.Namespace) -> int:
                 console = Console() if sys.stdout.isatty() and not replays else None
                 held.enter_context(posted(pump.publisher.newest, _say, console))
             if args.metrics:
-                _say(f"counters at {held.enter_context(served(args.metrics, pump.publisher.newest))}")
+                _say(f"counters at {held.enter_context(served(args.metrics, counters(pump.publisher.newest)))}")
             pump.run(stop)
     return 0
 
 
 def _say(line: str) -> None:
-    print(f"gateway: {line}", flush=True)
+    say("gateway", line)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the `gateway` command."""
-    logging.basicConfig(format="gateway: %(message)s")
     parser = parser_for("gateway", (__doc__ or "").strip().splitlines()[0], EXAMPLES)
     parser.add_argument(
         "--link", action="append", metavar="LINK", help=f"where aircraft are; may be given again ({DEFAULT_LINK})"
@@ -137,6 +137,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         "--record-budget", default="10G", metavar="SIZE", help="what its .tlog may take up; the oldest go (10G)"
     )
+    log_arguments(parser)
     parser.add_argument("--metrics", metavar="HOST:PORT", help="counters for Prometheus, e.g. 127.0.0.1:9100")
     return guarded("gateway", run, parser.parse_args(argv))
 

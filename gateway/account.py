@@ -1,9 +1,12 @@
 """The counters of one gateway, gathered from its links once a second."""
 
+import platform
+import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from fleet import SOURCES
 from fleet.contract import Account, LinkAccount
 from fleet.telemetry.heard import Heard
 from fleet.telemetry.intake import Intake
@@ -87,6 +90,9 @@ class Tally:
             unsure=way.unsure,
             router=way.joined,
             removed=self._recorder.budget.removed if self._recorder is not None else 0,
+            now=time.time(),
+            machine=platform.node(),
+            code=SOURCES,
         )
 
     def _link(self, t: float, number: int, intake: Intake, taped: Taped, share: Share) -> LinkAccount:

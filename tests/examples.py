@@ -259,6 +259,9 @@ MESSAGES = (
         unsure=2,
         removed=1,
         history_bytes=5000,
+        now=T + 1.0,
+        machine="ground-1",
+        code="0123456789abcdef",
     ),
     Claim(
         t=T,
@@ -266,6 +269,8 @@ MESSAGES = (
         held=((UAV, 5), (8, 1_700_000_000_000)),
         bare=(8,),
         leaving=True,
+        machine="ground-2",
+        code="0123456789abcdef",
         seen=((9, 4, "00000000000000cd"),),
     ),
     Handover(t=T, uav=UAV, epoch=5, code="0123456789abcdef", load=b"twin"),

@@ -14,7 +14,7 @@ from conftest import ROOT, unused_port
 
 from fleet import commands
 from fleet.access.entry import Entry
-from fleet.access.knock import knock
+from fleet.access.knock import answers
 from fleet.access.papers import ending, papers_of, password_of
 from fleet.access.roles import ROLES, ROUTER_ROLE
 from fleet.access.rules import PASSWORD, access_control
@@ -169,16 +169,16 @@ def test_an_authority_is_replaced_without_anyone_being_shut_out(tmp_path: Path) 
     assert (site / "ca.pem").read_text().count("BEGIN CERTIFICATE") == 2
     assert script("role", site, "viewer", "worker").returncode == 0
     with open_router(Entry(at, certificates=site)):  # the router trusts both, shows its old certificate
-        knock(Entry(at, "worker", old))
-        knock(Entry(at, "worker", site))
+        assert answers(Entry(at, "worker", old))
+        assert answers(Entry(at, "worker", site))
     assert script("router", site, "127.0.0.1").returncode == 0 and script("drop-ca", site).returncode == 0
     with open_router(Entry(at, certificates=site)):
-        knock(Entry(at, "worker", site))
+        assert answers(Entry(at, "worker", site))
         with pytest.raises(ConnectionError, match="not to be believed"):
-            knock(Entry(at, "worker", old))
+            answers(Entry(at, "worker", old))
         shutil.copy(site / "ca.pem", old)
         with pytest.raises(ConnectionError, match="refuses us as worker"):
-            knock(Entry(at, "worker", old))
+            answers(Entry(at, "worker", old))
 
 
 def test_the_script_refuses_what_would_lose_something(papers: Path, tmp_path: Path) -> None:

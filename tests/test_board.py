@@ -16,11 +16,12 @@ from test_gateway import PATIENCE_S, Ear
 
 from fleet.bus import MemoryBus
 from fleet.contract import Account, Status
+from fleet.metrics import served
 from gateway import board
 from gateway.account import overruns
 from gateway.board import drawn, in_line, posted
 from gateway.links.udp import Udp
-from gateway.metrics import served
+from gateway.metrics import counters
 from gateway.pump import Pump
 from gateway.record.recorder import Recorder
 from gateway.record.tape import Budget
@@ -62,10 +63,10 @@ def test_plain_lines_come_at_news_and_now_and_then(monkeypatch):
 
 
 def test_prometheus_reads_every_number_of_the_account(free_port):
-    with served(f"127.0.0.1:{free_port}", lambda: (ACCOUNT, [STATUS])) as address:
+    with served(f"127.0.0.1:{free_port}", counters(lambda: (ACCOUNT, [STATUS]))) as address:
         with urllib.request.urlopen(address, timeout=PATIENCE_S) as reply:
             families = list(text_string_to_metric_families(reply.read().decode()))
-        with pytest.raises(OSError, match="is not free"), served(f"127.0.0.1:{free_port}", lambda: (None, [])):
+        with pytest.raises(OSError, match="is not free"), served(f"127.0.0.1:{free_port}", list):
             pass
     found = {(s.name.removesuffix("_total"), *sorted(s.labels.values())): s.value for f in families for s in f.samples}
     link = ACCOUNT.per_link[0]
@@ -82,7 +83,7 @@ def test_prometheus_reads_every_number_of_the_account(free_port):
 
 @pytest.mark.parametrize("where", ["9100", "127.0.0.1:", "127.0.0.1:x", "127.0.0.1:99999"])
 def test_what_is_no_address_stops_at_start(where):
-    with pytest.raises(ValueError, match=r"^--metrics: found .*; correct it$"), served(where, lambda: (None, [])):
+    with pytest.raises(ValueError, match=r"^--metrics: found .*; correct it$"), served(where, list):
         pass
 
 

@@ -12,6 +12,7 @@ PACKAGES = ("fleet", "gateway", "twin_worker", "viewer")
 
 ROOMS = (  # inside fleet a room imports only from rooms above it, and from itself
     ("frames", "plain"),
+    ("logs",),
     ("contract",),
     ("access",),
     ("codec",),
@@ -30,7 +31,7 @@ ROOMS = (  # inside fleet a room imports only from rooms above it, and from itse
     ("pretend",),
     ("config",),
     ("children",),
-    ("cli", "commands", "prove"),
+    ("cli", "commands", "prove", "metrics", "examine"),
 )
 RANK = {f"fleet.{name}": rank for rank, names in enumerate(ROOMS) for name in names}
 
@@ -212,7 +213,7 @@ def test_the_house_keeps_its_law(rule: Callable[..., Iterator[str]], pytestconfi
 
 SHARED = (  # what concealer and finder may both stand on: words, frames, formats; nothing that flies or decides
     *("fleet", "fleet.contract", "fleet.cli", "fleet.children", "fleet.commands", "fleet.frames", "fleet.mission"),
-    *("fleet.codec", "fleet.config", "fleet.plain"),
+    *("fleet.codec", "fleet.config", "fleet.plain", "fleet.logs"),
 )
 AUTOPILOT = "fleet.autopilots"  # flies the pretend aircraft; the finder has no use for it, but draws beside who has
 

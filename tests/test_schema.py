@@ -6,8 +6,9 @@ import sys
 import pytest
 
 from fleet import cli
-from fleet.commands import doctor
 from fleet.contract import COLUMNS, TOPICS, Prediction, WhatIf
+from fleet.examine import machine
+from fleet.examine.finding import Finding
 
 
 def shown(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
@@ -65,6 +66,6 @@ def test_doctor_gives_a_line_each_and_fails_only_on_what_is_bad(
     assert [line.split()[1] for line in lines[:2]] == ["python", "packages"]
     assert ".".join(map(str, sys.version_info[:3])) in lines[0]
 
-    monkeypatch.setattr(doctor, "packages", lambda: [doctor.Finding("BAD", "packages", "missing numpy; make setup")])
+    monkeypatch.setattr(machine, "packages", lambda: [Finding("BAD", "packages", "missing numpy; make setup")])
     assert cli.main(["doctor", "--router", router]) == 1
     assert cli.main(["doctor", "--router", "nonsense"]) == 2

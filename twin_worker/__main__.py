@@ -1,6 +1,7 @@
 """`twin_worker --uavs 0-49`: hold the twins of a range of UAVs."""
 
 import argparse
+import contextlib
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +12,8 @@ from fleet.bus import connect
 from fleet.cli import guarded, id_range, parser_for, stop_on_signal
 from fleet.config import entry, router_arguments
 from fleet.contract import FleetState
+from fleet.logs import log_arguments, say
+from fleet.metrics import address, served
 from twin_worker.engine.many import run_many
 from twin_worker.engine.pace import read_pace
 
@@ -60,6 +63,7 @@ def _run(args: argparse.Namespace) -> int:
     with connect(entry(args, WORKER)) as bus:
         bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
         from twin_worker.conflict.separation import Separation
+        from twin_worker.metrics import counters
         from twin_worker.mismatch.background import Background
         from twin_worker.mismatch.live import Live
         from twin_worker.warm import warm_up  # numba is slow to import: say what happens first
@@ -77,11 +81,12 @@ def _run(args: argparse.Namespace) -> int:
             diagnosis=None if args.no_diagnosis else Live(hand, bases, adapt=not args.no_adapt),
         )
         warm_up()  # before anything is claimed: who compiles cannot take over
-        print(f"twin_worker {bus.writer:016x}: may hold UAVs {args.uavs.start}-{args.uavs.stop - 1}", flush=True)
-        try:
+        say(f"twin_worker {bus.writer:016x}", f"may hold UAVs {args.uavs.start}-{args.uavs.stop - 1}")
+        with contextlib.ExitStack() as held:
+            held.callback(hand.close)
+            if args.metrics:
+                say("twin_worker", f"counters at {held.enter_context(served(args.metrics, counters(worker, bus)))}")
             worker.run(stop)
-        finally:
-            hand.close()
     return 0
 
 
@@ -93,7 +98,11 @@ def _run_many(args: argparse.Namespace) -> int:
     """
     if not 1 <= args.processes <= 256:
         raise ValueError(f"--processes: found {args.processes}, expected 1 to 256; one for each core is a good choice")
-    return run_many(args.processes, [*args.options, "--processes=1"], stop_on_signal())
+    options = [[*args.options, "--processes=1"] for _ in range(args.processes)]
+    if args.metrics:
+        host, port = address(args.metrics)
+        options = [[*each, f"--metrics={host}:{port + k}"] for k, each in enumerate(options)]
+    return run_many(options, stop_on_signal())
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -136,6 +145,10 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--no-diagnosis", action="store_true", help="do not diagnose at all")
     parser.add_argument(
         "--processes", type=int, default=1, metavar="N", help="workers on this machine that share the range (1)"
+    )
+    log_arguments(parser)
+    parser.add_argument(
+        "--metrics", metavar="HOST:PORT", help="counters for Prometheus; of more processes: the ports from there on"
     )
     args = parser.parse_args(argv)
     args.options = sys.argv[1:] if argv is None else argv

@@ -7,6 +7,7 @@ from fleet.access.roles import VIEWER
 from fleet.bus import connect
 from fleet.cli import guarded, parser_for, stop_on_signal
 from fleet.config import entry, router_arguments
+from fleet.logs import log_arguments, say
 from viewer.app import App, quiet, serve
 
 EXAMPLES = """
@@ -27,6 +28,7 @@ def main(argv: list[str] | None = None) -> int:
         "authenticating reverse proxy before anything wider)",
     )
     router_arguments(parser)
+    log_arguments(parser)
     parser.add_argument("--light", action="store_true", help="light colours, for bright surroundings")
     return guarded("viewer", run, parser.parse_args(argv))
 
@@ -45,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         server = serve(args.host, args.port)
         try:
             app = App(bus, server, light=args.light)
-            print(f"viewer: http://{args.host}:{args.port}", flush=True)
+            say("viewer", f"http://{args.host}:{args.port}")
             app.run(stop)
         finally:
             with quiet():

@@ -2,6 +2,7 @@
 
 import socket
 import ssl
+from pathlib import Path
 
 from fleet.access.entry import Entry, endpoint
 
@@ -22,35 +23,28 @@ def reachable(router: str) -> bool:
         return False
 
 
-def knock(entry: Entry) -> None:
-    """Shake hands as a session would, and let go again; without certificates there is nothing to try.
+def answers(entry: Entry) -> bool:
+    """Tell whether a router is there; with certificates, shake hands as a session would, and let go again.
 
     Raises:
-        ConnectionError: when nobody answers, or one side refuses the other; the sentence says which and why.
+        ConnectionError: when one side refuses the other; the sentence says which and why.
         ValueError: when our own certificate is missing, expired or open to others.
     """
-    host, port = endpoint(entry.at)
     if entry.certificates is None:
-        return
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    try:
-        context.load_verify_locations(entry.certificates / "ca.pem")
-        if (own := entry.papers()) is not None:
-            context.load_cert_chain(*own)
-    except ssl.SSLError as error:
-        raise ValueError(
-            f"certificates: found {entry.certificates} to hold what does not fit together ({_said(error)}), expected a "
-            f"certificate with its key; make them again: certificates.sh role FOLDER {entry.role}"
-        ) from None
+        return reachable(entry.at)
+    context = _context(entry, entry.certificates)
+    host, port = endpoint(entry.at)
     try:
         plain = socket.create_connection((host, port), timeout=_PATIENCE_S)
+    except OSError:
+        return False
+    try:
         with plain, context.wrap_socket(plain, server_hostname=host) as secure:
             _refused(secure)
     except ssl.SSLCertVerificationError as error:
         raise ConnectionError(
-            f"router {entry.at}: found its certificate not to be believed ({error.verify_message}), "
-            "expected one for this name, by the authority in ca.pem; "
-            "copy the site's ca.pem here, or renew the router's certificate"
+            f"router {entry.at}: found its certificate not to be believed ({error.verify_message}), expected one for "
+            "this name, by the authority in ca.pem; copy the site's ca.pem here, or renew the router's certificate"
         ) from None
     except ssl.SSLError as error:
         raise ConnectionError(
@@ -62,6 +56,23 @@ def knock(entry: Entry) -> None:
             f"router {entry.at}: found no TLS there ({error.strerror or error}), expected a handshake; is it the tls "
             "endpoint of a router?"
         ) from None
+    return True
+
+
+def _context(entry: Entry, folder: Path) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    try:
+        context.load_verify_locations(folder / "ca.pem")
+        if (own := entry.papers()) is not None:
+            context.load_cert_chain(*own)
+    except ssl.SSLError as error:
+        raise ValueError(
+            f"certificates: found {folder} to hold what does not fit together ({_said(error)}), expected a certificate "
+            f"with its key; make them again: certificates.sh role FOLDER {entry.role}"
+        ) from None
+    except OSError as error:
+        raise ValueError(f"certificates: {folder} holds no ca.pem ({error.strerror}); copy the site's") from None
+    return context
 
 
 def _refused(secure: ssl.SSLSocket) -> None:

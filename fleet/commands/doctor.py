@@ -1,132 +1,58 @@
-"""Check this machine: Python, packages, caches, ports, browser.
+"""Check this machine, the way onto the bus, and the fleet behind it: a line each, a cure where one is needed.
 
-One line each: `ok`, `note` (something optional is missing) or `BAD` (the fleet cannot run; exit code 1).
+One line each: `ok`, `note` (something optional is missing) or `BAD` (exit code 1). With a router there: certificates,
+clocks and sources of all machines, who writes for which aircraft, which have no writer or two.
 """
 
 import argparse
-import importlib.metadata
-import os
-import shutil
-import socket
+import json
 import sys
 from collections.abc import Iterator
-from pathlib import Path
-from typing import NamedTuple
 
-from fleet.bus import endpoint, reachable
+from fleet.access.entry import Entry
+from fleet.bus import connect
 from fleet.config import entry, router_arguments
+from fleet.examine import claims, door, machine
+from fleet.examine.finding import BAD, Finding
+from fleet.plain import plain
 
 EXAMPLES = """
   fleet doctor
   fleet doctor --router tcp/127.0.0.1:7448
+  fleet doctor --config fleet.toml
+  fleet doctor --json
 """
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-MAVLINK_PORT = 14550
-
-
-class Finding(NamedTuple):
-    """What one check found: `ok`, `note` or `BAD`, about what, in a sentence."""
-
-    grade: str
-    what: str
-    sentence: str
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     router_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="a list of objects instead of lines")
 
 
 def run(args: argparse.Namespace) -> int:
     """Print every finding; exit code 1 when one of them is BAD."""
-    found = [python(), *packages(), compile_cache(), router(entry(args).at), mavlink_port(), chromium(), recordings()]
-    for grade, what, sentence in found:
-        print(f"{grade:5} {what:14} {sentence}")
-    return int(any(finding.grade == "BAD" for finding in found))
+    found = []
+    for finding in _looked(entry(args)):
+        found.append(finding)
+        if not args.json:
+            print(f"{finding.grade:5} {finding.what:14} {plain(finding.sentence)}", flush=True)
+    if args.json:
+        json.dump([finding._asdict() for finding in found], sys.stdout, indent=1)
+        print()
+    return int(any(finding.grade == BAD for finding in found))
 
 
-def python() -> Finding:
-    """Name the interpreter; one older than 3.11 does not get as far as this line."""
-    return Finding("ok", "python", ".".join(map(str, sys.version_info[:3])))
-
-
-def packages() -> Iterator[Finding]:
-    """Check that every run-time dependency is installed."""
-    try:
-        wanted = importlib.metadata.requires("parauav") or []
-    except importlib.metadata.PackageNotFoundError:
-        yield Finding("note", "packages", "parauav itself is not installed, only on the path; make setup")
+def _looked(at: Entry) -> Iterator[Finding]:
+    yield from machine.look()
+    yield from door.papers(at)
+    there = yield from door.router(at)
+    if not there:
         return
-    names = [line.split(";")[0].strip() for line in wanted if "extra ==" not in line]
-    missing = [name for name in names if not _installed(name)]
-    if missing:
-        yield Finding("BAD", "packages", f"missing {', '.join(missing)}; make setup")
-    else:
-        yield Finding("ok", "packages", ", ".join(f"{name} {_installed(name)}" for name in names))
-
-
-def _installed(name: str) -> str:
     try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return ""
-
-
-def compile_cache() -> Finding:
-    """Check that numba may keep what it compiles."""
-    folder = Path(os.environ["NUMBA_CACHE_DIR"])
-    nearest = next(p for p in (folder, *folder.parents) if p.exists())
-    if not os.access(nearest, os.W_OK):
-        return Finding("BAD", "compile cache", f"may not write {folder}; name another folder in PARAUAV_CACHE")
-    count = sum(1 for _ in folder.rglob("*.nbc")) if folder.exists() else 0
-    state = f"{count} functions compiled" if count else "empty, so the first start compiles (a minute)"
-    return Finding("ok", "compile cache", f"{folder}: {state}")
-
-
-def router(at: str) -> Finding:
-    """Check who is at the router's endpoint."""
-    if reachable(at):
-        return Finding("ok", "router", f"{at} answers; `fleet up` will use it")
-    host, port = endpoint(at)
-    free = _free(socket.SOCK_STREAM, host, port)
-    if free:
-        return Finding("ok", "router", f"{at} is free; `fleet up` will open a router there")
-    return Finding("BAD", "router", f"{at} neither answers nor is free; name another --router")
-
-
-def mavlink_port() -> Finding:
-    """Check that aircraft could reach us at the usual UDP port."""
-    if _free(socket.SOCK_DGRAM, "0.0.0.0", MAVLINK_PORT):
-        return Finding("ok", "mavlink", f"udp port {MAVLINK_PORT} is free")
-    return Finding("note", "mavlink", f"udp port {MAVLINK_PORT} is taken; name another: --link udpin:0.0.0.0:14551")
-
-
-def _free(kind: socket.SocketKind, host: str, port: int) -> bool:
-    try:
-        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, kind) as s:
-            if kind == socket.SOCK_STREAM:
-                s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            s.bind((host, port))
-            return True
-    except OSError:
-        return False
-
-
-def chromium() -> Finding:
-    """Look for a browser; only the viewer's tests and screenshots need one."""
-    found = os.environ.get("PARAUAV_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        return Finding("note", "chromium", "none, so no browser tests; apt-get install chromium, or PARAUAV_CHROMIUM")
-    return Finding("ok", "chromium", found)
-
-
-def recordings() -> Finding:
-    """Look for recorded flights; only some tests need them."""
-    named = os.environ.get("PARAUAV_RECORDINGS")
-    if not named or not Path(named).is_dir():
-        return Finding(
-            "note", "recordings", f"PARAUAV_RECORDINGS is {named or 'not set'}; tests on recordings are skipped"
-        )
-    count = sum(1 for path in Path(named).rglob("*") if path.is_file())
-    return Finding("ok", "recordings", f"{count} files in {named}")
+        bus = connect(at)
+    except ConnectionError as error:
+        yield Finding(BAD, "router", str(error))
+        return
+    with bus:
+        yield from claims.look(bus)

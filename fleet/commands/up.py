@@ -12,7 +12,8 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from fleet.bus import Bus, connect, open_router, reachable
+from fleet.access.knock import answers
+from fleet.bus import Bus, connect, open_router
 from fleet.children import Children
 from fleet.cli import stop_on_signal
 from fleet.commands.fly import AIRCRAFT, AUTOPILOTS, fault_arguments, faults_of
@@ -74,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     stop = stop_on_signal()
     at = entry(args)
-    router = None if reachable(at.at) else open_router(at)
+    router = None if answers(at) else open_router(at)
     try:
         with connect(at) as bus, Children() as children:
             _start(children, args)

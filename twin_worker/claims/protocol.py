@@ -11,6 +11,7 @@ heard        a higher claim on what we hold: drop it, without a word
 """
 
 import logging
+import platform
 import threading
 import time
 from collections.abc import Iterable, Iterator
@@ -18,6 +19,7 @@ from typing import Protocol
 
 import msgspec
 
+from fleet import SOURCES
 from fleet.bus import Bus
 from fleet.codec import Stamp
 from fleet.contract import Claim, Handover, Wanted
@@ -119,6 +121,8 @@ class Claiming:
                 held=held,
                 bare=self._keeper.bare,
                 leaving=self.claims.leaving,
+                machine=platform.node(),
+                code=SOURCES,
                 seen=tuple(seen),
             )
 

@@ -9,11 +9,12 @@ _LOOK_S = 0.5
 _AGAIN_S = 5.0  # before one that died is started again, so that what kills it at once does not run hot [s]
 
 
-def run_many(count: int, options: list[str], stop: threading.Event) -> int:
-    """Run so many workers until told to stop; one that dies is started again, one that refuses its options ends all."""
+def run_many(options: list[list[str]], stop: threading.Event) -> int:
+    """Run a worker with each of these options until told to stop; who dies is started again, a refusal ends all."""
     with Children() as children:
-        for k in range(count):
-            children.start(f"worker {k}", "twin_worker", *options)
+        started = {f"worker {k}": each for k, each in enumerate(options)}
+        for name, each in started.items():
+            children.start(name, "twin_worker", *each)
         while not stop.wait(_LOOK_S):
             failed = children.failed()
             for code, sentence in failed:
@@ -22,5 +23,5 @@ def run_many(count: int, options: list[str], stop: threading.Event) -> int:
                     return 2
             if failed and not stop.wait(_AGAIN_S):
                 for name in children.dead():
-                    children.start(name, "twin_worker", *options)
+                    children.start(name, "twin_worker", *started[name])
     return 0

@@ -8,7 +8,7 @@ from typing import Any
 
 import zenoh
 
-from fleet.access.knock import knock
+from fleet.access.knock import answers
 from fleet.bus import _config
 
 from .site import PATIENCE_S, Site, expired, make_papers
@@ -116,7 +116,7 @@ def _impostor(site: Site, folder: Path, name: str) -> str:
     }
     with zenoh.open(_config(entry.router() | papers)):
         try:
-            knock(entry)
+            answers(entry)
         except ConnectionError as error:
             words = str(error).split("found ")[1]
         else:

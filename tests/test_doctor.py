@@ -1,0 +1,183 @@
+"""What `fleet doctor` and `fleet status` say of a fleet: every finding is provoked, every bad one ends in a cure."""
+
+import io
+import json
+import re
+import time
+from collections.abc import Callable, Iterable
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+from conftest import unused_port
+from rich.console import Console
+
+from fleet import SOURCES, cli
+from fleet.access.entry import Entry
+from fleet.bus import MemoryBus, open_router
+from fleet.commands.status import machines, processes, spans
+from fleet.contract import Account, Claim, FleetRow, FleetState, LinkAccount, State, Status
+from fleet.examine import claims, door
+from fleet.examine.finding import BAD, NOTE, OK
+from tests.bench.security.bombs import ESCAPES
+from tests.bench.security.site import expired, make_papers, make_passwords
+
+ONE, TWO = "0" * 15 + "1", "0" * 15 + "2"
+
+
+def claim(worker: str, held: Iterable[int], **said: object) -> Claim:
+    given = {"t": time.time(), "machine": f"m{worker[-1]}", "code": SOURCES} | said
+    return Claim(worker=worker, held=tuple((uav, 5) for uav in held), **given)
+
+
+def fleet(
+    *said: Claim, uavs: Iterable[int] = range(4), live: Iterable[str] = ("1/0-9", "2/0-9"), **account
+) -> MemoryBus:
+    """A bus where these claims are answered, these aircraft heard, and these workers present."""
+    bus = MemoryBus()
+    heard = tuple(uavs)
+    told = Account(t=1.0, uavs=heard, links=("udpin:x",), **({"machine": "gs", "code": SOURCES} | account))
+    bus.answer(Claim, lambda *_: [(one, None) for one in said])
+    bus.answer(Account, lambda *_: [(told, None)])
+    bus.answer(Status, lambda *_: [(Status(uav=uav, t=1.0), None) for uav in heard])
+    for name in live:
+        worker, _, ids = name.partition("/")
+        bus.present(f"worker/{worker.zfill(16)}/{ids}/1")
+    return bus
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(claims, "SETTLE_S", 0.0)
+
+
+def found(bus: MemoryBus, grade: str) -> list[str]:
+    return [f"{one.what}: {one.sentence}" for one in claims.look(bus) if one.grade == grade]
+
+
+def test_a_healthy_fleet_is_told_line_by_line() -> None:
+    bus = fleet(claim(ONE, (0, 1)), claim(TWO, (2, 3)))
+    assert found(bus, BAD) == found(bus, NOTE) == []
+    assert found(bus, OK) == [
+        "gateways: gs: 4 aircraft on 1 links",
+        "clocks: m1: within 0.2 s of this machine's",
+        "clocks: m2: within 0.2 s of this machine's",
+        "versions: all 3 processes run the sources that are here",
+        f"owners: {ONE} on m1: writes for 0-1, may hold 0-9",
+        f"owners: {TWO} on m2: writes for 2-3, may hold 0-9",
+        "orphans: none of 4 aircraft",
+    ]
+
+
+def of(*said: Claim, **more: object) -> MemoryBus:
+    """A fleet of one worker that may hold 0 to 9."""
+    return fleet(*said, live=["1/0-9"], **more)
+
+
+FOUR = range(4)
+WRONG: list[tuple[Callable[[], MemoryBus], str, str]] = [  # made when they are looked at: clocks run on
+    (lambda: fleet(claim(ONE, (0, 1, 2)), claim(TWO, (2, 3))), BAD, f"uav-2: claimed by {ONE} and {TWO}; stop one"),
+    (lambda: fleet(claim(ONE, (0, 1)), claim(TWO, ())), BAD, "uav 2-3: in a worker's range, claimed by none; rest"),
+    (lambda: of(claim(ONE, (0, 1)), uavs=(0, 1, 77, 78)), BAD, "uav 77-78: in no worker's range; start"),
+    (lambda: fleet(claim(ONE, FOUR)), BAD, f"{TWO} is present and does not answer: frozen"),
+    (lambda: fleet(claim(ONE, FOUR), live=[]), BAD, f"{ONE}: claims without being present; restart"),
+    (lambda: of(claim(ONE, FOUR, bare=(2,))), NOTE, "uav 2 without past telemetry"),
+    (lambda: of(claim(ONE, FOUR, t=time.time() - 9.0)), BAD, "m1: 9.0 s behind .*; let both follow"),
+    (lambda: of(claim(ONE, FOUR, t=time.time() + 0.6)), NOTE, "m1: 0.6 s ahead of this machine's"),
+    (lambda: of(claim(ONE, FOUR, code="other")), NOTE, "twin_worker on m1: other sources .* install"),
+    (lambda: of(claim(ONE, FOUR), code="x"), NOTE, "gateway on gs: other sources than here"),
+    (lambda: fleet(live=[]), NOTE, "workers: none answers; start `twin_worker`"),
+]
+
+
+@pytest.mark.parametrize(("make", "grade", "sentence"), WRONG, ids=[sentence[:30] for _, _, sentence in WRONG])
+def test_what_is_wrong_is_found_with_its_cure(make: Callable[[], MemoryBus], grade: str, sentence: str) -> None:
+    lines = found(make(), grade)
+    assert any(re.search(sentence, line) for line in lines), lines
+
+
+def test_two_gateways_of_one_aircraft_and_none_at_all() -> None:
+    bus = of(claim(ONE, FOUR))
+    bus.answer(Account, lambda *_: [(Account(t=1.0, uavs=(3, 9), machine="gs2", code=SOURCES), None)])
+    assert found(bus, BAD) == ["gateways: two publish uav 3; give one of them another offset (#offset=), or stop it"]
+    assert found(MemoryBus(), NOTE)[0].startswith("gateways: none answers; start `gateway`")
+
+
+def test_a_handover_under_way_is_no_fault() -> None:
+    bus, turn = MemoryBus(), iter([((0, 1), (1,)), ((0,), (1,))])
+    bus.present(f"worker/{ONE}/0-9/1")
+    bus.present(f"worker/{TWO}/0-9/1")
+    bus.answer(Claim, lambda *_: [(claim(w, h), None) for w, h in zip((ONE, TWO), next(turn), strict=True)])
+    bus.answer(Status, lambda *_: [(Status(uav=uav, t=1.0), None) for uav in (0, 1)])
+    assert found(bus, BAD) == []
+
+
+def test_names_from_the_wire_are_only_names() -> None:
+    bus = fleet(claim(ONE, range(4), machine=ESCAPES), live=["1/0-9", "1/x-y", "9" * 5000 + "/1-2", "3/0-" + "9" * 99])
+    assert len(list(claims.look(bus))) < 12
+
+
+# --- certificates ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_papers(tmp_path_factory.mktemp("site") / "certificates", "127.0.0.1")
+
+
+def shown(capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, str]:
+    return cli.main(["doctor", *options]), capsys.readouterr().out
+
+
+def test_certificates_are_judged_by_their_end_and_the_fleet_behind_them_is_seen(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    at = f"tls/127.0.0.1:{unused_port()}"
+    file = tmp_path / "fleet.toml"
+    file.write_text(f'[router]\nat = "{at}"\ncertificates = "{site}"\n')
+    with open_router(Entry(at, certificates=site)):
+        code, out = shown(capsys, f"--config={file}")
+    assert code == 0
+    assert out.count("certificates") >= 7 and "the router's: good until" in out and "off line" in out
+    assert "gateways       none answers" in out
+
+    soon = expired(site, "viewer", tmp_path / "soon", ended=timedelta(days=-3))
+    (soon / "worker.key").chmod(0o644)
+    old = {line.sentence: line.grade for line in door.papers(Entry(at, "tools", soon))}
+    assert any(g == NOTE and "viewer: ends on" in s and "renew it: certificates.sh role" in s for s, g in old.items())
+    assert any(g == BAD and "chmod 640" in s for s, g in old.items())
+    gone = [
+        one for one in door.papers(Entry(at, "viewer", expired(site, "viewer", tmp_path / "old"))) if one.grade == BAD
+    ]
+    assert "expired on" in gone[0].sentence and "renew it" in gone[0].sentence
+
+
+def test_a_network_in_the_clear_is_noted(site: Path) -> None:
+    assert [one.grade for one in door.papers(Entry())] == [OK]
+    (note,) = door.papers(Entry("tcp/10.1.2.3:7447", passwords=make_passwords(site)))
+    assert note.grade == NOTE and "in the clear, known by passwords; --config" in note.sentence
+
+
+def test_findings_are_json_too(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out = shown(capsys, "--json", "--router", f"tcp/127.0.0.1:{unused_port()}")
+    assert code == 0 and {"grade", "what", "sentence"} == set(json.loads(out)[0])
+
+
+# --- status ----------------------------------------------------------------------------------------------------------
+
+
+def test_status_tells_which_machine_does_what() -> None:
+    bus = fleet(claim(ONE, (0, 1, 2, 5), leaving=True), per_link=(LinkAccount(link="udpin:x", messages_hz=40.0),))
+    row = FleetRow(uav=0, state=State.WAITING, verdict="", worker=ONE)
+    bus.answer(FleetState, lambda *_: [(FleetState(t=1.0, rows=(row,), sentence=f"busy{ESCAPES}"), None)])
+    console = Console(file=io.StringIO(), width=160)
+    with console.capture() as captured:
+        console.print(machines(processes(bus)))
+    lines = captured.get().splitlines()
+    assert lines[1].split() == ["gs", "gateway", "0-3", "40", "messages/s"]
+    assert lines[2].split()[:5] == ["m1", "worker", ONE, "0-2,", "5"] and "is leaving; busy" in lines[2]
+    assert "\x1b" not in captured.get()
+
+
+def test_ids_are_written_as_spans() -> None:
+    assert [spans(ids) for ids in ((), (3,), (2, 1, 0), (9, 1, 2, 5))] == ["", "3", "0-2", "1-2, 5, 9"]

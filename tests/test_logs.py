@@ -1,0 +1,98 @@
+"""What a process says of itself: sentences for people, JSON for machines, numbers for Prometheus."""
+
+import json
+import logging
+import subprocess
+import sys
+import urllib.request
+
+import pytest
+from conftest import ROOT, unused_port
+from prometheus_client.parser import text_string_to_metric_families
+
+from fleet.bus import MemoryBus
+from fleet.contract import FleetRow, FleetState, State
+from fleet.logs import Lines, Words
+from fleet.metrics import served
+from tests.bench.security.bombs import ESCAPES
+from twin_worker.engine.pace import Work
+from twin_worker.engine.rates import Rates
+from twin_worker.metrics import counters
+
+PATIENCE_S = 10.0
+
+
+def record(message: str, *, defect: bool = False) -> logging.LogRecord:
+    info = None
+    if defect:
+        try:
+            raise ZeroDivisionError("by a stranger")
+        except ZeroDivisionError:
+            info = sys.exc_info()
+    return logging.LogRecord("gateway.router", logging.WARNING, __file__, 1, "%s", (message,), info)
+
+
+def test_people_read_a_sentence_that_steers_no_terminal() -> None:
+    assert Words("gateway").format(record("the router is away")) == "gateway: the router is away"
+    said = Words("gateway").format(record(f"uav-7 says {ESCAPES}"))
+    assert said.isprintable() and said.startswith("gateway: uav-7 says ?]0;owned??[2J")
+    assert "ZeroDivisionError: by a stranger" in Words("gateway").format(record("x", defect=True))
+
+
+def test_machines_read_one_line_of_json() -> None:
+    line = Lines("gateway").format(record(f"uav-7 says {ESCAPES}", defect=True))
+    assert line.isprintable()
+    told = json.loads(line)
+    assert told["message"] == f"uav-7 says {ESCAPES}" and "by a stranger" in told["defect"]
+    assert (told["level"], told["process"], told["from"]) == ("warning", "gateway", "gateway.router")
+    assert told["t"].endswith("+00:00")
+
+
+@pytest.mark.parametrize("module", ["gateway", "twin_worker", "viewer"])
+def test_with_log_json_even_a_refusal_is_a_line_of_json(module: str) -> None:
+    command = [sys.executable, "-m", module, "--log-json", "--router", f"tcp/127.0.0.1:{unused_port()}"]
+    command += ["--link", "nonsense"] if module == "gateway" else []
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2 and done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    told = json.loads(line)
+    assert told["level"] == "error" and told["process"] == module
+    assert ("found 'nonsense'" if module == "gateway" else "nobody answers; start") in told["message"]
+
+
+class Told:
+    """A worker that holds two."""
+
+    def __init__(self) -> None:
+        self.rates = Rates()
+        self.rows = (
+            FleetRow(
+                uav=7, state=State.PREDICTING, verdict="", fit={"V": 91.0}, horizon_s=30.0, alerts=("low",), epoch=9
+            ),
+            FleetRow(uav=8, state=State.WAITING, verdict="", sample_age_s=0.5, mismatch="named icing"),
+        )
+
+    def state(self) -> FleetState:
+        return FleetState(t=1.0, rows=self.rows)
+
+    def shed(self) -> int:
+        return 3
+
+
+def test_a_worker_tells_prometheus_what_it_holds_and_how_it_fares(free_port: int) -> None:
+    bus = MemoryBus()
+    bus.bad = 4
+    where = f"127.0.0.1:{free_port}"
+    with served(where, counters(Told(), bus)) as at, urllib.request.urlopen(at, timeout=PATIENCE_S) as reply:
+        families = list(text_string_to_metric_families(reply.read().decode()))
+    found = {(s.name.removesuffix("_total"), *sorted(s.labels.values())): s.value for f in families for s in f.samples}
+    assert found["parauav_worker_uavs",] == 2 and found["parauav_worker_router",] == 1
+    assert found["parauav_worker_shed",] == 3 and found["parauav_worker_undecodable",] == 4
+    assert found["parauav_worker_state", "predicting"] == 1 == found["parauav_worker_state", "waiting"]
+    assert found["parauav_worker_state", "link_lost"] == 0
+    assert {name[1] for name in found if name[0] == "parauav_worker_period_s"} == {work.value for work in Work}
+    assert found["parauav_twin_horizon_s", "7"] == 30.0 and found["parauav_twin_epoch", "7"] == 9
+    assert found["parauav_twin_fit", "7", "V"] == 91.0 and found["parauav_twin_sample_age_s", "8"] == 0.5
+    assert found["parauav_twin_alerts", "7"] == 1 and found["parauav_twin_mismatch", "8"] == 1
+    assert found["process_resident_memory_bytes",] > 1e6 and found["process_cpu_seconds",] > 0
+    assert all(family.documentation for family in families)
