@@ -15,8 +15,6 @@ from fleet.contract import FleetRow, FleetState, State
 from fleet.logs import Lines, Words
 from fleet.metrics import served
 from tests.bench.security.bombs import ESCAPES
-from twin_worker.engine.pace import Work
-from twin_worker.engine.rates import Rates
 from twin_worker.metrics import counters
 
 PATIENCE_S = 10.0
@@ -60,37 +58,25 @@ def test_with_log_json_even_a_refusal_is_a_line_of_json(module: str) -> None:
     assert ("found 'nonsense'" if module == "gateway" else "nobody answers; start") in told["message"]
 
 
-class Told:
-    """A worker that holds two."""
-
-    def __init__(self) -> None:
-        self.rates = Rates()
-        self.rows = (
-            FleetRow(
-                uav=7, state=State.PREDICTING, verdict="", fit={"V": 91.0}, horizon_s=30.0, alerts=("low",), epoch=9
-            ),
-            FleetRow(uav=8, state=State.WAITING, verdict="", sample_age_s=0.5, mismatch="named icing"),
-        )
-
-    def state(self) -> FleetState:
-        return FleetState(t=1.0, rows=self.rows)
-
-    def shed(self) -> int:
-        return 3
+ROWS = (
+    FleetRow(uav=7, state=State.PREDICTING, verdict="", fit={"V": 91.0}, horizon_s=30.0, alerts=("x",), epoch=9),
+    FleetRow(uav=8, state=State.WAITING, verdict="", sample_age_s=0.5, mismatch="named icing"),
+)
 
 
 def test_a_worker_tells_prometheus_what_it_holds_and_how_it_fares(free_port: int) -> None:
     bus = MemoryBus()
     bus.bad = 4
     where = f"127.0.0.1:{free_port}"
-    with served(where, counters(Told(), bus)) as at, urllib.request.urlopen(at, timeout=PATIENCE_S) as reply:
+    state = FleetState(t=1.0, rows=ROWS, shed=3, done={"identify": 12})
+    with served(where, counters(lambda: state, bus)) as at, urllib.request.urlopen(at, timeout=PATIENCE_S) as reply:
         families = list(text_string_to_metric_families(reply.read().decode()))
     found = {(s.name.removesuffix("_total"), *sorted(s.labels.values())): s.value for f in families for s in f.samples}
     assert found["parauav_worker_uavs",] == 2 and found["parauav_worker_router",] == 1
     assert found["parauav_worker_shed",] == 3 and found["parauav_worker_undecodable",] == 4
     assert found["parauav_worker_state", "predicting"] == 1 == found["parauav_worker_state", "waiting"]
     assert found["parauav_worker_state", "link_lost"] == 0
-    assert {name[1] for name in found if name[0] == "parauav_worker_period_s"} == {work.value for work in Work}
+    assert found["parauav_worker_done", "identify"] == 12
     assert found["parauav_twin_horizon_s", "7"] == 30.0 and found["parauav_twin_epoch", "7"] == 9
     assert found["parauav_twin_fit", "7", "V"] == 91.0 and found["parauav_twin_sample_age_s", "8"] == 0.5
     assert found["parauav_twin_alerts", "7"] == 1 and found["parauav_twin_mismatch", "8"] == 1

@@ -85,7 +85,8 @@ def _run(args: argparse.Namespace) -> int:
         with contextlib.ExitStack() as held:
             held.callback(hand.close)
             if args.metrics:
-                say("twin_worker", f"counters at {held.enter_context(served(args.metrics, counters(worker, bus)))}")
+                where = held.enter_context(served(args.metrics, counters(worker.state, bus)))
+                say("twin_worker", f"counters at {where}")
             worker.run(stop)
     return 0
 

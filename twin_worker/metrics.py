@@ -1,15 +1,12 @@
-"""A worker's numbers as metrics: what it holds, how old that is, how often heavy work is done, what was shed."""
+"""A worker's numbers as metrics: what it holds, how old that is, what heavy work was done, what was shed."""
 
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from fleet.contract import FleetRow, FleetState, State
 from fleet.metrics import Families, Naming, families
-from twin_worker.engine.pace import Work
-from twin_worker.engine.rates import Rates
 
 _NOW = {"horizon_s", "sample_age_s", "prediction_age_s", "t10_s", "t10_censored", "t10_n", "epoch"}
 _TWIN = Naming("parauav_twin", ("uav",), _NOW)
@@ -25,37 +22,22 @@ class Bussed(Protocol):
         """Name the router; empty: none is there."""
 
 
-class Told(Protocol):
-    """Who tells its numbers: a `Worker`."""
-
-    rates: Rates
-
-    def state(self) -> FleetState:
-        """Give the fleet table."""
-
-    def shed(self) -> int:
-        """Count the messages that found no room."""
-
-
-def counters(worker: Told, bus: Bussed) -> Families:
+def counters(state: Callable[[], FleetState], bus: Bussed) -> Families:
     """Give what Prometheus is told."""
-    return lambda: _counters(worker, bus)
+    return lambda: _counters(state(), bus)
 
 
-def _counters(worker: Told, bus: Bussed) -> Iterator[Metric]:
-    rows = worker.state().rows
-    yield GaugeMetricFamily("parauav_worker_uavs", "aircraft held", len(rows))
+def _counters(state: FleetState, bus: Bussed) -> Iterator[Metric]:
+    yield GaugeMetricFamily("parauav_worker_uavs", "aircraft held", len(state.rows))
     yield GaugeMetricFamily("parauav_worker_router", "a router is there", float(bool(bus.router)))
-    yield CounterMetricFamily("parauav_worker_shed", "messages that found no room: too many aircraft", worker.shed())
     yield CounterMetricFamily("parauav_worker_undecodable", "messages heard that do not fit the contract", bus.bad)
-    period = GaugeMetricFamily(
-        "parauav_worker_period_s", "between two of this work on one aircraft, of late; inf: never [s]", labels=["work"]
-    )
-    for work in Work:
-        period.add_metric([work.value], worker.rates.period(work, len(rows), time.monotonic()))
-    yield period
-    yield from families(FleetRow, [((str(row.uav),), row) for row in rows], _TWIN)
-    yield from _judged(rows)
+    yield GaugeMetricFamily("parauav_worker_shed", "messages of aircraft held that found no room", state.shed)
+    done = CounterMetricFamily("parauav_worker_done", "heavy work done", labels=["work"])
+    for work, count in state.done.items():
+        done.add_metric([work], count)
+    yield done
+    yield from families(FleetRow, [((str(row.uav),), row) for row in state.rows], _TWIN)
+    yield from _judged(state.rows)
 
 
 def _judged(rows: tuple[FleetRow, ...]) -> Iterator[Metric]:

@@ -197,10 +197,6 @@ class Worker:
         watch = self.diagnosis and self.diagnosis.watches.get(held.twin.uav)
         return watch.told if watch else None
 
-    def shed(self) -> int:
-        """Count the messages of aircraft held that found no room."""
-        return sum(held.shed for held in self.holding())
-
     def state(self) -> FleetState:
         """Give the fleet table of this worker."""
         writer = f"{self.bus.writer:016x}"
@@ -208,7 +204,8 @@ class Worker:
             fleet_row(h.twin, data_time(h), self.active(h), worker=writer, epoch=h.epoch, mismatch=word(self._found(h)))
             for h in self.holding()
         ]
-        said = [f"{shed} messages shed: too many UAVs for this worker"] if (shed := self.shed()) else []
+        shed = sum(held.shed for held in self.holding())
+        said = [f"{shed} messages shed: too many UAVs for this worker"] if shed else []
         said += self.rates.said(self.pace, len(self.holding()), time.monotonic())
         said += [held.failed for held in self.holding() if held.failed]
         done = {work.value: n for work, n in self.rates.total.items()}
