@@ -13,7 +13,8 @@ from conftest import ROOT, unused_port
 from examples import EXAMPLES
 
 from fleet.access.entry import Entry
-from fleet.access.roles import SAID
+from fleet.access.roles import LIVE, SAID
+from fleet.access.roles import ROOT as WIRE
 from fleet.bus import connect
 from fleet.codec import decode, encode, encoding
 from fleet.commands.router import text
@@ -24,7 +25,7 @@ from tests.bench.security.door import BY_CERTIFICATE, BY_PASSWORD, _kept_out
 from tests.bench.security.role import BY_ROLE
 from tests.bench.security.site import OURS, REAL, Site, make_papers, make_passwords, routed, zenohd
 from tests.bench.security.size import BY_SIZE
-from tests.bench.security.trying import Admitted, Attempt
+from tests.bench.security.trying import FORGED, RIGHT, Admitted, Attempt, fresh, only_heard, until
 from tests.bench.security.victims import VICTIMS, Victim
 
 LIGHT = 1 << 20  # bytes of the largest bomb; the bench has larger ones
@@ -112,6 +113,17 @@ def test_the_attempts_are_real_for_they_succeed_where_nothing_is_guarded(open_si
     assert all(words.startswith("went in") and "nothing was tried" not in words for words in found.values()), found
     with pytest.raises(Admitted, match="joined"):
         _kept_out(open_site, "viewer", {})
+
+
+def test_two_routers_are_one_bus_that_keeps_the_same_rules(guarded: Site, papers: Path) -> None:
+    with routed(OURS, Site(f"tls/127.0.0.1:{unused_port()}", papers), [guarded.at]) as other:
+        name = fresh("prediction")
+        with other.session("worker") as worker, other.session("tools") as forger, guarded.session("viewer") as reader:
+            live = f"{WIRE}/{LIVE}/worker/{name.split('/')[1]}/0-9/1"
+            token = worker.liveliness().declare_token(live)
+            assert only_heard(reader, name, lambda: worker.put(name, RIGHT), lambda: forger.put(name, FORGED))
+            assert until(lambda: any(one.ok for one in reader.liveliness().get(live)))
+            token.undeclare()
 
 
 # --- bombs -----------------------------------------------------------------------------------------------------------

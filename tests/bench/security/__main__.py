@@ -18,7 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from .door import BY_CERTIFICATE, BY_PASSWORD, ends_while_joined
+from .door import BY_CERTIFICATE, BY_PASSWORD, ends_while_joined, renewed_while_joined
 from .role import BY_ROLE
 from .site import OURS, REAL, Site, free_port, make_papers, make_passwords, routed, zenohd
 from .size import BY_SIZE
@@ -49,7 +49,7 @@ def _tried(kind: str) -> Iterator[dict[str, Any]]:
         words = Site(f"tcp/127.0.0.1:{free_port()}", folder, make_passwords(folder))
         both = Site(f"tls/127.0.0.1:{free_port()}", folder, words.passwords)
         for what, site, attempts in (
-            ("certificates", mutual, (*BY_CERTIFICATE, ends_while_joined, *BY_ROLE, *BY_SIZE)),
+            ("certificates", mutual, (*BY_CERTIFICATE, ends_while_joined, renewed_while_joined, *BY_ROLE, *BY_SIZE)),
             ("passwords", words, (*BY_PASSWORD, *BY_ROLE, *BY_SIZE)),
             ("passwords in TLS", both, (*BY_PASSWORD, *BY_ROLE)),
             ("loopback, nothing shown", Site(f"tcp/127.0.0.1:{free_port()}", folder), BY_SIZE),

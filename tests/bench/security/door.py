@@ -1,5 +1,6 @@
 """Attempts to come in: without certificate or password, with the wrong one, and to pass for the router."""
 
+import shutil
 import time
 from dataclasses import replace
 from datetime import timedelta
@@ -76,6 +77,20 @@ def ends_while_joined(site: Site) -> str:
         if not until(lambda: not session.info.routers_zid()):
             raise Admitted(f"it is still there after {PATIENCE_S:.0f} s")
         return f"hung up after {time.monotonic() - begun:.1f} s of {left_s}"
+
+
+def renewed_while_joined(site: Site) -> str:
+    """Renew a certificate that ends while it is used: its process must come back by itself, without a restart."""
+    mine = expired(site.folder, "worker", _folder(site), ended=timedelta(seconds=-3))
+    with site.session("worker", _shown(mine, "worker")) as session:
+        for suffix in ("pem", "key"):
+            shutil.copy(site.folder / f"worker.{suffix}", mine)
+        if not until(lambda: not session.info.routers_zid()):
+            raise Admitted(f"it is still there after {PATIENCE_S:.0f} s")
+        begun = time.monotonic()
+        if not until(lambda: bool(session.info.routers_zid())):
+            raise Admitted("it did not come back")
+        return f"back after {time.monotonic() - begun:.2f} s"
 
 
 BY_CERTIFICATE: tuple[Attempt, ...] = (

@@ -22,7 +22,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from fleet.access.entry import Entry, endpoint
 from fleet.access.knock import reachable
 from fleet.access.roles import ROLES, ROUTER_ROLE
-from fleet.bus import _config, open_router
+from fleet.bus import _config
 from fleet.commands.router import text
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -127,17 +127,17 @@ def zenohd() -> str | None:
 
 
 @contextlib.contextmanager
-def routed(kind: str, site: Site) -> Iterator[Site]:
-    """Have a router at the site for as long as the block lasts."""
-    entry = site.entry("tools")
+def routed(kind: str, site: Site, beside: list[str] | None = None) -> Iterator[Site]:
+    """Have a router at the site for as long as the block lasts, perhaps beside others."""
+    settings = site.entry("tools").router(beside=beside)
     if kind == OURS:
-        with open_router(entry):
+        with zenoh.open(_config(settings)):
             yield site
         return
     program = zenohd()
     assert program is not None
     config = site.folder / f"zenohd-{endpoint(site.at)[1]}.json5"
-    config.write_text(text(entry.router()))
+    config.write_text(text(settings))
     log = (site.folder / "zenohd.log").open("wb")
     child = subprocess.Popen([program, "-c", str(config)], stdout=log, stderr=log)
     try:

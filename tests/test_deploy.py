@@ -1,0 +1,218 @@
+"""What is in deploy/ is well-formed, and every command line in it is one that the commands take."""
+
+import ast
+import contextlib
+import re
+import shlex
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+import zenoh
+from conftest import ROOT, unused_port
+from test_readme import MAINS, commands, understood
+
+from fleet.access.roles import ROLES, ROUTER_ROLE
+from tests.bench.security.site import make_papers, zenohd
+from tests.bench.security.trying import until
+
+DEPLOY = ROOT / "deploy"
+README = (DEPLOY / "README.md").read_text()
+IMAGES = {"parauav", "eclipse/zenoh:1.10.2"}
+OURS = {"gateway", "twin_worker", "viewer"}
+
+
+def manifests() -> list[dict[str, Any]]:
+    files = sorted((DEPLOY / "k8s").glob("*.yaml"))
+    return [one for file in files for one in yaml.safe_load_all(file.read_text())]
+
+
+def composed() -> dict[str, Any]:
+    return yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
+
+
+def containers() -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
+    """Give name, container and pod of every Deployment."""
+    for one in manifests():
+        if one["kind"] == "Deployment":
+            pod = one["spec"]["template"]["spec"]
+            for container in pod["containers"]:
+                yield one["metadata"]["name"], container, pod
+
+
+def units() -> dict[str, dict[str, list[str]]]:
+    """Give the settings of every service unit, by name."""
+    out: dict[str, dict[str, list[str]]] = {}
+    for file in sorted((DEPLOY / "systemd").glob("*.service")):
+        found: dict[str, list[str]] = {}
+        for name, value in re.findall(r"^(\w+)=(.*)$", file.read_text(), re.M):
+            found.setdefault(name, []).append(value)
+        out[file.name] = found
+    return out
+
+
+def started(unit: dict[str, list[str]]) -> str:
+    """Give what a unit starts, its instance 0-49, the variables as the unit itself sets them."""
+    (line,) = unit["ExecStart"]
+    told = dict(re.findall(r'"(\w+)=([^"]*)"', " ".join(unit["Environment"])))
+    return re.sub(r"\$(\w+)", lambda found: told[found[1]], line.replace("%i", "0-49"))
+
+
+def lines() -> list[str]:
+    """Give every command line of ours in deploy/."""
+    out = [shlex.join(service["command"]) for service in composed().values()]
+    out += [shlex.join([*container.get("command", []), *container["args"]]) for _, container, _ in containers()]
+    out += [started(unit) for unit in units().values()]
+    out += re.findall(r'^    \w+="(.*)"$', README, re.M)
+    return out
+
+
+def ours() -> list[str]:
+    out = [line.rpartition("/.venv/bin/")[2] for line in lines()]
+    out = [line for line in out if line.split()[0] in MAINS]
+    gateway, worker = re.findall(r'^    (?:GATEWAY|WORKER)="(.*)"$', README, re.M)
+    return sorted({*out, f"gateway {gateway}", f"twin_worker {worker}", *commands(README)})
+
+
+@pytest.mark.parametrize("line", ours())
+def test_every_command_line_is_one_that_the_command_takes(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert understood(line, monkeypatch)
+
+
+def test_each_process_is_started_by_each_way() -> None:
+    found = [line.split()[0] for line in ours()]
+    assert all(found.count(name) >= 3 for name in OURS)
+    assert {container["image"] for _, container, _ in containers()} == IMAGES
+    assert {service["image"] for service in composed().values()} == IMAGES
+
+
+# --- containers ------------------------------------------------------------------------------------------------------
+
+
+def test_probes_and_ports_are_those_of_the_commands() -> None:
+    for name, container, pod in containers():
+        assert pod["automountServiceAccountToken"] is False
+        if container["image"] != "parauav":
+            continue
+        ports = {port["name"]: port["containerPort"] for port in container["ports"]}
+        where = {"metrics": "--metrics=0.0.0.0:9100", "mavlink": "--link=udpin:0.0.0.0:14550"}
+        assert all(where[port] in container["args"] for port in ports if port in where), name
+        for probe in ("startupProbe", "livenessProbe"):
+            assert container[probe]["httpGet"]["port"] in ports
+        assert container["securityContext"]["allowPrivilegeEscalation"] is False
+        assert pod["securityContext"]["runAsNonRoot"] and pod["terminationGracePeriodSeconds"] >= 30
+
+
+def test_each_pod_has_the_certificates_of_its_own_role_alone() -> None:
+    for name, container, pod in containers():
+        (secret,) = [volume["secret"] for volume in pod["volumes"] if "secret" in volume]
+        assert secret["secretName"] == name and name.removeprefix("parauav-") in (*ROLES, ROUTER_ROLE)
+        assert secret["defaultMode"] == 0o440
+        assert "/etc/parauav/certificates" in [mount["mountPath"] for mount in container["volumeMounts"]]
+
+
+def test_services_select_pods_that_exist() -> None:
+    labels = [one["spec"]["template"]["metadata"]["labels"] for one in manifests() if one["kind"] == "Deployment"]
+    services = [one for one in manifests() if one["kind"] == "Service"]
+    assert len(services) == 3 and all(service["spec"]["selector"] in labels for service in services)
+    deployments = {name: container for name, container, _ in containers()}
+    for service in services:
+        ports = [port["name"] for port in deployments[service["spec"]["selector"]["app"]]["ports"]]
+        assert all(port["targetPort"] in ports for port in service["spec"]["ports"])
+
+
+def test_workers_scale_by_replicas_and_a_new_one_joins_before_an_old_one_goes() -> None:
+    (worker,) = [one for one in manifests() if one["metadata"]["name"] == "parauav-worker"]
+    assert worker["spec"]["replicas"] > 1
+    assert worker["spec"]["strategy"]["rollingUpdate"] == {"maxSurge": 1, "maxUnavailable": 0}
+
+
+def test_files_that_are_mounted_or_named_exist() -> None:
+    for service in composed().values():
+        for volume in service["volumes"]:
+            source = volume.split(":")[0]
+            assert source == "./certificates" or (DEPLOY / source).is_file(), source
+    custom = yaml.safe_load((DEPLOY / "kustomization.yaml").read_text())
+    assert sorted(custom["resources"]) == sorted(f"k8s/{file.name}" for file in (DEPLOY / "k8s").glob("*.yaml"))
+    named = [file.rpartition("=")[2] for made in custom["configMapGenerator"] for file in made["files"]]
+    assert all((DEPLOY / name).is_file() for name in named)
+    for name in re.findall(r"`([\w./-]+\.(?:json5|toml|sh|yaml|py))`", README):
+        assert (DEPLOY / name).is_file() or (ROOT / name).is_file(), name
+
+
+def test_kubectl_takes_the_manifests() -> None:
+    if shutil.which("kubectl") is None:
+        pytest.skip("no kubectl on the path")
+    done = subprocess.run(["kubectl", "kustomize", str(DEPLOY)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    made = list(yaml.safe_load_all(done.stdout))
+    (policy,) = [one for one in made if one["kind"] == "NetworkPolicy"]
+    (let_in,) = policy["spec"]["ingress"][0]["from"]
+    pods = [one["spec"]["template"]["metadata"]["labels"] for one in made if one["kind"] == "Deployment"]
+    assert all(let_in["podSelector"]["matchLabels"].items() <= labels.items() for labels in pods)
+
+
+def test_the_image_is_made_of_what_is_there() -> None:
+    text = (DEPLOY / "Dockerfile").read_text()
+    for names in re.findall(r"^COPY (.*) \S+$", text, re.M):
+        assert all((ROOT / name).exists() for name in names.split())
+    (code,) = re.findall(r'^RUN python -c "(.*)" \\$', text, re.M)
+    assert [node.module for node in ast.parse(code).body if isinstance(node, ast.ImportFrom)] == [
+        "fleet.telemetry.warm",
+        "twin_worker.warm",
+    ]
+
+
+# --- units -----------------------------------------------------------------------------------------------------------
+
+
+def test_systemd_takes_the_units(tmp_path: Path) -> None:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("no systemd-analyze on the path")
+    for file in (DEPLOY / "systemd").iterdir():
+        text = re.sub(r"^ExecStart=\S+", "ExecStart=/bin/true", file.read_text(), flags=re.M)
+        (tmp_path / file.name.replace("@", "@0-49")).write_text(text)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert len(names) == 5
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", *(f"./{name}" for name in names)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_units_end_politely_and_never_give_up() -> None:
+    for unit in units().values():
+        assert unit["KillSignal"] == ["SIGTERM"] and int(unit["TimeoutStopSec"][0]) >= 30
+        assert unit["StartLimitIntervalSec"] == ["0"] and unit["User"] == ["parauav"]
+
+
+# --- the router ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["zenohd.json5", "zenohd-site.json5", "rest.json5"])
+def test_zenoh_takes_the_configuration_and_zenohd_starts_with_it(name: str, tmp_path: Path) -> None:
+    assert zenoh.Config.from_file(str(DEPLOY / name))
+    if name == "rest.json5":
+        return
+    if (program := zenohd()) is None:
+        pytest.skip("no zenohd (PARAUAV_ZENOHD, the path, ~/.cargo/bin)")
+    papers, port = make_papers(tmp_path / "certificates", "127.0.0.1"), unused_port()
+    text = (DEPLOY / name).read_text().replace("/etc/parauav/certificates", str(papers))
+    file = tmp_path / name
+    file.write_text(re.sub(r"(0\.0\.0\.0|127\.0\.0\.1):7447", f"127.0.0.1:{port}", text))
+    log = tmp_path / "log"
+    with log.open("wb") as out, subprocess.Popen([program, "-c", str(file)], stdout=out, stderr=out) as child:
+        try:
+            assert until(lambda: b"can be reached at" in log.read_bytes() or child.poll() is not None)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                child.terminate()
+        assert b"can be reached at" in log.read_bytes() and b"ERROR" not in log.read_bytes()
