@@ -62,6 +62,16 @@ def test_who_has_no_prediction_yet_comes_first_and_without_a_limit_nobody_waits(
     assert not free.grants(Work.IDENTIFY)
 
 
+def test_what_is_old_already_is_not_foreseen_where_telemetry_waits(clock: list[float]) -> None:
+    limited, free = Quota(limit=1.0, behind=True), Quota(behind=True)
+    assert not limited.grants(Work.PREDICT) and not limited.grants(Work.RENEW)
+    assert free.grants(Work.PREDICT) and free.grants(Work.RENEW)  # a recording sheds nothing
+    limited.behind = False
+    assert limited.grants(Work.RENEW) and limited.grants(Work.PREDICT)
+    clock[0] += 2.0
+    assert limited.grants(Work.RENEW) and not limited.grants(Work.PREDICT)
+
+
 def test_identification_yields_to_late_telemetry_and_never_starves() -> None:
     learner = Learner(list, lambda *_: None, Rates())
     assert learner.rest(0.2) == 0.0

@@ -90,7 +90,7 @@ def _turn(twin: Twin, now: float) -> list[Message]:
         made = foresee(twin, now)
         twin.base = twin.prediction if made else None
         results += [*made, *watch(twin, now, twin.base)]
-    elif _due(now, twin.renew_t, SOON * pace.renew):
+    elif _due(now, twin.renew_t, SOON * pace.renew) and twin.may(Work.RENEW):
         twin.renew_t = now
         results += renew(twin)
     return results

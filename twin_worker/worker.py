@@ -298,10 +298,12 @@ def data_time(held: Held) -> float:
 def _advance_all(held: Held, waiting: int, traffic: Traffic) -> Iterator[Message]:
     """Turn the loop after every message, as offline; the wall clock turns it on where data have fallen silent."""
     twin = held.twin
-    for _ in range(waiting):
+    for left in reversed(range(waiting)):
         with held.lock:
             if not held.ready:  # handed over meanwhile, with what still waits
                 return
+            if twin.quota is not None:
+                twin.quota.behind = left > 0
             results = advance(twin, (held.inbox.popleft(),))
         yield from traffic.after(twin.uav, twin.turned_t, results)
     now = data_time(held)

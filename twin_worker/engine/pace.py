@@ -8,8 +8,9 @@ SOON = 0.9  # share of a period after which work that follows telemetry is due: 
 
 
 class Work(StrEnum):
-    """Kinds of heavy work, the first to be done and the last to give way first."""
+    """Kinds of work, the first to be done and the last to give way first."""
 
+    RENEW = "renew"
     PREDICT = "predict"
     IDENTIFY = "identify"
     ENSEMBLE = "ensemble"

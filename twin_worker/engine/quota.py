@@ -18,12 +18,14 @@ class Quota:
     Attributes:
         limit: of heavy work in one sweep [s]
         hurry: an aircraft waits for its first prediction, so that nothing else is begun
+        behind: telemetry of this aircraft waits: what would be foreseen now is old already
         aside: kinds that are done by another hand
         done, refused: how often each other kind was
     """
 
     limit: float = float("inf")
     hurry: bool = False
+    behind: bool = False
     aside: frozenset[Work] = frozenset()
     done: Counter[Work] = field(default_factory=Counter)
     refused: Counter[Work] = field(default_factory=Counter)
@@ -43,8 +45,10 @@ class Quota:
 
     def grants(self, work: Work) -> bool:
         """Tell whether work that is due may be begun."""
-        if work in self.aside:
+        if work in self.aside or (self.behind and self.limit < float("inf")):
             return False
+        if work is Work.RENEW:
+            return True
         self.settle()
         granted = self._spent < self.limit * _SHARE[work] and not (self.hurry and work is not Work.PREDICT)
         (self.done if granted else self.refused)[work] += 1

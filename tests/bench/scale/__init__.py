@@ -1,0 +1,1 @@
+"""How many aircraft a machine holds, and what gives way first?"""
