@@ -96,7 +96,7 @@ class ZenohBus(AbstractContextManager):
 
         def on_query(query: zenoh.Query) -> None:
             with query:
-                uav = uav_in(str(query.key_expr)) if kind in PER_UAV else None
+                uav, named = uav_in(str(query.key_expr)) if kind in PER_UAV else None, encoding(kind)
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
                     for message, stamp in asked_for(uav, reply(uav, _parameters(query), payload)):
@@ -106,7 +106,7 @@ class ZenohBus(AbstractContextManager):
                         query.reply(
                             name,
                             encode(message),
-                            encoding=encoding(kind),
+                            encoding=named,
                             attachment=pack_stamp(stamp) if stamp else None,
                         )
                 except ValueError as error:

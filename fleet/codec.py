@@ -14,6 +14,11 @@ _STAMP = struct.Struct("<QQ")
 _PACK = msgspec.msgpack.Encoder()
 _UNPACK: dict[str, Any] = {topic: msgspec.msgpack.Decoder(kind) for topic, kind in TOPICS.items()}
 
+_NAMED = {
+    kind: f"application/msgpack;parauav.{topic.lstrip('@').replace('/', '.')}.{kind.version}"  # type: ignore[attr-defined]
+    for topic, kind in TOPICS.items()
+}
+
 
 class Stamp(NamedTuple):
     """Who wrote a worker result, and under which claim; the highest epoch per UAV wins."""
@@ -42,7 +47,7 @@ def encode(message: Any) -> bytes:
 
 def encoding(kind: type) -> str:
     """Name the Zenoh encoding of a message class, e.g. `application/msgpack;parauav.sample.1`."""
-    return f"application/msgpack;parauav.{kind.topic.lstrip('@').replace('/', '.')}.{kind.version}"  # type: ignore[attr-defined]
+    return _NAMED[kind]
 
 
 def decode(kind: type[M], payload: bytes, named: str = "") -> M:

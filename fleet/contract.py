@@ -12,6 +12,7 @@
     parauav/{uav}/alert                  Alert        worker   predicted conflict, fence, ground, …; answers queries
                                                       gateway  a second sender that uses this id; answers queries
     parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; answers queries
+    parauav/@fleet/prediction/{writer}   Predictions  worker   only answers: the newest of all it holds
     parauav/@gateway/{writer}            Account      gateway  counters of one gateway; answers queries
     parauav/@claim/{writer}              Claim        worker   which aircraft it writes for; every 0.5 s; queries too
     parauav/@handover/{writer}           Handover     worker   answers a `Wanted` of another worker: twins to go on with
@@ -569,6 +570,17 @@ class FleetState(msgspec.Struct, frozen=True, kw_only=True):
     shed: Annotated[int, Meta(description="messages of aircraft it holds now that it could not keep for them")] = 0
 
 
+class Predictions(msgspec.Struct, frozen=True, kw_only=True):
+    """The newest predictions of all aircraft of one worker, in one answer: quicker than a thousand."""
+
+    topic: ClassVar[str] = "@fleet/prediction"
+    version: ClassVar[int] = 1
+
+    t: Annotated[float, Meta(description="fleet time of the answer [s since 1970]")]
+    predictions: tuple[Prediction, ...] = ()
+    epochs: Annotated[tuple[int, ...], Meta(description="claim of each; readers keep the highest of an aircraft")] = ()
+
+
 class LinkAccount(msgspec.Struct, frozen=True, kw_only=True):
     """Counters of one link, since the gateway began unless a unit says otherwise."""
 
@@ -665,6 +677,6 @@ class Wanted(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 PER_UAV: tuple[type[Message], ...] = (Sample, Status, Mission, Params, History, Model, Prediction, Mismatch, Alert)
-CONTROL: tuple[type, ...] = (FleetState, Account, Claim, Handover)
+CONTROL: tuple[type, ...] = (FleetState, Predictions, Account, Claim, Handover)
 QUERIES: dict[type, type] = {Prediction: WhatIf, Handover: Wanted}  # what a query on a key may carry
 TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}  # type: ignore[attr-defined]

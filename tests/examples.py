@@ -28,6 +28,7 @@ from fleet.contract import (
     Outcome,
     Params,
     Prediction,
+    Predictions,
     Rows,
     Sample,
     State,
@@ -218,7 +219,7 @@ MESSAGES = (
         lon=85_000_000,
         alt=550_000,
     ),
-    FleetState(t=T, rows=(ROW,), sentence="compiling the twin's physics, once"),
+    FleetState(t=T, rows=(ROW,), sentence="compiling the twin's physics, once", done={"identify": 7}, shed=3),
     Account(
         t=T,
         links=("udpin:0.0.0.0:14550",),
@@ -275,4 +276,5 @@ MESSAGES = (
     ),
     Handover(t=T, uav=UAV, epoch=5, code="0123456789abcdef", load=b"twin"),
 )
+MESSAGES += (Predictions(t=T, predictions=(next(m for m in MESSAGES if isinstance(m, Prediction)),), epochs=(5,)),)
 EXAMPLES = {type(message): message for message in MESSAGES}

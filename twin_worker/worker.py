@@ -19,6 +19,7 @@ from fleet.contract import (
     Mismatch,
     Model,
     Prediction,
+    Predictions,
     Sample,
     Status,
     WhatIf,
@@ -88,6 +89,7 @@ class Worker:
         self.bus.subscribe(Prediction, self._overhear)
         self.bus.subscribe(Model, self._overhear, lambda uav: uav in self.uavs and uav not in self._held)
         self.bus.answer(Prediction, self._predictions)
+        self.bus.answer(Predictions, lambda *_: [(self._at_once(), None)])
         self.bus.answer(Alert, lambda uav, *_: self._stamped((h, a) for h in self._asked(uav) for a in self.active(h)))
         self.bus.answer(Model, lambda uav, *_: self._stamped((h, h.twin.model) for h in self._asked(uav)))
         self.bus.answer(Mismatch, lambda uav, *_: self._stamped((h, self._found(h)) for h in self._asked(uav)))
@@ -243,8 +245,14 @@ class Worker:
         if payload:
             supposed = self._supposed(uav, question.read(payload))
             return self._stamped((held, resample(made, grid)) for held, made in supposed)
-        found = ((held, told(held.twin)) for held in self._asked(uav))
+        found = ((held, told(held)) for held in self._asked(uav))
         return self._stamped((held, made and resample(made, grid)) for held, made in found)
+
+    def _at_once(self) -> Predictions:
+        """Give the newest prediction of every aircraft held."""
+        found = [(made, held.epoch) for held in self.holding() if (made := told(held)) is not None]
+        predictions, epochs = (tuple(each) for each in zip(*found, strict=True)) if found else ((), ())
+        return Predictions(t=time.time(), predictions=predictions, epochs=epochs)
 
     def _supposed(self, uav: int | None, asked: WhatIf) -> list[tuple[Held, Prediction]]:
         """Let a copy of one twin fly what a query supposes.
@@ -280,12 +288,14 @@ def suppose(held: Held, asked: WhatIf) -> Prediction:
         raise ValueError(f"what if: {twin.name} met a defect ({error}), expected a prediction; report it") from None
 
 
-def told(twin: Twin) -> Prediction | None:
+def told(held: Held) -> Prediction | None:
     """Give the newest prediction with the law and parameters it was flown by; None before any."""
-    made, control = twin.prediction, twin.control
+    made, control = held.twin.prediction, held.twin.control
     if made is None or control is None or made.controller is not None:
         return made
-    return msgspec.structs.replace(made, controller=control.wire())
+    if held.told is None or held.told[0] is not made:
+        held.told = made, msgspec.structs.replace(made, controller=control.wire())
+    return held.told[1]
 
 
 def data_time(held: Held) -> float:

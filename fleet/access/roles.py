@@ -38,6 +38,7 @@ SAID: dict[str, Said] = {
     "mismatch": Said((WORKER,), 256 * KB),
     "alert": Said((GATEWAY, WORKER), 64 * KB),  # of the gateway: a second sender
     "@fleet/state": Said((WORKER,), MB),
+    "@fleet/prediction": Said((WORKER,), 32 * MB),  # 4 KB for each of its aircraft
     "@gateway": Said((GATEWAY,), MB),
     "@claim": Said((WORKER,), MB),
     "@handover": Said((WORKER,), 32 * MB, asked=(WORKER,)),  # to ask for it is to take an aircraft away

@@ -39,6 +39,7 @@ class Held:
     ready: bool = True  # its twin is here
     bare: bool = False  # without the telemetry of before
     since: float = float("-inf")  # when its twin came [s, monotonic]
+    told: tuple[Prediction, Prediction] | None = None  # one that was asked for, and the same with law and parameters
 
 
 class Extras(Protocol):
