@@ -36,6 +36,7 @@ __all__ += ["newest", "open_router", "reachable", "uav_in"]
 M = TypeVar("M")
 _WAITED_FOR = (Claim,)  # seldom and needed: the sender waits where the way is full, everything else is dropped there
 _LIVE = f"{ROOT}/@live/"
+_ANSWERS = 4096  # that may wait to be read
 _TOKENS = 4096  # asked for at once; with the usual channel more than 256 would block for ever
 
 
@@ -96,7 +97,7 @@ class ZenohBus(AbstractContextManager):
 
         def on_query(query: zenoh.Query) -> None:
             with query:
-                uav, named = uav_in(str(query.key_expr)) if kind in PER_UAV else None, encoding(kind)
+                uav, named = uav_in(str(query.key_expr)) if kind in PER_UAV else None, zenoh.Encoding(encoding(kind))
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
                     for message, stamp in asked_for(uav, reply(uav, _parameters(query), payload)):
@@ -131,7 +132,7 @@ class ZenohBus(AbstractContextManager):
     def gather(self, kind: type[M], who: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
         """Ask with a payload and give every answer as it comes."""
         for reply in self._coming(key(kind, who), timeout_s, payload):
-            if reply.ok is not None and (pair := self._read(kind, reply.ok)) is not None:
+            if (found := reply.ok) is not None and (pair := self._read(kind, found)) is not None:
                 yield pair[0]
 
     def _replies(self, name: str, timeout_s: float, payload: bytes | None = None) -> list[zenoh.Reply]:
@@ -141,6 +142,7 @@ class ZenohBus(AbstractContextManager):
         try:
             yield from self._session.get(
                 name,
+                zenoh.handlers.FifoChannel(_ANSWERS),
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,

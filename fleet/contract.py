@@ -571,13 +571,15 @@ class FleetState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Predictions(msgspec.Struct, frozen=True, kw_only=True):
-    """The newest predictions of all aircraft of one worker, in one answer: quicker than a thousand."""
+    """The newest prediction of every aircraft of one worker, in one answer."""
 
     topic: ClassVar[str] = "@fleet/prediction"
     version: ClassVar[int] = 1
 
     t: Annotated[float, Meta(description="fleet time of the answer [s since 1970]")]
-    predictions: tuple[Prediction, ...] = ()
+    predictions: Annotated[
+        tuple[msgspec.Raw, ...], Meta(description="each a Prediction; ours unpack it when read")
+    ] = ()
     epochs: Annotated[tuple[int, ...], Meta(description="claim of each; readers keep the highest of an aircraft")] = ()
 
 

@@ -1,7 +1,9 @@
 """One example of every message, with fixed values; a new class in the contract adds its own here."""
 
 import numpy as np
+from msgspec import Raw
 
+from fleet.codec import encode
 from fleet.contract import (
     COLUMNS,
     Account,
@@ -276,5 +278,7 @@ MESSAGES = (
     ),
     Handover(t=T, uav=UAV, epoch=5, code="0123456789abcdef", load=b"twin"),
 )
-MESSAGES += (Predictions(t=T, predictions=(next(m for m in MESSAGES if isinstance(m, Prediction)),), epochs=(5,)),)
+MESSAGES += (
+    Predictions(t=T, predictions=(Raw(encode(next(m for m in MESSAGES if isinstance(m, Prediction)))),), epochs=(5,)),
+)
 EXAMPLES = {type(message): message for message in MESSAGES}

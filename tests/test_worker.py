@@ -7,8 +7,20 @@ import pytest
 from flights import item
 
 from fleet.bus import MemoryBus
-from fleet.codec import Stamp
-from fleet.contract import Array, FleetState, Message, Mission, Model, Params, Prediction, Sample, State, Status
+from fleet.codec import Stamp, decode
+from fleet.contract import (
+    Array,
+    FleetState,
+    Message,
+    Mission,
+    Model,
+    Params,
+    Prediction,
+    Predictions,
+    Sample,
+    State,
+    Status,
+)
 from twin_worker import worker as live
 from twin_worker.claims.keeper import INBOX
 from twin_worker.whatif.grid import resample, wanted
@@ -116,6 +128,17 @@ def test_wildcard_queries_are_answered_with_stamps(bus, worker):
     assert bus.ask(Prediction, 9) == []
     ((table, _),) = bus.ask(FleetState)
     assert [row.uav for row in table.rows] == [2, 3, 4]
+
+
+def test_one_answer_has_them_all(bus, worker):
+    assert [one.predictions for one, _ in bus.ask(Predictions)] == [()]
+    for uav in (2, 3):
+        fly(bus, uav)
+    worker.turn()
+    each = bus.ask(Prediction)
+    ((batch, _),) = bus.ask(Predictions)
+    assert [decode(Prediction, bytes(raw)) for raw in batch.predictions] == [made for made, _ in each]
+    assert list(batch.epochs) == [stamp.epoch for _, stamp in each]
 
 
 def test_a_query_chooses_horizon_and_step(bus, worker):

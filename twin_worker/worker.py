@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import msgspec
+from msgspec import Raw
 
 from fleet.airframes import GENERIC, Airframe, load
 from fleet.bus import Bus
-from fleet.codec import Stamp
+from fleet.codec import Stamp, encode
 from fleet.contract import (
     Alert,
     FleetState,
@@ -250,7 +251,7 @@ class Worker:
 
     def _at_once(self) -> Predictions:
         """Give the newest prediction of every aircraft held."""
-        found = [(made, held.epoch) for held in self.holding() if (made := told(held)) is not None]
+        found = [(Raw(encode(made)), held.epoch) for held in self.holding() if (made := told(held)) is not None]
         predictions, epochs = (tuple(each) for each in zip(*found, strict=True)) if found else ((), ())
         return Predictions(t=time.time(), predictions=predictions, epochs=epochs)
 

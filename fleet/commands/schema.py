@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
         print(msgspec.json.format(described, indent=2).decode())
         return 0
     if not args.topic:
-        print("\n".join(f"{wire_key(kind):34} {encoding(kind):44} {summary(kind)}" for kind in chosen), end="\n\n")
+        print("\n".join(f"{wire_key(kind):34} {encoding(kind):46} {summary(kind)}" for kind in chosen), end="\n\n")
     print("\n\n".join(as_text(kind) for kind in chosen))
     return 0
 

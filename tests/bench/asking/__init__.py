@@ -1,0 +1,1 @@
+"""How long a question for every aircraft's prediction takes?"""

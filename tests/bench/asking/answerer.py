@@ -1,0 +1,49 @@
+"""A worker of the bench: our `Worker` as it answers, holding aircraft whose prediction is there already."""
+
+import sys
+import time
+
+import msgspec
+import numpy as np
+
+from fleet.bus import connect
+from fleet.cli import stop_on_signal
+from fleet.contract import Array, Controller, Prediction, State
+from twin_worker.claims.keeper import Held
+from twin_worker.horizon import AHEAD
+from twin_worker.twin import Twin
+from twin_worker.worker import Worker
+
+_SAID = "hybrid/arduplane/fixed_wing/known, adapted by 24 of its own"
+
+
+def prediction(uav: int) -> Prediction:
+    """Make one up, as long as a real one with law and parameters."""
+    path = np.column_stack([22.0 * AHEAD, 3.0 * AHEAD, -100.0 - 0.1 * AHEAD])
+    known = {f"PARAMETER_{k:03d}": 0.1 * k for k in range(24)}
+    return Prediction(
+        uav=uav, t=time.time(), state=State.PREDICTING, method="hybrid", origin=(470_000_000, 80_000_000, 500_000),
+        ahead=Array.of(AHEAD), path=Array.of(path), tube=Array.of(0.05 * path), quantile=0.9, horizon_s=42.0,
+        calibration=_SAID, sentence="flown with defaults", law="arduplane: L1 + TECS",
+        controller=Controller(law="arduplane: L1 + TECS", received=known),
+    )  # fmt: skip
+
+
+def main(router: str, low: int, high: int) -> None:
+    """Answer until told to stop."""
+    stop = stop_on_signal()
+    with connect(router) as bus:
+        worker = Worker(bus, range(low, high), omega=0.0)
+        for uav in range(low, high):
+            twin = Twin(uav)
+            twin.prediction = prediction(uav)
+            worker._held[uav] = Held(twin, epoch=int(time.time() * 1e3))
+        worker.claiming.threaded = True
+        worker.listen()
+        size = len(msgspec.msgpack.encode(worker._held[low].twin.prediction))
+        print(f"{size} bytes a prediction", flush=True)
+        stop.wait()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
