@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from viewer.labels import Sight
+
 FOV = np.radians(50.0)  # vertical field of view [rad]
 CLOSEST = 5.0  # no nearer, however little there is to see [10 m]
 VIEW = (np.radians(-125.0), np.radians(38.0))  # where the camera stands: azimuth from east, elevation [rad]
@@ -40,51 +42,52 @@ def _middle(x: np.ndarray) -> float:
     return float(x.min() + x.max()) / 2
 
 
-class Cameras:
-    """The cameras of all who watch: framed once things appear, left alone as soon as someone moves theirs."""
+class Camera:
+    """The camera of one page: framed once things appear, left alone as soon as someone moves it."""
 
-    def __init__(self, server: Any) -> None:
-        self._server = server
-        self._placed: dict[int, np.ndarray] = {}
-        start = server.initial_camera
-        start.fov, start.near, start.far = FOV, 0.1, 5000.0
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        self._placed: np.ndarray | None = None
 
-    def watchers(self) -> tuple[tuple[int, float], ...]:
-        """Tell who looks, and through what shape of picture: (client, width over height), (n,)."""
-        clients = self._server.get_clients().items()
-        return tuple(
-            (number, round(client.camera.image_width / max(client.camera.image_height, 1), 1))
-            for number, client in clients
-        )
+    @property
+    def aspect(self) -> float:
+        """Give width over height of the picture [-]."""
+        camera = self._client.camera
+        return camera.image_width / max(camera.image_height, 1) or 1.0
 
-    def show(self, points: np.ndarray) -> None:
-        """Frame the points for everyone who has not moved their camera."""
-        position, look_at = frame(points, 1.0)
-        self._server.initial_camera.position, self._server.initial_camera.look_at = position, look_at
-        clients = self._server.get_clients()
-        self._placed = {number: placed for number, placed in self._placed.items() if number in clients}
-        for number, client in clients.items():
-            camera = client.camera
-            placed = self._placed.get(number)
-            if placed is not None and np.linalg.norm(camera.position - placed) > 0.01 * np.linalg.norm(placed):
-                continue
-            aspect = camera.image_width / max(camera.image_height, 1) or 1.0
-            position, look_at = frame(points, aspect)
-            camera.position, camera.look_at = position, look_at
-            self._placed[number] = position
+    def sight(self) -> Sight:
+        """Give what it sees now."""
+        camera = self._client.camera
+        return Sight(np.array(camera.position), np.array(camera.look_at), float(camera.fov), self.aspect)
+
+    def show(self, points: np.ndarray, *, again: bool = False) -> None:
+        """Frame the points (n, 3) [10 m]; a camera that was moved stays, unless asked for `again`."""
+        camera, placed = self._client.camera, self._placed
+        moved = placed is not None and np.linalg.norm(camera.position - placed) > 0.01 * np.linalg.norm(placed)
+        if moved and not again:
+            return
+        camera.position, camera.look_at = frame(points, self.aspect)
+        self._placed = np.array(camera.position)
 
     def fly_to(self, points: np.ndarray) -> None:
-        """Turn every camera to some points (n, 3) [10 m], no farther off than it takes to see them all."""
+        """Turn to some points (n, 3) [10 m], no farther off than it takes to see them all."""
+        camera = self._client.camera
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         enough = 1.6 * float(np.linalg.norm(points - middle, axis=1).max()) / np.tan(FOV / 2) + 30.0
-        for client in self._server.get_clients().values():
-            away = client.camera.position - client.camera.look_at
-            length = float(np.linalg.norm(away)) or 1.0
-            client.camera.position = middle + away / length * min(length, enough)
-            client.camera.look_at = middle
+        away = camera.position - camera.look_at
+        length = float(np.linalg.norm(away)) or 1.0
+        camera.position, camera.look_at = middle + away / length * min(length, enough), middle
 
     def follow(self, step: np.ndarray) -> None:
-        """Move every camera along with what it follows, by a step (3,) [10 m]."""
-        for client in self._server.get_clients().values():
-            position, look_at = client.camera.position + step, client.camera.look_at + step
-            client.camera.position, client.camera.look_at = position, look_at
+        """Move along with what it follows, by a step (3,) [10 m]."""
+        camera = self._client.camera
+        camera.position, camera.look_at = camera.position + step, camera.look_at + step
+
+
+def start_at(server: Any, points: np.ndarray | None = None) -> None:
+    """Say where a page that opens from now on looks from; points (n, 3) [10 m] are framed."""
+    start = server.initial_camera
+    if points is None:
+        start.fov, start.near, start.far = FOV, 0.1, 5000.0
+    else:
+        start.position, start.look_at = frame(points, 1.0)

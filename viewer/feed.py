@@ -86,6 +86,17 @@ class Feed:
         with self.lock:
             return [self.vehicles[uav].still(self._clock()) for uav in sorted(self.vehicles)]
 
+    def poses(self, uavs: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Give where some UAVs are and how they are turned: scene ENU [10 m], phi theta psi [rad], two (n, 3).
+
+        A place that nobody told is not a number.
+        """
+        nowhere = np.full(3, np.nan)
+        with self.lock:
+            found = [self.vehicles[uav] for uav in uavs]
+            places = [one.at if one.at is not None else nowhere for one in found]
+            return np.array(places).reshape(-1, 3), np.array([one.attitude for one in found]).reshape(-1, 3)
+
     def one(self, uav: int) -> Vehicle | None:
         """Copy one UAV; None where it was never heard of."""
         with self.lock:

@@ -32,6 +32,23 @@ def _where(name: str, surface: str) -> str:
     return name[:40].replace("_", " ") + (f" of the {surface[:20]}" if surface else "")
 
 
+def spans(found: Mismatch | None, newest: float) -> list[tuple[float, float]]:
+    """Give when it was located, (begin, end) on the fleet clock [s]; the last one goes on to `newest`."""
+    if found is None or found.outcome is Found.NONE:
+        return []
+    pairs = [pair for one in found.causes[:MOST] for pair in one.segments[:MOST]][:MOST]
+    sound = [(begin, end) for begin, end in pairs if isfinite(begin) and isfinite(end)]
+    return [(begin, newest if end >= found.t - 5.0 else min(end, newest)) for begin, end in sound]
+
+
+def within(t: np.ndarray, found: Mismatch | None) -> np.ndarray:
+    """Tell which of some rising times (n,) lie where it was located, (n,)."""
+    inside = np.zeros(len(t), bool)
+    for begin, end in spans(found, float(t[-1])) if len(t) else []:
+        inside |= (t >= begin) & (t <= end)
+    return inside
+
+
 def lines(found: Mismatch | None, track: np.ndarray) -> np.ndarray:
     """Give the stretches of the flown path where it was located, as segments (n, 2, 3) [10 m].
 
@@ -43,10 +60,7 @@ def lines(found: Mismatch | None, track: np.ndarray) -> np.ndarray:
     if found is None or found.outcome is Found.NONE or len(track) < 2:
         return parts[0]
     newest, oldest = float(track[-1, 0]), float(track[0, 0])
-    for begin, end in [pair for one in found.causes[:MOST] for pair in one.segments[:MOST]][:MOST]:
-        if not (isfinite(begin) and isfinite(end)):
-            continue
-        last = newest if end >= found.t - 5.0 else min(end, newest)  # it goes on
+    for begin, last in spans(found, newest):
         if last > (first := max(begin, oldest)):
             points = placed(track, np.linspace(first, last, min(int(last - first) + 2, MOST_POINTS)))
             parts.append(chain(points[np.isfinite(points).all(axis=1)]))

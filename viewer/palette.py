@@ -40,6 +40,10 @@ class Palette:
             State.LINK_LOST: self.lost,
         }.get(state, self.muted)
 
+    def looks(self) -> tuple[str, ...]:
+        """Give the colours of `flock.LOOKS`, in their order."""
+        return self.muted, self.predicting, self.verified, self.identifying, self.lost, self.mismatch
+
     def event(self, kind: Kind) -> str:
         """Give the colour of an event; none but a verified model has that of "verified"."""
         return {

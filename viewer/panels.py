@@ -20,10 +20,10 @@ COMMANDS = 50  # UAVs offered in the command palette (Ctrl+K)
 
 
 class Panels:
-    """All that is not 3-D."""
+    """All that is not 3-D, on one page."""
 
-    def __init__(self, server: viser.ViserServer, palette: Palette, choose: Callable[[int], None]) -> None:
-        self._gui, self._palette, self._choose = server.gui, palette, choose
+    def __init__(self, client: viser.ClientHandle, palette: Palette, choose: Callable[[int], None]) -> None:
+        self._gui, self._palette, self._choose = client.gui, palette, choose
         self._commands: dict[int, Any] = {}
         self._beat = False
         self._gui.configure_theme(

@@ -6,6 +6,7 @@ import numpy as np
 
 from viewer.datatime import moment
 from viewer.events import Event, Kind
+from viewer.labels import Tag
 from viewer.palette import MARK, Palette, mesh_colour, rgb
 from viewer.shapes import diamond
 from viewer.track import placed
@@ -13,19 +14,19 @@ from viewer.track import placed
 PINS = 40  # drawn: the newest of those that lie on the path
 LABELS = 3  # labels do not make room for each other: few are readable
 LETTERS = 26  # of a label
-CLEAR = 6.0  # a label keeps this far from the aircraft and from the others [drawn spans of an aircraft]
-RADIUS = 0.3  # of a diamond [drawn spans of an aircraft]
+CLEAR = 3.0  # a label keeps this far from the aircraft and from the others [drawn spans of an aircraft]
+RADIUS = 0.22  # of a diamond [drawn spans of an aircraft]
 MINOR = {Kind.ITEM, Kind.MISSION, Kind.SOUND, Kind.DOUBTED}  # come often: drawn smaller, and without a label
 MODEL = {Kind.VERIFIED, Kind.NO_MODEL}  # a label has room for the first words of their sentence alone
 
 
 class Pins:
-    """The marks of one UAV: a batch of fixed size and a fixed number of labels, whatever happens."""
+    """The marks of one UAV: a batch of fixed size, whatever happens."""
 
-    def __init__(self, server: Any, palette: Palette) -> None:
+    def __init__(self, scene: Any, palette: Palette) -> None:
         self._palette = palette
         vertices, faces = diamond()
-        self._batch = server.scene.add_batched_meshes_simple(
+        self._batch = scene.add_batched_meshes_simple(
             "/selected/events",
             vertices,
             faces,
@@ -38,20 +39,9 @@ class Pins:
             cast_shadow=False,
             receive_shadow=False,
         )
-        self._labels = [
-            server.scene.add_label(
-                f"/selected/event{k}",
-                "",
-                font_screen_scale=0.75,
-                anchor="bottom-center",
-                depth_test=False,
-                visible=False,
-            )
-            for k in range(LABELS)
-        ]
 
-    def draw(self, events: tuple[Event, ...], rows: np.ndarray, at: np.ndarray | None, size: float) -> None:
-        """Mark events where they happened.
+    def draw(self, events: tuple[Event, ...], rows: np.ndarray, at: np.ndarray | None, size: float) -> list[Tag]:
+        """Mark events where they happened; give the labels of the newest few.
 
         Args:
             events: oldest first
@@ -68,14 +58,11 @@ class Pins:
             scales[k] = RADIUS * size * (0.6 if event.kind in MINOR else 1.0)
         self._batch.batched_positions, self._batch.batched_scales = where, scales
         self._batch.batched_colors = mesh_colour(colours)
-        self._say(apart(found, at, CLEAR * size), 0.9 * RADIUS * size)
-
-    def _say(self, chosen: list[tuple[Event, np.ndarray]], above: float) -> None:
-        for label, (event, spot) in zip(self._labels, chosen, strict=False):
-            label.text, label.position = caption(event), (*spot[:2].tolist(), float(spot[2]) + above)
-            label.visible = True
-        for label in self._labels[len(chosen) :]:
-            label.visible = False
+        above = np.array([0.0, 0.0, 0.9 * RADIUS * size])
+        return [
+            Tag(f"event{event.t}{event.kind}", caption(event), spot + above, 0.75, "bottom-center")
+            for event, spot in apart(found, at, CLEAR * size)
+        ]
 
 
 def apart(found: list[tuple[Event, np.ndarray]], at: np.ndarray | None, clear: float) -> list[tuple[Event, np.ndarray]]:

@@ -49,9 +49,12 @@ class Route(NamedTuple):
     back: np.ndarray  # jumps and returns, drawn dashed, (m, 2, 3)
     circles: np.ndarray  # loiter circles as segments, (k, 2, 3)
     points: np.ndarray  # where items sit, (p, 3)
+    items: np.ndarray  # the number of each, (p,)
+    ends: np.ndarray  # the number of the item each leg ends at, (n,)
 
 
-NOTHING = Route(np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), np.zeros((0, 3)))
+_NO_LINES, _NO_ITEMS = np.zeros((0, 2, 3)), np.zeros(0, int)
+NOTHING = Route(_NO_LINES, _NO_LINES, _NO_LINES, np.zeros((0, 3)), _NO_ITEMS, _NO_ITEMS)
 
 
 def home_alt_m(mission: Mission | None) -> float | None:
@@ -79,6 +82,7 @@ def route(mission: Mission | None, place: Place, ground: float) -> Route:
     legs: list[np.ndarray] = []
     back: list[np.ndarray] = []
     circles: list[np.ndarray] = []
+    ends: list[int] = []
     last = None
     for index, item in enumerate(mission.items):
         if home is not None and index == 0:
@@ -96,15 +100,19 @@ def route(mission: Mission | None, place: Place, ground: float) -> Route:
         spot = spots[item.seq] = found[0]
         if last is not None and np.linalg.norm(spot - last) > 1e-6:
             legs.append(np.stack([last, spot]))
+            ends.append(item.seq)
         if item.command in RADIUS_IN:
             circles.append(circle(spot, _radius_m(item) / UNIT_M))
         last = spot
     points = [spot for spot in spots.values() if spot.size]
+    items = [seq for seq, spot in spots.items() if spot.size]
     return Route(
         np.array(legs).reshape(-1, 2, 3),
         np.array(back).reshape(-1, 2, 3),
         np.concatenate(circles) if circles else NOTHING.circles,
         np.array(points).reshape(-1, 3),
+        np.clip(np.array(items, dtype=object), -1, 10**6).astype(int),
+        np.clip(np.array(ends, dtype=object), -1, 10**6).astype(int),
     )
 
 

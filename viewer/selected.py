@@ -1,4 +1,4 @@
-"""The selected UAV in 3-D: tube, rings, horizon, route, flown path, hindcast, labels."""
+"""The selected UAV in 3-D: tube, rings, horizon, route, flown path, hindcast, and what its labels say."""
 
 from typing import Any
 
@@ -7,43 +7,44 @@ import numpy as np
 from fleet.contract import State
 from viewer import mismatch
 from viewer.feed import Feed
+from viewer.hindcast import hindcast
+from viewer.labels import Sight, Tag
 from viewer.palette import Palette, mix, rgb, triple
 from viewer.pins import Pins
+from viewer.plan import Plan, seq_in_force
 from viewer.routes import NOTHING, Route
-from viewer.strokes import Strokes, chain, dash_lines, dashed
-from viewer.tube import closed, curtain, marks, rings, skin
+from viewer.strokes import Sheaf, Strokes, chain, closed, dashed, disc
+from viewer.tube import curtain, marks, rings, samples, skin
 from viewer.vehicle import Forecast, Vehicle
 from viewer.words import CLAIMS_S
 
-BANDS, BAND_STEPS = 4, 20  # the tube fades in bands, each of so many slices
-HINDCAST_S = 25.0  # how old the prediction is that is laid beside what happened
+BANDS, BAND_STEPS = 5, 12  # the tube fades in bands, each of so many slices
 BEYOND_S = 20.0  # how far past the horizon the grey dashes go
-LABELS = ("name", "horizon", "m0", "m1", "m2", "m3", "then", "mismatch")
+SAMPLES, SAMPLE_STEPS = 6, 40  # paths drawn out of the band, each in so many points
 
 
 class Selection:
-    """The nodes of one selected UAV."""
+    """The nodes of one selected UAV on one page."""
 
-    def __init__(self, server: Any, palette: Palette) -> None:
-        self._scene, self._palette = server.scene, palette
+    def __init__(self, scene: Any, palette: Palette) -> None:
+        self._scene, self._palette = scene, palette
         faces = skin(BAND_STEPS + 1)
         flat = np.zeros((int(faces.max()) + 1, 3), np.float32)
         self._bands = [
-            self._sheet(f"/selected/band{b}", flat, faces, 0.30 * (1.2 - 0.25 * b), palette.tube) for b in range(BANDS)
+            self._sheet(f"/selected/band{b}", flat, faces, 0.34 * (1.2 - 0.2 * b), palette.tube) for b in range(BANDS)
         ]
         steps = BANDS * BAND_STEPS + 1
-        self._curtain = self._sheet("/selected/curtain", *curtain(np.zeros((steps, 3)), 0.0), 0.09, palette.tube)
-        self._thin = Strokes(self._scene, "/selected/thin", 1.4)
-        self._flown = Strokes(self._scene, "/selected/flown", 1.6)
-        self._pins = Pins(server, palette)
-        self._mismatch = Strokes(self._scene, "/selected/mismatch", 4.4)
-        self._route = Strokes(self._scene, "/selected/route", 2.0)
-        self._bold = Strokes(self._scene, "/selected/bold", 2.7)
-        self._horizon = Strokes(self._scene, "/selected/horizon", 3.6)
-        self._labels = {name: self._label(name) for name in LABELS}
+        self._curtain = self._sheet("/selected/curtain", *curtain(np.zeros((steps, 3)), 0.0), 0.10, palette.tube)
+        self._thin = Strokes(scene, "/selected/thin", 1.3)
+        self._flown = Strokes(scene, "/selected/flown", 1.6)
+        self._mismatch = Strokes(scene, "/selected/mismatch", 5.5)
+        self._bold = Strokes(scene, "/selected/bold", 2.6)
+        self._horizon = Strokes(scene, "/selected/horizon", 4.0)
+        self._pins, self._plan = Pins(scene, palette), Plan(scene, palette)
         self._flown_colour = mix(palette.flown, palette.ground, 0.5)
         self.tube = True
-        self._clear_of = 0.0  # room round a label [10 m]
+        self.tags: list[Tag] = []  # of what moves
+        self.marks: list[Tag] = []  # of what stays where it happened
 
     def _sheet(self, name: str, vertices: np.ndarray, faces: np.ndarray, opacity: float, colour: str) -> Any:
         return self._scene.add_mesh_simple(
@@ -58,56 +59,42 @@ class Selection:
             visible=False,
         )
 
-    def _label(self, name: str) -> Any:
-        scale, anchor = {"name": (0.95, "bottom-center"), "horizon": (0.8, "bottom-left")}.get(
-            name, (0.75, "top-center")
-        )
-        return self._scene.add_label(
-            f"/selected/label_{name}", "", font_screen_scale=scale, anchor=anchor, depth_test=False, visible=False
-        )
-
-    def say(self, name: str, text: str, at: np.ndarray | None) -> None:
-        """Write a label at a place (3,) [10 m]; None hides it."""
-        label = self._labels[name]
-        label.visible = at is not None
-        if at is not None:
-            label.text, label.position = text, tuple(float(x) for x in at)
-
     def clear(self) -> None:
         """Hide everything: nobody is selected."""
-        for strokes in (self._thin, self._flown, self._route, self._bold, self._horizon, self._mismatch):
+        for strokes in (self._thin, self._flown, self._bold, self._horizon, self._mismatch):
             strokes.draw(NOTHING.legs)
-        self._pins.draw((), NOTHING.points, None, 1.0)
-        for node in (*self._bands, self._curtain, *self._labels.values()):
-            node.visible = False
+        self._hide_tube()
+        self.tags, self.marks = [], []
 
-    def draw(self, vehicle: Vehicle, feed: Feed, now: float, *, ground: float, size: float) -> None:
-        """Draw all but the route of one UAV; `size` is the drawn span of an aircraft [10 m]."""
+    def draw(self, vehicle: Vehicle, feed: Feed, now: float, *, ground: float, unit: float) -> None:
+        """Draw what moves with one UAV; `unit` is the drawn span of an aircraft [10 m]."""
         at, p = vehicle.where(now), self._palette
         if at is None:
             return self.clear()
-        thin, bold = _Sheaf(), _Sheaf()
-        turn = closed(_disc(at * [1, 1, 0] + [0, 0, ground + 0.06], 1.1 * size))
-        bold.add(turn, rgb(p.ink))
-        thin.add(np.array([[at, at * [1, 1, 0] + [0, 0, ground]]]), rgb(p.ink))
+        thin, bold, clock = Sheaf(), Sheaf(), vehicle.clock(now)
+        self.tags = [Tag("name", caption(vehicle, now), at + np.array([0, 0, 0.85 * unit]), 0.95, "bottom-center")]
+        foot = at * [1, 1, 0] + [0, 0, ground + 0.06]
+        bold.add(closed(disc(foot, 1.1 * unit)), rgb(p.ink))
+        bold.add(closed(disc(at, 0.85 * unit)), rgb(p.ink))
+        thin.add(np.stack([at, foot]), rgb(p.ink))
         trail = feed.trail(vehicle)
-        flown = trail[:, 1:4]
-        if len(flown) > 1:
-            bold.add(chain(np.vstack([flown[::2], flown[-1:]])), rgb(p.flown))
-        self._clear_of = 1.4 * size
-        self._draw_forecast(vehicle.forecast, vehicle.clock(now), ground, thin, bold)
-        self._draw_hindcast(feed.past(vehicle), trail, vehicle.clock(now), thin)
+        if len(trail) > 1:
+            own = np.vstack([trail[::2], trail[-1:]])
+            sound = ~mismatch.within(own[:, 0], vehicle.mismatch)[1:]
+            bold.add(chain(own[:, 1:4])[sound], rgb(p.flown))
+        self._draw_forecast(vehicle, clock, ground, thin, bold)
+        lines, said = hindcast(feed.past(vehicle), trail, clock)
+        thin.add(lines, mix(p.horizon, p.ground, 0.85))
+        self.tags += [said] if said is not None else []
         self._thin.draw(*thin.all())
         self._bold.draw(*bold.all())
-        self.say("name", caption(vehicle, now), _above(at, 0.8 * size))
 
-    def _draw_forecast(
-        self, told: Forecast | None, clock: float, ground: float, thin: "_Sheaf", bold: "_Sheaf"
-    ) -> None:
+    def _draw_forecast(self, vehicle: Vehicle, clock: float, ground: float, thin: Sheaf, bold: Sheaf) -> None:
+        told, p = vehicle.forecast, self._palette
         start = max(clock - told.t, 0.0) if told is not None else 0.0
         if told is None or start >= told.until - 0.2:
             return self._no_tube(told, start, thin)
-        p, until = self._palette, told.until
+        until = told.until
         at = np.linspace(start, until, BANDS * BAND_STEPS + 1)
         path, axes = told.at(at), told.width(at)
         hoops = rings(path, axes)
@@ -116,106 +103,60 @@ class Selection:
             band.visible = self.tube
         self._curtain.vertices, self._curtain.visible = curtain(path, ground)[0], self.tube
         bold.add(chain(path), rgb(p.ink))
-        thin.add(chain(path * [1, 1, 0] + [0, 0, ground + 0.05]), mix(p.tube, p.ground, 0.5))
+        foot = path * [1, 1, 0] + [0, 0, ground + 0.05]
+        thin.add(chain(foot), mix(p.tube, p.ground, 0.5))
+        thin.add(np.stack([path[-1], foot[-1]]), mix(p.horizon, p.ground, 0.5))
+        if self.tube:
+            some = np.linspace(start, until, SAMPLE_STEPS)
+            drawn = samples(told.at(some), told.width(some), SAMPLES, vehicle.uav)
+            thin.add(chain(drawn), mix(p.tube, p.ground, 0.6))
+        self._draw_marks(told, start, thin)
+        thin.add(_beyond(told, until), rgb(p.muted))
+
+    def _draw_marks(self, told: Forecast, start: float, thin: Sheaf) -> None:
+        """Ring the tube at the marked look-aheads and, in its own colour, at the horizon."""
+        p, until = self._palette, told.until
         steps = [s for s in marks(until) if s > start + 1.0][-4:]
         hoop = rings(told.at(np.array([0.0, *steps, until])), told.width(np.array([0.0, *steps, until])))[1:]
-        thin.add(closed(hoop[:-1]).reshape(-1, 2, 3), mix(p.tube, p.ground, 0.85))
+        thin.add(closed(hoop[:-1]), mix(p.tube, p.ink, 0.7))
         self._horizon.draw(closed(hoop[-1]), rgb(p.horizon))
-        self._say_marks(steps, hoop)
         said = "below 10 % to the end" if told.message.horizon_open else "error reaches 10 %"
         top = hoop[-1][np.argmax(hoop[-1][:, 2])]
-        clear = np.linalg.norm(top - path[0]) > self._clear_of  # the aircraft's own label says the horizon too
-        self.say("horizon", f"{until:.0f} s: {said}", _above(top, 0.3) if clear else None)
-        thin.add(self._beyond(told, until), rgb(p.muted))
+        self.tags.append(Tag("horizon", f"horizon {until:.0f} s: {said}", top, 0.8, "bottom-left"))
+        lows = [ring[np.argmin(ring[:, 2])] for ring in hoop[:-1]]
+        self.tags += [Tag(f"+{s:g}", f"+{s:g} s", low, 0.72) for s, low in zip(steps, lows, strict=True)]
 
-    def _say_marks(self, steps: list[float], hoop: np.ndarray) -> None:
-        """Label the time rings (k + 1, sides, 3), the last is the horizon; one too near to another stays bare."""
-        taken = [hoop[-1].mean(axis=0)]
-        for k in range(4):
-            low = hoop[k][np.argmin(hoop[k][:, 2])] if k < len(steps) else None
-            if low is not None and min(np.linalg.norm(low - other) for other in taken) < self._clear_of:
-                low = None
-            self.say(f"m{k}", f"+{steps[k]:g} s" if low is not None else "", low)
-            taken += [low] if low is not None else []
-
-    def _no_tube(self, told: Forecast | None, start: float, thin: "_Sheaf") -> None:
-        """Claim nothing: no band, no horizon; a path without a horizon is grey dashes."""
+    def _hide_tube(self) -> None:
         for node in (*self._bands, self._curtain):
             node.visible = False
         self._horizon.draw(NOTHING.legs)
-        for name in LABELS[1:6]:
-            self.say(name, "", None)
+
+    def _no_tube(self, told: Forecast | None, start: float, thin: Sheaf) -> None:
+        """Claim nothing: no band, no horizon; a path without a horizon is grey dashes."""
+        self._hide_tube()
         if told is not None:
-            thin.add(self._beyond(told, start), rgb(self._palette.muted))
+            thin.add(_beyond(told, start), rgb(self._palette.muted))
 
-    @staticmethod
-    def _beyond(told: Forecast, start: float) -> np.ndarray:
-        """Dash what was predicted past the horizon: (n, 2, 3), where nothing is claimed."""
-        end = min(float(told.ahead[-1]), start + BEYOND_S)
-        return dashed(told.at(np.linspace(start, end, 40))) if end > start + 0.5 else np.zeros((0, 2, 3))
-
-    def _draw_hindcast(self, past: list[Forecast], trail: np.ndarray, clock: float, thin: "_Sheaf") -> None:
-        """Lay an old prediction beside what happened, with a whisker every 5 s."""
-        old = [told for told in past if HINDCAST_S - 5 <= clock - told.t <= HINDCAST_S + 5]
-        if not old or len(trail) < 2:
-            return self.say("then", "", None)
-        told = min(old, key=lambda one: abs(clock - one.t - HINDCAST_S))
-        reach = min(clock - told.t, told.until, float(trail[-1, 0] - told.t))  # past its horizon it claimed nothing
-        if reach < 5:
-            return self.say("then", "", None)
-        colour = mix(self._palette.horizon, self._palette.ground, 0.85)
-        thin.add(dashed(told.at(np.linspace(0, reach, 2 * int(reach) + 2))), colour)
-        at = np.arange(5.0, reach, 5.0)
-        happened = np.stack([np.interp(told.t + at, trail[:, 0], trail[:, i]) for i in (1, 2, 3)], axis=-1)
-        thin.add(np.stack([told.at(at), happened], axis=1), colour)
-        middle = told.at(0.4 * reach) - [0, 0, 0.6]
-        clear = np.linalg.norm(middle - trail[-1, 1:4]) > self._clear_of
-        self.say("then", f"predicted {clock - told.t:.0f} s ago", middle if clear else None)
-
-    def draw_flight(self, vehicle: Vehicle, rows: np.ndarray, now: float, size: float) -> None:
-        """Draw the whole flown path (n, 4), faintly, with what happened on it; `size` as for `draw`."""
-        self._flown.draw(chain(rows[:, 1:]) if len(rows) > 1 else NOTHING.legs, self._flown_colour)
-        self._pins.draw(vehicle.events, rows, vehicle.where(now), size)
+    def draw_flight(self, vehicle: Vehicle, rows: np.ndarray, now: float, unit: float) -> None:
+        """Draw the whole flown path (n, 4), faintly, with what happened on it; `unit` as for `draw`."""
+        sound = ~mismatch.within(rows[:, 0], vehicle.mismatch)[1:]
+        self._flown.draw(chain(rows[:, 1:])[sound] if len(rows) > 1 else NOTHING.legs, self._flown_colour)
         found = vehicle.mismatch
         self._mismatch.draw(mismatch.lines(found, rows), rgb(self._palette.mismatch))
         begun = mismatch.place(found, rows)
-        said = f"▲ {mismatch.short(found)} from here" if found is not None and begun is not None else ""
-        self.say("mismatch", said, begun)
+        self.marks = self._pins.draw(vehicle.events, rows, vehicle.where(now), unit)
+        if found is not None and begun is not None:
+            self.marks.insert(0, Tag("mismatch", f"▲ {mismatch.short(found)} from here", begun, 0.85))
 
-    def draw_route(self, route: Route, size: float) -> None:
-        """Draw the mission: legs and loiters solid, jumps and returns dashed, a small ring at each item."""
-        p, lines, radius = self._palette, _Sheaf(), min(1.2, 0.9 * size)
-        lines.add(np.concatenate([route.legs, route.circles]), mix(p.route, p.ground, 0.8))
-        lines.add(dash_lines(route.back, 3.0), mix(p.route, p.ground, 0.6))
-        if len(route.points):
-            lines.add(
-                closed(np.stack([_disc(point, radius, 12) for point in route.points])).reshape(-1, 2, 3), rgb(p.route)
-            )
-        self._route.draw(*lines.all())
+    def draw_route(self, vehicle: Vehicle, route: Route, sight: Sight, unit: float) -> None:
+        """Draw its mission; numbers face the camera."""
+        self._plan.draw(route, seq_in_force(vehicle), sight, unit)
 
 
-class _Sheaf:
-    """Segments of several colours for one node."""
-
-    def __init__(self) -> None:
-        self._lines: list[np.ndarray] = []
-        self._colours: list[np.ndarray] = []
-
-    def add(self, lines: np.ndarray, colour: np.ndarray) -> None:
-        self._lines.append(lines)
-        self._colours.append(np.broadcast_to(colour, (len(lines), 3)))
-
-    def all(self) -> tuple[np.ndarray, np.ndarray]:
-        return np.concatenate(self._lines), np.concatenate(self._colours)
-
-
-def _disc(centre: np.ndarray, radius: float, sides: int = 40) -> np.ndarray:
-    turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
-    return centre + radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(sides)], axis=-1)
-
-
-def _above(at: np.ndarray, height: float) -> np.ndarray:
-    return at + np.array([0.0, 0.0, height])
+def _beyond(told: Forecast, start: float) -> np.ndarray:
+    """Dash what was predicted past the horizon: (n, 2, 3), where nothing is claimed."""
+    end = min(float(told.ahead[-1]), start + BEYOND_S)
+    return dashed(told.at(np.linspace(start, end, 40))) if end > start + 0.5 else np.zeros((0, 2, 3))
 
 
 def caption(vehicle: Vehicle, now: float) -> str:

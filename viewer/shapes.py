@@ -54,3 +54,10 @@ def rotorcraft() -> tuple[np.ndarray, np.ndarray]:
         vertices += [beam, rotor]
         faces += [np.array([(0, 1, 2), (0, 2, 3), (2, 1, 0), (3, 2, 0)]) + n, fan + n + 4, fan[:, ::-1] + n + 4]
     return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
+
+
+def dart() -> tuple[np.ndarray, np.ndarray]:
+    """Shape an arrowhead of one unit span that looks along +x, for a crowd: vertices (5, 3), triangles (6, 3)."""
+    vertices = np.array([[0.75, 0, 0], [-0.45, 0.42, 0], [-0.45, -0.42, 0], [-0.2, 0, 0.16], [-0.2, 0, -0.06]])
+    faces = np.array([(0, 1, 3), (0, 3, 2), (1, 2, 3), (0, 4, 1), (0, 2, 4), (1, 4, 2)])
+    return vertices.astype(np.float32), faces.astype(np.uint32)

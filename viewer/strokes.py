@@ -62,3 +62,31 @@ def faded(colour: np.ndarray, ground: np.ndarray, shares: np.ndarray) -> np.ndar
     """Fade a line along its segments: colour (..., 3), shares (n + 1,) of it at the joints -> (..., n, 2, 3)."""
     joints = colour[..., None, :] * shares[:, None] + ground * (1 - shares[:, None])
     return chain(joints)
+
+
+def closed(ring: np.ndarray) -> np.ndarray:
+    """Join the corners of rings (..., sides, 3) into closed loops: (..., sides, 2, 3)."""
+    return np.stack([ring, np.roll(ring, -1, axis=-2)], axis=-2)
+
+
+def disc(centre: np.ndarray, radius: float, sides: int = 40) -> np.ndarray:
+    """Lay the corners of a level circle round a place (3,): (sides, 3)."""
+    turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+    return centre + radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(sides)], axis=-1)
+
+
+class Sheaf:
+    """Segments of several colours for one node."""
+
+    def __init__(self) -> None:
+        self._lines: list[np.ndarray] = [np.zeros((0, 2, 3))]
+        self._colours: list[np.ndarray] = [np.zeros((0, 3))]
+
+    def add(self, lines: np.ndarray, colour: np.ndarray) -> None:
+        """Add segments (n, 2, 3) of one colour (3,), or of one each (n, 3)."""
+        self._lines.append(lines.reshape(-1, 2, 3))
+        self._colours.append(np.broadcast_to(colour, (len(self._lines[-1]), 3)))
+
+    def all(self) -> tuple[np.ndarray, np.ndarray]:
+        """Give what was added, for `Strokes.draw`."""
+        return np.concatenate(self._lines), np.concatenate(self._colours)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-SIDES = 24  # corners of one ring
+SIDES = 20  # corners of one ring
+BAND_SIGMA = 2.1  # half-axes of the 90 % band, to be held all at once, in standard deviations
 
 
 def frame_of(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -49,11 +50,6 @@ def skin(n: int, sides: int = SIDES) -> np.ndarray:
     return np.concatenate([half.reshape(-1, 3) for half in halves]).astype(np.uint32)
 
 
-def closed(ring: np.ndarray) -> np.ndarray:
-    """Join the corners of rings (..., sides, 3) into closed loops: (..., sides, 2, 3)."""
-    return np.stack([ring, np.roll(ring, -1, axis=-2)], axis=-2)
-
-
 def curtain(path: np.ndarray, ground: float) -> tuple[np.ndarray, np.ndarray]:
     """Hang a curtain from a path to the ground: corners (2 n, 3), triangles (2 (n - 1), 3)."""
     foot = path * [1.0, 1.0, 0.0] + [0.0, 0.0, ground]
@@ -65,3 +61,22 @@ def curtain(path: np.ndarray, ground: float) -> tuple[np.ndarray, np.ndarray]:
 def marks(until: float, steps: tuple[float, ...] = (5, 10, 20, 30, 60, 120)) -> list[float]:
     """Choose the look-aheads to mark [s]: those that leave room before the horizon."""
     return [step for step in steps if step < until - max(2.0, 0.12 * until)]
+
+
+def samples(path: np.ndarray, axes: np.ndarray, n: int, seed: int) -> np.ndarray:
+    """Draw a few paths that the band would hold as often as it says: (n, k, 3).
+
+    Each is off the mean by one standard normal offset across and one up, in units of the band's half-axes over
+    `BAND_SIGMA`, that turn slowly into two others: doubt is correlated along a flight.
+
+    Args:
+        path: mean position, (k, 3) [10 m]
+        axes: half-axes along, cross, vertical, (k, 3) [10 m]
+        n: how many
+        seed: the same gives the same offsets, so that paths do not flicker
+    """
+    cross, up = frame_of(path)
+    begin, end = np.random.default_rng(seed).standard_normal((2, n, 2, 1))
+    turn = np.linspace(0.0, 0.9, len(path))
+    offset = (np.cos(turn) * begin + np.sin(turn) * end) / BAND_SIGMA
+    return path + offset[:, 0, :, None] * (axes[:, 1, None] * cross) + offset[:, 1, :, None] * (axes[:, 2, None] * up)

@@ -1,0 +1,139 @@
+"""The whole fleet as arrays, once for all who look: who, where, how each stands, and a minute of trail."""
+
+import numpy as np
+
+from fleet.contract import State
+from viewer.feed import Feed
+from viewer.mismatch import in_force
+from viewer.place import UNIT_M, scene_quat
+from viewer.vehicle import Vehicle
+
+CROWD = 300  # above this many, exceptions alone keep stems and predicted paths, and trails get coarser
+CHUNKS, STEPS = 5, 12  # the trail: chunks of 12 s, and a head of up to 12 s, one point a second
+MINUTE = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # how long ago each point of the trail is, (73,) [s]
+COARSE = 4  # seconds between the points of a trail in a crowd
+LEAP_M = 1_000.0  # farther within a second is no flight but another one (a recording begun anew): a new trail [m]
+HOVER = ("multirotor", "helicopter")  # kinds of vehicle drawn with rotors
+LOOKS = ("muted", "predicting", "verified", "identifying", "lost", "mismatch")  # names of colours
+WAITING, PREDICTING, VERIFIED, IDENTIFYING, LOST, MISMATCH = range(len(LOOKS))
+_OF_STATE = {
+    State.PREDICTING: PREDICTING,
+    State.VERIFIED: VERIFIED,
+    State.IDENTIFYING: IDENTIFYING,
+    State.LINK_LOST: LOST,
+}
+
+
+def look(vehicle: Vehicle, now: float) -> int:
+    """Tell how a UAV looks: an index into `LOOKS`; a mismatch or an alert wins over all but a lost link."""
+    state = vehicle.state(now)
+    if vehicle.ended:
+        return WAITING
+    if state is not State.LINK_LOST and (vehicle.alerts or in_force(vehicle.mismatch)):
+        return MISMATCH
+    return _OF_STATE.get(state, WAITING)
+
+
+class Flock:
+    """Who is drawn, in the order of their ids; arrays of n."""
+
+    def __init__(self) -> None:
+        self.fleet: list[Vehicle] = []  # copies, as of the last second
+        self.now = 0.0  # when that was, monotonic [s]
+        self.uavs: tuple[int, ...] = ()
+        self.looks = np.zeros(0, int)  # indices into LOOKS
+        self.hover = np.zeros(0, bool)  # who has rotors instead of wings
+        self.at = np.zeros((0, 3))  # scene ENU [10 m]
+        self.quat = np.zeros((0, 4))  # orientation, scalar first
+        self.changes = 0  # of who is drawn, and of trails begun anew
+        self.beats = 0  # seconds of trail
+        self.ring = np.zeros((0, len(MINUTE), 3))  # a minute of trail, newest last
+        self._ghosts: list[tuple[int, Vehicle]] = []  # whose place is predicted, for they are not heard
+
+    @property
+    def crowd(self) -> bool:
+        """Tell whether there are too many to draw everything of each."""
+        return len(self.uavs) > CROWD
+
+    @property
+    def stride(self) -> int:
+        """Give the seconds between the drawn points of a trail."""
+        return COARSE if self.crowd else 1
+
+    @property
+    def exceptions(self) -> np.ndarray:
+        """Tell who needs an eye, (n,)."""
+        return (self.looks == MISMATCH) | (self.looks == LOST)
+
+    def index(self, uav: int | None) -> int | None:
+        """Give the row of a UAV; None where it is not drawn."""
+        found = np.searchsorted(self.uavs, uav) if uav is not None and self.uavs else 0
+        return int(found) if found < len(self.uavs) and self.uavs[found] == uav else None
+
+    def meet(self, fleet: list[Vehicle], now: float) -> None:
+        """Take over who is there and how they stand; call it once a second."""
+        self.fleet, self.now = fleet, now
+        shown = [(vehicle, at) for vehicle in fleet if (at := vehicle.where(now)) is not None]
+        uavs = tuple(vehicle.uav for vehicle, _ in shown)
+        self.looks = np.array([look(vehicle, now) for vehicle, _ in shown], int)
+        hover = np.array([v.status is not None and v.status.vehicle in HOVER for v, _ in shown], bool)
+        if uavs != self.uavs or not np.array_equal(hover, self.hover):
+            self._enlist(uavs, np.array([at for _, at in shown]).reshape(-1, 3))
+            self.hover = hover
+        self._ghosts = [(i, v) for i, (v, _) in enumerate(shown) if v.ended or v.at is None or self.looks[i] == LOST]
+        for i, _ in self._ghosts:
+            self.at[i] = shown[i][1]
+
+    def _enlist(self, uavs: tuple[int, ...], at: np.ndarray) -> None:
+        """Begin with another set of UAVs; those who stay keep their trails."""
+        old = {uav: i for i, uav in enumerate(self.uavs)}
+        ring = np.repeat(at[:, None], len(MINUTE), axis=1)
+        for i, uav in enumerate(uavs):
+            if uav in old:
+                ring[i] = self.ring[old[uav]]
+        self.ring, self.uavs, self.at, self.changes = ring, uavs, at, self.changes + 1
+        self.quat = np.tile([1.0, 0.0, 0.0, 0.0], (len(uavs), 1))
+
+    def pose(self, feed: Feed, now: float) -> None:
+        """Take over where everybody is; call it as often as the picture moves."""
+        if not self.uavs:
+            return
+        places, turns = feed.poses(self.uavs)
+        heard = np.isfinite(places[:, 0])
+        held = [i for i, _ in self._ghosts]
+        heard[held] = False
+        self.at = np.where(heard[:, None], places, self.at)
+        if not self.crowd:
+            for i, vehicle in self._ghosts:
+                if (spot := vehicle.where(now)) is not None:
+                    self.at[i] = spot
+        self.quat = scene_quat(*turns.T)
+
+    def beat(self, played: dict[int, np.ndarray]) -> None:
+        """Remember where everyone is, once a second.
+
+        Args:
+            played: of UAVs whose seconds are others than ours, the places `MINUTE` ago, (n, 3) [10 m]
+        """
+        if not self.uavs:
+            return
+        self.ring = np.concatenate([self.ring[:, 1:], self.at[:, None]], axis=1)
+        leapt = np.linalg.norm(self.ring[:, -1] - self.ring[:, -2], axis=1) > LEAP_M / UNIT_M
+        self.ring[leapt] = self.ring[leapt, -1:]
+        for i, uav in enumerate(self.uavs):
+            if uav in played:
+                self.ring[i] = played[uav]
+        self.beats += 1
+        self.changes += bool(leapt.any() or played)
+
+    def chunk(self, age: int) -> np.ndarray:
+        """Give the points of one closed chunk of trail, (n, k, 3); `age` 0 is the newest."""
+        last = len(MINUTE) - 1 - self.beats % STEPS - age * STEPS
+        return self.ring[:, last - STEPS : last + 1 : self.stride]
+
+    def head(self) -> np.ndarray:
+        """Give the newest stretch of trail up to where each is now, (n, k, 3): an array of fixed size."""
+        run = self.beats % STEPS
+        points = self.ring[:, len(MINUTE) - 1 - run :: self.stride]
+        missing = STEPS // self.stride + 2 - points.shape[1]
+        return np.concatenate([points, np.repeat(self.at[:, None], missing, axis=1)], axis=1)

@@ -1,0 +1,99 @@
+"""At most eight labels in 3-D, those that matter most, and none upon another: labels do not make room by themselves."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+MOST = 8
+LETTER, LINE = 0.0068, 0.020  # width and height of a letter over the height of the picture, at scale 1 [-]
+EDGE = 0.02  # a label keeps this far from the edge of the picture [heights of it]
+_SHIFT = {"bottom-center": (-0.5, 0.0), "bottom-left": (0.0, 0.0), "top-center": (-0.5, -1.0), "top-left": (0.0, -1.0)}
+
+
+class Tag(NamedTuple):
+    """Words at a place."""
+
+    key: str  # what it is, so that it keeps its node while it is shown
+    text: str
+    at: np.ndarray  # (3,) [10 m]
+    scale: float = 0.8
+    anchor: str = "top-center"
+
+
+class Labels:
+    """The label nodes of one page."""
+
+    def __init__(self, scene: Any) -> None:
+        self._nodes = [
+            scene.add_label(f"/labels/{k}", "", font_screen_scale=0.8, depth_test=False, visible=False)
+            for k in range(MOST)
+        ]
+        self._held: dict[str, Any] = {}  # key -> node
+
+    def draw(self, tags: list[Tag], sight: "Sight") -> None:
+        """Show the first that fit, most important first."""
+        shown = fitting(tags, sight)
+        keys = {tag.key for tag in shown}
+        for key in [key for key in self._held if key not in keys]:
+            self._held.pop(key).visible = False
+        free = iter([node for node in self._nodes if not any(node is held for held in self._held.values())])
+        for tag in shown:
+            if tag.key not in self._held:
+                self._held[tag.key] = next(free)
+            node = self._held[tag.key]
+            node.text, node.font_screen_scale, node.anchor = tag.text, tag.scale, tag.anchor
+            node.position, node.visible = tuple(float(x) for x in tag.at), True
+
+
+class Sight(NamedTuple):
+    """What a camera sees: from where, which way, how wide."""
+
+    eye: np.ndarray  # (3,) [10 m]
+    look_at: np.ndarray  # (3,) [10 m]
+    fov: float  # vertical [rad]
+    aspect: float  # width over height [-]
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Give where points (n, 3) are, right and up of the picture's middle in heights of it, (n, 2), and how deep."""
+        right, up = self.axes()
+        off = points - self.eye
+        depth = off @ np.cross(up, right)
+        flat = np.stack([off @ right, off @ up], axis=-1)
+        return flat / (2 * np.tan(self.fov / 2) * np.maximum(depth, 1e-3)[:, None]), depth
+
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Give the directions right and up in the picture, two (3,)."""
+        ahead = (self.look_at - self.eye) / (np.linalg.norm(self.look_at - self.eye) or 1.0)
+        right = np.cross(ahead, [0.0, 0.0, 1.0])
+        right = right / (np.linalg.norm(right) or 1.0)
+        return right, np.cross(right, ahead)
+
+
+def fitting(tags: list[Tag], sight: Sight) -> list[Tag]:
+    """Choose the labels that are in the picture and clear of those before them, at most `MOST`."""
+    if not tags:
+        return []
+    spots, depth = sight.project(np.array([tag.at for tag in tags]))
+    shown: list[Tag] = []
+    boxes: list[np.ndarray] = []
+    half = np.array([sight.aspect / 2 - EDGE, 0.5 - EDGE])
+    for tag, spot, far in zip(tags, spots, depth, strict=True):
+        box = _box(tag, spot)
+        inside = far > 0 and (np.abs(box) <= half).all()
+        if inside and not any(_overlap(box, other) for other in boxes):
+            shown.append(tag)
+            boxes.append(box)
+        if len(shown) == MOST:
+            break
+    return shown
+
+
+def _box(tag: Tag, spot: np.ndarray) -> np.ndarray:
+    """Give the corners of a label in the picture, (2, 2) [heights of it]."""
+    size = np.array([LETTER * len(tag.text), LINE]) * tag.scale
+    low = spot + np.array(_SHIFT[tag.anchor]) * size
+    return np.stack([low, low + size])
+
+
+def _overlap(one: np.ndarray, other: np.ndarray) -> bool:
+    return bool((one[0] < other[1]).all() and (other[0] < one[1]).all())

@@ -1,0 +1,38 @@
+"""Figures as strokes: numbers that lie in the scene cost neither a label nor a node."""
+
+import numpy as np
+
+# Each figure on a grid of 2 x 4, as polylines of corners (x, y).
+_FIGURES: dict[str, tuple[tuple[tuple[float, float], ...], ...]] = {
+    "0": (((0, 0), (2, 0), (2, 4), (0, 4), (0, 0)),),
+    "1": (((0.4, 3.2), (1.2, 4), (1.2, 0)),),
+    "2": (((0, 4), (2, 4), (2, 2), (0, 2), (0, 0), (2, 0)),),
+    "3": (((0, 4), (2, 4), (2, 0), (0, 0)), ((0.5, 2), (2, 2))),
+    "4": (((0, 4), (0, 2), (2, 2)), ((2, 4), (2, 0))),
+    "5": (((2, 4), (0, 4), (0, 2), (2, 2), (2, 0), (0, 0)),),
+    "6": (((2, 4), (0, 4), (0, 0), (2, 0), (2, 2), (0, 2)),),
+    "7": (((0, 4), (2, 4), (0.9, 0)),),
+    "8": (((0, 0), (2, 0), (2, 4), (0, 4), (0, 0)), ((0, 2), (2, 2))),
+    "9": (((2, 2), (0, 2), (0, 4), (2, 4), (2, 0), (0, 0)),),
+    ".": (((0.3, 0), (0.7, 0), (0.7, 0.4), (0.3, 0.4), (0.3, 0)),),
+    "k": (((0, 0), (0, 4)), ((1.6, 2.6), (0, 1.2), (1.7, 0))),
+    "m": (((0, 0), (0, 2.4), (2, 2.4), (2, 0)), ((1, 2.4), (1, 0))),
+}
+_STEP = {".": 1.4}  # how far the next figure stands; 3 of the rest
+
+
+def written(text: str, tall: float) -> np.ndarray:
+    """Write figures flat on the ground, east along the line, north up: (n, 2, 3); what has no figure is a space."""
+    lines, x = [np.zeros((0, 2, 2))], 0.0
+    for letter in text:
+        for stroke in _FIGURES.get(letter, ()):
+            corners = np.array(stroke) + np.array([x, 0.0])
+            lines.append(np.stack([corners[:-1], corners[1:]], axis=1))
+        x += _STEP.get(letter, 3.0)
+    flat = np.concatenate(lines) * (tall / 4)
+    return np.concatenate([flat, np.zeros((*flat.shape[:2], 1))], axis=-1)
+
+
+def upright(strokes: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Turn flat strokes (n, 2, 3) to face who looks along right x up, both (3,): (n, 2, 3)."""
+    return strokes[..., :1] * right + strokes[..., 1:2] * up

@@ -1,0 +1,154 @@
+"""One page: what one operator has selected, shows and looks at."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from viewer.callouts import callouts
+from viewer.camera import Camera
+from viewer.feed import Feed
+from viewer.flock import Flock
+from viewer.labels import Labels
+from viewer.palette import Palette
+from viewer.panels import Panels
+from viewer.place import UNIT_M, Place
+from viewer.routes import NOTHING, route
+from viewer.scene import Scene
+from viewer.selected import Selection
+
+NEAR_M = 800.0  # items of the route within this are shown with an aircraft one turns to [m]
+ROOM = 1.35  # how much more than what was flown is framed, while it grows [-]
+IN_VIEW_M = 20_000.0  # what is farther from the middle of the fleet is not framed [m]
+
+
+class View:
+    """The page of one client: its scene, its panels, its camera, its selection."""
+
+    def __init__(self, client: Any, feed: Feed, palette: Palette, wake: Callable[[], None]) -> None:
+        self.client, self._feed, self.palette, self._wake = client, feed, palette, wake
+        self.scene = Scene(client.scene, palette, self.choose)
+        self.selection, self._labels = Selection(client.scene, palette), Labels(client.scene)
+        self.panels = Panels(client, palette, self.visit)
+        self.camera = Camera(client)
+        self.selected: int | None = None
+        self.dirty = True  # something was chosen that is not drawn yet
+        self.offset = 0  # tick of the second at which what is slow is drawn
+        self._seen: tuple = ()
+        self._framed = np.zeros((2, 3))  # corners of what the camera was last framed on [10 m]
+        self._followed: tuple[int, np.ndarray] | None = None
+
+    def choose(self, uav: int) -> None:
+        """Select a UAV; it is drawn at once."""
+        if uav in self._feed.vehicles:
+            self.selected, self.dirty = uav, True
+            self._wake()
+
+    def visit(self, uav: int) -> None:
+        """Select a UAV that may be out of sight, and turn the camera to it."""
+        self.choose(uav)
+        vehicle, place = self._feed.one(uav), self._feed.place
+        if vehicle is None or place is None or (at := vehicle.where(time.monotonic())) is None:
+            return
+        told = [vehicle.forecast.path] if vehicle.forecast is not None else []
+        around = route(vehicle.mission, place, self.scene.ground.height).points[1:]
+        close = around[np.linalg.norm(around - at, axis=1) < NEAR_M / UNIT_M]
+        self.camera.fly_to(np.vstack([at, *told, close]))
+
+    def move(self, flock: Flock, now: float, tick: int) -> None:
+        """Draw what moves: aircraft at the full rate, heads of trails, stems and the selected UAV more slowly."""
+        self.scene.glyphs.draw(flock)
+        if tick % (10 if flock.crowd else 2) == 0:
+            self.scene.draw_heads(flock)
+            self.scene.draw_stems(flock)
+            self.scene.draw_alerts(flock)
+        if tick % 2 == 0:
+            self.point(flock, now)
+        self._follow(now)
+
+    def point(self, flock: Flock, now: float) -> None:
+        """Draw the selected UAV, size everybody for where the camera is, and label."""
+        sight, scene = self.camera.sight(), self.scene
+        size = self.panels.glyph.value
+        scene.glyphs.look(flock, selected=self.selected, eye=sight.eye, look_at=sight.look_at, size=size)
+        chosen = self._feed.one(self.selected) if self.selected is not None else None
+        if chosen is None:
+            self.selection.clear()
+        else:
+            self.selection.draw(chosen, self._feed, now, ground=scene.ground.height, unit=scene.glyphs.unit)
+        said = [*self.selection.tags, *self.selection.marks[:1], *callouts(flock, self.selected, scene.glyphs.unit)]
+        self._labels.draw([*said, *self.selection.marks[1:]], sight)
+
+    def settle(self, flock: Flock, now: float, ground: float) -> None:
+        """Draw what changes slowly: trails, predicted paths, routes, panels; once a second and on a new selection."""
+        self.dirty = False
+        if self.selected is None and (known := [v for v in flock.fleet if flock.index(v.uav) is not None]):
+            self.selected = max(known, key=lambda v: (v.forecast is not None, -v.uav)).uav
+        self.panels.draw(flock.fleet, self._feed, flock.now, self.selected)
+        place, options, scene = self._feed.place, self.panels, self.scene
+        if place is None or not flock.uavs:
+            return
+        scene.ground.raise_to(ground)
+        scene.draw_trails(flock)
+        scene.draw_predicted(flock, now, self.selected if options.tube.value else None)
+        scene.predicted.show(options.predicted.value)
+        scene.stems.show(options.stems.value)
+        for strokes in (*scene.trails, scene.head):
+            strokes.show(options.trails.value)
+        others = [v for v in flock.fleet if v.uav != self.selected] if options.routes.value else []
+        scene.draw_routes([route(v.mission, place, ground) for v in others])
+        self.selection.tube = options.tube.value
+        self._draw_chosen(now, place, ground)
+
+    def _draw_chosen(self, now: float, place: Place, ground: float) -> None:
+        """Draw the selected UAV's flown path and mission."""
+        chosen = self._feed.one(self.selected) if self.selected is not None else None
+        if chosen is None:
+            return
+        self.selection.draw_flight(chosen, self._feed.track(chosen), now, self.scene.glyphs.unit)
+        own = route(chosen.mission, place, ground)
+        self.selection.draw_route(chosen, own, self.camera.sight(), self.scene.glyphs.unit)
+
+    def frame(self, cloud: np.ndarray, seen: tuple, ground: float) -> None:
+        """Frame what there is to see when something of it is new or outgrows the frame, or the picture's shape.
+
+        Args:
+            cloud: the fleet and what is predicted, (n, 3) [10 m]
+            seen: what makes a new picture, whatever its extent
+            ground: height of the ground [10 m]
+        """
+        chosen, place = self._feed.one(self.selected) if self.selected is not None else None, self._feed.place
+        own = route(chosen.mission, place, ground) if chosen is not None and place is not None else NOTHING
+        flown = self._feed.track(chosen)[:, 1:] if chosen is not None else NOTHING.points
+        cloud = near(np.vstack([cloud, own.points, own.circles.reshape(-1, 3), flown]), IN_VIEW_M / UNIT_M)
+        seen = (*seen, bool(len(own.points)), round(self.camera.aspect, 1))
+        if seen == self._seen and not outgrown(cloud, self._framed):
+            return
+        grown, self._seen = seen == self._seen, seen
+        self._framed = np.stack([cloud.min(axis=0), cloud.max(axis=0)])
+        if grown:  # it will go on growing: make room, rather than move the picture every second
+            cloud = cloud.mean(axis=0) + (cloud - cloud.mean(axis=0)) * [ROOM, ROOM, 1.0]
+        self.camera.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, ground]]))
+
+    def _follow(self, now: float) -> None:
+        vehicle = self._feed.one(self.selected) if self.panels.follow.value and self.selected is not None else None
+        at = vehicle.where(now) if vehicle is not None else None
+        if vehicle is None or at is None:
+            self._followed = None
+            return
+        if self._followed is not None and self._followed[0] == vehicle.uav:
+            self.camera.follow(at - self._followed[1])
+        self._followed = vehicle.uav, at
+
+
+def near(points: np.ndarray, reach: float) -> np.ndarray:
+    """Keep the points (n, 3) within `reach` of the most central one: never none [10 m]."""
+    centre = points[np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1))]
+    return points[np.linalg.norm(points - centre, axis=1) < reach]
+
+
+def outgrown(cloud: np.ndarray, framed: np.ndarray) -> bool:
+    """Tell whether points (n, 3) have left a framed box (2, 3), its corners, by more than what was left free."""
+    spare = 0.4 * (ROOM - 1) * max(float(np.linalg.norm(framed[1] - framed[0])), 10.0)
+    return bool(((framed[0] - cloud.min(axis=0)) > spare).any() or ((cloud.max(axis=0) - framed[1]) > spare).any())
