@@ -102,8 +102,10 @@ class App:
             with view.client.atomic():
                 if tick % SECOND == view.offset or view.dirty:
                     view.settle(self.flock, now, self._ground)
-                    view.frame(self._cloud, self._news(), self._ground)
-                view.move(self.flock, now, tick)
+                    if len(self._cloud):
+                        view.frame(self._cloud, self._news(), self._ground)
+                if self.flock.uavs:
+                    view.move(self.flock, now, tick)
 
     def answer(self) -> None:
         """Draw at once what was just selected."""
