@@ -1,0 +1,154 @@
+"""What the viewer takes and gives with a fleet of synthetic feeds: server, clients, picture, clicks, restart.
+
+    python -m tests.bench.viewing --uavs 1000 --json viewing.json
+    python -m tests.bench.viewing --uavs 200 --seconds 60 --picture fleet.png
+    python -m tests.bench.viewing --uavs 1000 --seconds 600 --plain 0      is its memory flat?
+
+A router, the feeder, the viewer as an operator starts it, one browser with software rendering and three websocket
+clients, all on this machine: the browser takes the most of it. `server_cpu` is of one core, all threads of the viewer.
+`clients` are bytes received. `pose_to_screen` is from the publishing of a sample to the first frame with its place.
+`plain`: a scene with a node for each aircraft, on the same feed, without a browser in the way.
+"""
+
+import argparse
+import json
+import platform
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .page import Page
+from .process import cpu_s, free_port, rss_mb, start, tell
+from .watcher import Watcher
+
+SETTLE_S = 15.0  # until chunks of trail are full enough to count [s]
+SAMPLES_S = 5.0  # between two looks at the memory [s]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--uavs", type=int, default=1000)
+    parser.add_argument("--hz", type=float, default=10.0, help="samples of each per second")
+    parser.add_argument("--seconds", type=float, default=30.0, help="watched with every client")
+    parser.add_argument("--plain", type=float, default=15.0, help="seconds of the plain scene; 0: without it")
+    parser.add_argument("--no-page", action="store_true", help="without a browser")
+    parser.add_argument("--chromium", default="/usr/bin/chromium")
+    parser.add_argument("--picture", type=Path, help="keep the last frame of the page here")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    router = f"tcp/127.0.0.1:{free_port()}"
+    feeder = start("tests.bench.viewing.feeder", router, "--uavs", str(args.uavs), "--hz", str(args.hz))
+    found: dict[str, Any] = {"machine": platform.processor() or platform.machine(), "uavs": args.uavs, "hz": args.hz}
+    try:
+        found |= with_page(args, router, feeder) if not args.no_page else without_page(args, router, feeder)
+        if args.plain:
+            found["plain"] = plain(router, args.plain)
+    finally:
+        tell(feeder)
+        feeder.wait(30)
+    print(json.dumps(found, indent=1))
+    if args.json:
+        args.json.write_text(json.dumps(found, indent=1))
+    return 0
+
+
+def without_page(args: argparse.Namespace, router: str, feeder: Any) -> dict[str, Any]:
+    """Watch with websocket clients alone."""
+    port = free_port()
+    viewer = start("viewer", "--port", str(port), "--router", router)
+    tell(feeder)
+    watchers = [Watcher(port) for _ in range(4)]
+    try:
+        wait(SETTLE_S)
+        return watched(viewer.pid, watchers, args.seconds)
+    finally:
+        viewer.terminate()
+        viewer.wait(30)
+
+
+def with_page(args: argparse.Namespace, router: str, feeder: Any) -> dict[str, Any]:
+    """Watch with a browser and three clients; then click, then kill the server and start it again."""
+    port = free_port()
+    command = "viewer", "--port", str(port), "--router", router
+    viewer = start(*command)
+    with Page(args.chromium) as page:
+        page.open(port)
+        began = float(tell(feeder))
+        page.await_node("/fleet/vehicles")
+        found: dict[str, Any] = {"first_scene_s": round(time.time() - began, 2)}
+        alone = cpu_s(viewer.pid), time.time()
+        wait(SETTLE_S)
+        found["server_cpu_one_page"] = share(viewer.pid, *alone)
+        watchers = [Watcher(port) for _ in range(3)]
+        wait(SAMPLES_S)
+        page.watch("/fleet/vehicles", began)
+        found |= watched(viewer.pid, watchers, args.seconds)
+        found["page"] = page.seen()
+        for watcher in watchers:
+            watcher.close()
+        found["selection"] = page.clicks(12)
+        if args.picture:
+            page.picture(args.picture)
+        viewer.kill()
+        viewer.wait(30)
+        page.page.wait_for_function("!window.__viserMutable.nodeRefFromName['/fleet/vehicles']", timeout=30_000)
+        spawned = time.time()
+        viewer = start(*command)
+        listening = time.time()
+        page.page.bring_to_front()
+        page.await_node("/fleet/vehicles")
+        found["restart"] = {"start_s": round(listening - spawned, 2), "usable_s": round(time.time() - listening, 2)}
+    viewer.terminate()
+    viewer.wait(30)
+    return found
+
+
+def watched(pid: int, watchers: list[Watcher], seconds: float) -> dict[str, Any]:
+    """Let time pass; give what the server and each client took."""
+    before, memory = [watcher.bytes for watcher in watchers], []
+    cpu, begin = cpu_s(pid), time.time()
+    while (passed := time.time() - begin) < seconds:
+        memory.append((passed / 60, rss_mb(pid)))
+        wait(min(SAMPLES_S, seconds - passed))
+    spent = time.time() - begin
+    minutes, held = np.array(memory).T
+    return {
+        "seconds": round(spent, 1),
+        "server_cpu": share(pid, cpu, begin),
+        "clients_kB_s": [round((w.bytes - b) / spent / 1e3, 1) for w, b in zip(watchers, before, strict=True)],
+        "clients_first_s": [round(watcher.first_s, 2) for watcher in watchers],
+        "memory_MB": [round(held[0], 1), round(held[-1], 1)],
+        "memory_MB_min": round(float(np.polyfit(minutes, held, 1)[0]), 2) if len(held) > 5 else None,
+    }
+
+
+def plain(router: str, seconds: float) -> dict[str, Any]:
+    """Watch the scene with a node for each aircraft, with one client."""
+    port = free_port()
+    server = start("tests.bench.viewing.naive", "--port", str(port), "--router", router)
+    try:
+        wait(SETTLE_S)
+        watcher = Watcher(port)
+        wait(SAMPLES_S)
+        return watched(server.pid, [watcher], seconds)
+    finally:
+        server.kill()
+        server.wait(30)
+
+
+def share(pid: int, cpu: float, since: float) -> float:
+    """Give how much of one core a process took since a time."""
+    return round((cpu_s(pid) - cpu) / (time.time() - since), 3)
+
+
+def wait(seconds: float) -> None:
+    """Let time pass."""
+    threading.Event().wait(seconds)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

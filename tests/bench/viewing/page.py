@@ -1,0 +1,122 @@
+"""The real browser: what is on the screen, how old it is, how soon a click is answered."""
+
+import tempfile
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from .feeder import PROBE_M_S
+
+ARGS = [
+    "--headless=new",
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--no-first-run",
+]
+IN_SCENE = "window.__viserMutable && window.__viserMutable.nodeRefFromName['{}']"
+NODES = "Object.keys(window.__viserMutable.nodeRefFromName).length"
+WATCH = """([name, began, speed]) => {
+  const told = window.__told = {ages: [], frames: [], last: null, then: performance.now()};
+  const look = () => {
+    const now = performance.now(); told.frames.push(now - told.then); told.then = now;
+    const root = window.__viserMutable.nodeRefFromName[name]; let batch = null, east = null;
+    if (root) root.traverse(o => { if (!batch && o.getPositionAt) batch = o; });
+    if (batch) east = batch.getPositionAt(0).x; else if (root) east = root.position.x;
+    if (east !== null && east !== told.last) {
+      told.last = east; told.ages.push(performance.timeOrigin + now - 1e3 * (began + 10 * east / speed));
+    }
+    requestAnimationFrame(look);
+  };
+  requestAnimationFrame(look);
+}"""
+CLICK = """uav => new Promise((done, fail) => {
+  const row = document.querySelector(`tr[data-uav="${uav}"]`), name = 'UAV-' + String(uav).padStart(3, '0');
+  const shown = () => [...document.querySelectorAll('.uav .head h1')].some(e => e.textContent === name);
+  if (!row) { done(null); return; }
+  const began = performance.now();
+  row.dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}));
+  const look = () => shown() ? done(performance.now() - began)
+    : performance.now() - began > 5000 ? done(5000) : setTimeout(look, 2);
+  look();
+})"""
+ROWS = "[...document.querySelectorAll('tr.pick')].map(e => Number(e.dataset.uav))"
+
+
+class Page:
+    """A browser with the page in it."""
+
+    def __init__(self, chromium: str) -> None:
+        from playwright.sync_api import sync_playwright
+
+        self._playwright = sync_playwright().start()
+        self._folder = tempfile.TemporaryDirectory()
+        self._context = self._playwright.chromium.launch_persistent_context(
+            self._folder.name,
+            executable_path=chromium,
+            headless=True,
+            args=ARGS,
+            viewport={"width": 1280, "height": 720},
+        )
+        self.page = self._context.pages[0]
+        self.errors: list[str] = []
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+
+    def __enter__(self) -> "Page":
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._context.close()
+        self._playwright.stop()
+        self._folder.cleanup()
+
+    def open(self, port: int) -> None:
+        """Go to the page."""
+        self.page.goto(f"http://127.0.0.1:{port}/?fixedDpr=0.5")
+        self.page.wait_for_function("window.__viserMutable && window.__viserMutable.canvas", timeout=60_000)
+
+    def await_node(self, name: str, timeout_s: float = 60.0) -> None:
+        """Wait until a node is in the scene."""
+        self.page.wait_for_function(IN_SCENE.format(name), timeout=1e3 * timeout_s, polling=10)
+
+    def watch(self, name: str, began: float) -> None:
+        """Begin to note how old the probe's place is whenever it changes on the screen."""
+        self.page.evaluate(WATCH, [name, began, PROBE_M_S])
+
+    def seen(self) -> dict[str, Any]:
+        """Give what was noted since `watch`: ages of poses and times between frames [ms]."""
+        told = self.page.evaluate(
+            "() => { const t = window.__told; const s = {ages: t.ages, frames: t.frames};"
+            " t.ages = []; t.frames = []; return s; }"
+        )
+        ages, frames = np.array(told["ages"] or [np.nan]), np.array(told["frames"] or [np.nan])
+        return {
+            "poses": len(told["ages"]),
+            "pose_to_screen_ms_median": round(float(np.median(ages)), 1),
+            "pose_to_screen_ms_p95": round(float(np.quantile(ages, 0.95)), 1),
+            "frame_ms_median": round(float(np.median(frames)), 1),
+            "nodes": self.page.evaluate(NODES),
+            "page_errors": len(self.errors),
+        }
+
+    def clicks(self, n: int) -> dict[str, float]:
+        """Select by row clicks; give how long until the panel shows the new one [ms]."""
+        took = []
+        for k in range(n):
+            rows = self.page.evaluate(ROWS)
+            ms = self.page.evaluate(CLICK, rows[(7 * k + 3) % len(rows)]) if rows else None
+            took += [ms] if ms is not None and ms > 1.0 else []  # one that was selected already is no answer
+        found = np.array(took or [np.nan])
+        return {
+            "n": len(took),
+            "ms_median": round(float(np.median(found)), 1),
+            "ms_worst": round(float(found.max()), 1),
+        }
+
+    def picture(self, file: Path) -> None:
+        """Keep what is on the screen."""
+        self.page.screenshot(path=str(file))
