@@ -82,7 +82,7 @@ def test_the_track_keeps_the_whole_flight_in_a_fixed_number_of_points() -> None:
     track, t = Track(), T + 0.1 * np.arange(60_000)
     enu = np.stack([np.cos(t / 40), np.sin(t / 40), t * 0 + 3], axis=-1) * 20
     for part in np.array_split(np.arange(len(t)), 500):
-        assert not track.add(t[part], enu[part])
+        assert not track.add([(float(at), *spot) for at, spot in zip(t[part], enu[part].tolist(), strict=True)])
     rows = track.rows()
     assert POINTS // 2 <= len(rows) <= POINTS
     assert rows[0, 0] == t[0] and t[-1] - rows[-1, 0] < 30
@@ -91,10 +91,10 @@ def test_the_track_keeps_the_whole_flight_in_a_fixed_number_of_points() -> None:
 
 def test_a_leap_among_the_first_positions_begins_the_path_anew() -> None:
     track = Track()
-    track.add(np.array([T]), np.array([[0, 0, -45.0]]))
-    assert track.add(np.array([T + 2.9]), np.zeros((1, 3))) and len(track.rows()) == 1
-    assert not track.add(np.array([T + 60.0]), np.array([[0, 0, 90.0]]))
-    assert not track.add(np.array([T + 61.0]), np.array([[0, 0, -90.0]]))  # later a leap is what was recorded
+    track.add([(T, 0, 0, -45.0)])
+    assert track.add([(T + 2.9, 0, 0, 0)]) and len(track.rows()) == 1
+    assert not track.add([(T + 60.0, 0, 0, 90.0)])
+    assert not track.add([(T + 61.0, 0, 0, -90.0)])  # later a leap is what was recorded
     assert len(track.rows()) == 3
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fleet.bus import Bus, key
-from fleet.codec import Stamp
+from fleet.codec import Stamp, decode, encoding
 from fleet.contract import (
     Account,
     Alert,
@@ -26,11 +26,14 @@ from fleet.contract import (
 )
 from fleet.fence import GIVE_UP_S, Fence
 from viewer.events import MAX_RAISED
+from viewer.forecast import Kept, forecast
+from viewer.inbox import CROWD, Inbox
 from viewer.place import Place, TooFar, checked, first_fix
-from viewer.vehicle import ENDED_S, JUMP_S, Forecast, Vehicle, forecast
+from viewer.vehicle import ENDED_S, JUMP_S, Vehicle
 
 MAX_VEHICLES = 2_000  # ids are written by strangers: more than this many are counted, not kept
 COASTING_S = 1.0  # a prediction so long after the last sample is of no flight that anything can be laid beside [s]
+_SAMPLES = encoding(Sample)
 MAX_WRITERS = 16  # workers whose sentences are kept: a restarted one is another
 # asked for at the start, so that a late viewer is complete
 LATE = (Status, Mission, Model, Prediction, Alert, Mismatch, FleetState, Account)
@@ -40,10 +43,11 @@ class Feed:
     """Everything heard, one `Vehicle` per UAV; written by the bus's threads, read by the render thread."""
 
     def __init__(self, bus: Bus, clock: Callable[[], float] = time.monotonic) -> None:
-        self.vehicles: dict[int, Vehicle] = {}
-        self.place: Place | None = None
+        self._vehicles: dict[int, Vehicle] = {}
+        self.inbox = Inbox()
+        self._place: Place | None = None
         self.sentences: dict[int, str] = {}  # what each worker says of itself
-        self.counts: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
         self.since = clock()
         self.lock = threading.Lock()
         self._bus, self._clock, self._fence = bus, clock, Fence(clock)
@@ -59,8 +63,49 @@ class Feed:
             FleetState: self._fleet,
         }
         self._hears = hears
+        bus.overhear(Sample, self._overhear)
         for kind in hears:
-            bus.subscribe(kind, self._guarded(kind))
+            if kind is not Sample:
+                bus.subscribe(kind, self._guarded(kind))
+
+    @property
+    def vehicles(self) -> dict[int, Vehicle]:
+        """Give everyone heard of, up to date."""
+        with self.lock:
+            self._read()
+            return self._vehicles
+
+    @property
+    def place(self) -> Place | None:
+        """Give the frame of the scene; None before anybody was anywhere."""
+        with self.lock:
+            self._read()
+            return self._place
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Give how many messages came of each class, and how many were strange or outdated."""
+        with self.lock:
+            self._read()
+            return self._counts
+
+    def _overhear(self, payload: bytes, named: str, _: Stamp | None) -> None:
+        """Put a sample aside: it is read when somebody asks, or when there is other news."""
+        if named == _SAMPLES:
+            self.inbox.put(payload, self._clock())
+        else:
+            self._counts["strange"] += 1
+
+    def _read(self) -> None:
+        """Read what was put aside; the lock is held."""
+        for payload, now in self.inbox.take():
+            try:
+                sample = decode(Sample, payload)
+            except ValueError:
+                self._counts["strange"] += 1
+                continue
+            self._hear(Sample, sample, None, now)
+        self.inbox.crowd = len(self._vehicles) > CROWD
 
     @property
     def listening(self) -> str:
@@ -78,13 +123,14 @@ class Feed:
     def _is_known(self, message: Any) -> bool:
         """Tell whether something as new came by itself while we asked."""
         with self.lock:
-            held = getattr(self.vehicles.get(getattr(message, "uav", -1)), message.topic, None)
+            held = getattr(self._vehicles.get(getattr(message, "uav", -1)), message.topic, None)
         return held is not None and held.t >= message.t
 
     def all(self) -> list[Vehicle]:
         """Copy the UAVs, in order of their ids: nothing changes in them while they are drawn."""
         with self.lock:
-            return [self.vehicles[uav].still(self._clock()) for uav in sorted(self.vehicles)]
+            self._read()
+            return [self._vehicles[uav].still(self._clock()) for uav in sorted(self._vehicles)]
 
     def poses(self, uavs: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
         """Give where some UAVs are and how they are turned: scene ENU [10 m], phi theta psi [rad], two (n, 3).
@@ -93,14 +139,16 @@ class Feed:
         """
         nowhere = np.full(3, np.nan)
         with self.lock:
-            found = [self.vehicles[uav] for uav in uavs]
+            self._read()
+            found = [self._vehicles[uav] for uav in uavs]
             places = [one.at if one.at is not None else nowhere for one in found]
             return np.array(places).reshape(-1, 3), np.array([one.attitude for one in found]).reshape(-1, 3)
 
     def one(self, uav: int) -> Vehicle | None:
         """Copy one UAV; None where it was never heard of."""
         with self.lock:
-            found = self.vehicles.get(uav)
+            self._read()
+            found = self._vehicles.get(uav)
             return found.still(self._clock()) if found is not None else None
 
     def said(self) -> list[str]:
@@ -111,15 +159,15 @@ class Feed:
     def trail(self, vehicle: Vehicle) -> np.ndarray:
         """Copy the flown trail: (n, 5) fleet time [s], scene ENU [10 m], Va [m/s]."""
         with self.lock:
-            return np.array(vehicle.trail, float).reshape(-1, 5)
+            return vehicle.trail.rows()
 
     def track(self, vehicle: Vehicle) -> np.ndarray:
         """Copy the whole flown path, thinned: (n, 4) fleet time [s], scene ENU [10 m]."""
         with self.lock:
             return vehicle.track.rows()
 
-    def past(self, vehicle: Vehicle) -> list[Forecast]:
-        """Copy the forecasts of the last minute, oldest first."""
+    def past(self, vehicle: Vehicle) -> list[Kept]:
+        """Copy what is kept of the forecasts of the last half minute, oldest first."""
         with self.lock:
             return list(vehicle.past)
 
@@ -133,46 +181,51 @@ class Feed:
 
         def hear(message: Any, stamp: Stamp | None) -> None:
             with self.lock:
-                try:
-                    self._hears[kind](message, stamp, self._clock())
-                    self.counts[kind.__name__] += 1
-                except (ValueError, IndexError, TypeError, OverflowError) as error:
-                    self.counts["strange"] += 1
-                    if (vehicle := self.vehicles.get(getattr(message, "uav", -1))) is not None:
-                        vehicle.refused = self._clock(), f"A {kind.__name__.lower()} was refused: {error}"
+                if not self.inbox.crowd:
+                    self._read()
+                self._hear(kind, message, stamp, self._clock())
 
         return hear
 
+    def _hear(self, kind: type, message: Any, stamp: Stamp | None, now: float) -> None:
+        try:
+            self._hears[kind](message, stamp, now)
+            self._counts[kind.__name__] += 1
+        except (ValueError, IndexError, TypeError, OverflowError) as error:
+            self._counts["strange"] += 1
+            if (vehicle := self._vehicles.get(getattr(message, "uav", -1))) is not None:
+                vehicle.refused = now, f"A {kind.__name__.lower()} was refused: {error}"
+
     def _vehicle(self, uav: int) -> Vehicle:
-        if uav not in self.vehicles:
-            if len(self.vehicles) >= MAX_VEHICLES or not 0 <= uav < 1_000_000:
+        if uav not in self._vehicles:
+            if len(self._vehicles) >= MAX_VEHICLES or not 0 <= uav < 1_000_000:
                 raise ValueError(
-                    f"uav-{uav}: found {len(self.vehicles)} UAVs already or no id below 1,000,000, "
+                    f"uav-{uav}: found {len(self._vehicles)} UAVs already or no id below 1,000,000, "
                     f"expected at most {MAX_VEHICLES}; open another viewer"
                 )
-            self.vehicles[uav] = Vehicle(uav)
-        return self.vehicles[uav]
+            self._vehicles[uav] = Vehicle(uav)
+        return self._vehicles[uav]
 
     def _sample(self, sample: Sample, _: Stamp | None, now: float) -> None:
-        if self.place is None and (origin := first_fix(sample)) is not None:
-            self.place = Place(origin)
-        if self.place is None:
+        if self._place is None and (origin := first_fix(sample)) is not None:
+            self._place = Place(origin)
+        if self._place is None:
             return
         vehicle = self._vehicle(sample.uav)
         try:
-            vehicle.hear_sample(sample, self.place, now)
+            vehicle.hear_sample(sample, self._place, now)
         except TooFar:
-            others = (v for v in self.vehicles.values() if v is not vehicle and v.at is not None)
+            others = (v for v in self._vehicles.values() if v is not vehicle and v.at is not None)
             if (origin := first_fix(sample)) is None or any(now - v.heard < GIVE_UP_S for v in others):
                 raise
             self._move(Place(origin))
-            vehicle.hear_sample(sample, self.place, now)
+            vehicle.hear_sample(sample, self._place, now)
         vehicle.note(sample, now)
 
     def _move(self, place: Place) -> None:
         """Begin anew elsewhere: where we are, nobody flies any more; the first position was a wrong one, say."""
-        self.place = place
-        for vehicle in self.vehicles.values():
+        self._place = place
+        for vehicle in self._vehicles.values():
             vehicle.forget()
 
     def _keep(self, name: str) -> Callable[[Any, Stamp | None, float], None]:
@@ -186,7 +239,7 @@ class Feed:
     def _believe(self, vehicle: Vehicle, stamp: Stamp | None, now: float) -> bool:
         """Tell whether a worker may speak for a UAV: not below the highest claim that still speaks."""
         if not self._fence.believes(vehicle.uav, stamp):
-            self.counts["outdated"] += 1
+            self._counts["outdated"] += 1
             return False
         vehicle.believed = now
         return True
@@ -209,17 +262,18 @@ class Feed:
             return  # delayed, and newer is here
         vehicle.note(message, now)
         vehicle.controller = message.controller or vehicle.controller
-        if self.place is None and message.path.shape[0]:
-            self.place = Place(checked(message.ned_origin()))
-        found = forecast(message, self.place, now) if self.place is not None else None
+        if self._place is None and message.path.shape[0]:
+            self._place = Place(checked(message.ned_origin()))
+        found = forecast(message, self._place, now) if self._place is not None else None
         vehicle.prediction, vehicle.forecast = message, found
         if found is None:
             return
         if vehicle.past and found.t < vehicle.past[-1].t - JUMP_S:
             vehicle.past.clear()
         coasting = message.coast_s > COASTING_S
+        vehicle.sure = vehicle.sure if coasting else found
         if not coasting and (not vehicle.past or found.t - vehicle.past[-1].t >= 0.9):
-            vehicle.past.append(found)
+            vehicle.past.append(found.kept())
 
     def _mismatch(self, found: Mismatch, stamp: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(found.uav)
@@ -231,7 +285,7 @@ class Feed:
         """Learn who is played from a recording, and that the player still speaks; one who flies now is live again."""
         played = bool(account.links) and all(link.startswith("replay:") for link in account.links)
         for uav in account.uavs:
-            vehicle = self.vehicles.get(uav)
+            vehicle = self._vehicles.get(uav)
             if vehicle is not None and (played or now - vehicle.player > ENDED_S):
                 vehicle.player = now if played else -np.inf
 
@@ -257,7 +311,7 @@ class Feed:
         """Give the alerts in force, newest first."""
         with self.lock:
             now = self._clock()
-            copies = [vehicle.still(now) for vehicle in self.vehicles.values() if vehicle.alerts]
+            copies = [vehicle.still(now) for vehicle in self._vehicles.values() if vehicle.alerts]
             found = [(copy, alert.kind, alert) for copy in copies for alert in copy.alerts.values()]
         return sorted(found, key=lambda one: -one[2].t)
 

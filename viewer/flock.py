@@ -4,11 +4,11 @@ import numpy as np
 
 from fleet.contract import State
 from viewer.feed import Feed
+from viewer.inbox import CROWD
 from viewer.mismatch import in_force
 from viewer.place import UNIT_M, scene_quat
 from viewer.vehicle import Vehicle
 
-CROWD = 300  # above this many, exceptions alone keep stems and predicted paths, and trails get coarser
 CHUNKS, STEPS = 5, 12  # the trail: chunks of 12 s, and a head of up to 12 s, one point a second
 MINUTE = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # how long ago each point of the trail is, (73,) [s]
 COARSE = 4  # seconds between the points of a trail in a crowd
@@ -52,7 +52,7 @@ class Flock:
 
     @property
     def crowd(self) -> bool:
-        """Tell whether there are too many to draw everything of each."""
+        """Tell whether there are too many to draw everything of each: exceptions alone keep predicted paths."""
         return len(self.uavs) > CROWD
 
     @property

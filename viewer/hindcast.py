@@ -2,16 +2,16 @@
 
 import numpy as np
 
+from viewer.forecast import Kept
 from viewer.labels import Tag
 from viewer.strokes import dashed
-from viewer.vehicle import Forecast
 
 AGE_S, SPAN_S = 25.0, 5.0  # how old the prediction is that is laid beside what happened, give or take [s]
 LEAST_S = 5.0  # a shorter stretch says nothing [s]
 NONE = np.zeros((0, 2, 3)), None
 
 
-def hindcast(past: list[Forecast], trail: np.ndarray, clock: float) -> tuple[np.ndarray, Tag | None]:
+def hindcast(past: list[Kept], trail: np.ndarray, clock: float) -> tuple[np.ndarray, Tag | None]:
     """Lay an old prediction beside the flown trail, with a whisker every 5 s to where it was then.
 
     Args:

@@ -18,6 +18,8 @@ class Place:
 
     def __init__(self, origin: Origin) -> None:
         self.origin = origin
+        north, east, _ = to_ned(origin, *(np.array([x + 1e6]) for x in origin))[0]
+        self._east, self._north = east / 1e6 / UNIT_M, north / 1e6 / UNIT_M  # the map is linear [10 m / 1e-7 deg]
 
     def geodetic(self, lat_e7: np.ndarray, lon_e7: np.ndarray, alt_mm: np.ndarray) -> np.ndarray:
         """Map geodetic positions, (n,) [1e-7 deg, 1e-7 deg, mm], to the scene: (n, 3) ENU [10 m].
@@ -38,14 +40,30 @@ class Place:
             )
         return scene
 
-    def local(self, origin: Origin, ned: np.ndarray) -> np.ndarray:
+    def spot(self, lat_e7: float, lon_e7: float, alt_mm: float) -> tuple[float, float, float]:
+        """Map one position as `geodetic` does, quickly: east, north, up [10 m].
+
+        Raises:
+            ValueError: when it is not on this earth; check the sender.
+            TooFar: when it is farther than 100 km from the fleet.
+        """
+        d_lon = lon_e7 - self.origin.lon_e7
+        east, north = d_lon * self._east, (lat_e7 - self.origin.lat_e7) * self._north
+        up = (alt_mm - self.origin.alt_mm) * 1e-3 / UNIT_M
+        reach = REACH_M / UNIT_M
+        if -reach <= east <= reach and -reach <= north <= reach and -reach <= up <= reach:
+            return east, north, up
+        found = self.geodetic(*(np.array([x]) for x in (lat_e7, lon_e7, alt_mm)))[0]  # says why, or crosses 180 degrees
+        return float(found[0]), float(found[1]), float(found[2])
+
+    def local(self, origin: tuple[int, int, int], ned: np.ndarray) -> np.ndarray:
         """Map NED positions relative to another origin, (n, 3) [m], to the scene: (n, 3) ENU [10 m]."""
         ned = np.asarray(ned, float)
         if not np.isfinite(ned).all() or (np.abs(ned) > 2 * REACH_M).any():
             raise ValueError("path: found values that are not finite or beyond 200 km, expected metres; resend")
-        if origin == self.origin:
+        if tuple(origin) == tuple(self.origin):
             return ned_to_scene(ned)
-        return self.geodetic(*to_geodetic(origin, ned).T)
+        return self.geodetic(*to_geodetic(Origin(*origin), ned).T)
 
 
 def ned_to_scene(ned: np.ndarray) -> np.ndarray:

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from viewer.flock import CHUNKS, CROWD, LOST, MISMATCH, STEPS, Flock
+from viewer.flock import CHUNKS, LOST, MISMATCH, STEPS, Flock
 from viewer.glyphs import Glyphs
 from viewer.ground import Ground
+from viewer.inbox import CROWD
 from viewer.palette import Palette, mix, rgb
 from viewer.routes import NOTHING, Route, circle
 from viewer.strokes import Strokes, chain, dash_lines, faded

@@ -7,6 +7,7 @@ import numpy as np
 from fleet.contract import State
 from viewer import mismatch
 from viewer.feed import Feed
+from viewer.forecast import Forecast
 from viewer.hindcast import hindcast
 from viewer.labels import Sight, Tag
 from viewer.palette import Palette, mix, rgb, triple
@@ -15,7 +16,7 @@ from viewer.plan import Plan, seq_in_force
 from viewer.routes import NOTHING, Route
 from viewer.strokes import Sheaf, Strokes, chain, closed, dashed, disc
 from viewer.tube import curtain, marks, rings, samples, skin
-from viewer.vehicle import Forecast, Vehicle
+from viewer.vehicle import Vehicle
 from viewer.words import CLAIMS_S
 
 BANDS, BAND_STEPS = 5, 12  # the tube fades in bands, each of so many slices

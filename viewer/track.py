@@ -1,10 +1,13 @@
 """The whole flown path of one UAV in a fixed number of points: the longer the flight, the farther apart they are."""
 
+from math import dist
+
 import numpy as np
 
 from viewer.place import UNIT_M
 
 POINTS = 800
+TRAIL_ROWS = 900  # about 90 s at 10 Hz
 STEP_S = 0.5  # between two points, until they are full for the first time [s]
 SETTLE_S = 30.0  # so long first positions may be wrong: a leap among them begins the path anew [s]
 LEAP_M, LEAP_M_S = 50.0, 60.0  # farther than this, and this for every second between, is a leap [m], [m/s]
@@ -15,36 +18,58 @@ class Track:
 
     def __init__(self) -> None:
         self._rows = np.empty((POINTS, 4))  # t [s], scene ENU [10 m]
-        self._n, self._step = 0, STEP_S
+        self._n, self._step, self._last = 0, STEP_S, -np.inf
 
-    def add(self, t: np.ndarray, enu: np.ndarray) -> bool:
-        """Add places, t (n,) rising [s], enu (n, 3) [10 m]; what does not rise is left out. Tell of a leap."""
-        if leapt := self._leaps(float(t[0]), enu[0]):
+    def add(self, spots: list[tuple[float, float, float, float]]) -> bool:
+        """Add times and places, rising: t [s], scene ENU [10 m]; what does not rise is left out. Tell of a leap."""
+        if leapt := self._leaps(spots[0]):
             self.clear()
-        last = self._rows[self._n - 1, 0] if self._n else -np.inf
-        for at, place in zip(t, enu, strict=True):
-            if at < last + self._step:
+        for spot in spots:
+            if spot[0] < self._last + self._step:
                 continue
             if self._n == POINTS:
                 self._n, self._step = POINTS // 2, 2 * self._step
                 self._rows[: self._n] = self._rows[::2].copy()
-            self._rows[self._n] = at, *place
-            self._n, last = self._n + 1, at
+            self._rows[self._n] = spot
+            self._n, self._last = self._n + 1, spot[0]
         return leapt
 
-    def _leaps(self, t: float, place: np.ndarray) -> bool:
-        if not self._n or t - self._rows[0, 0] > SETTLE_S:
+    def _leaps(self, spot: tuple[float, float, float, float]) -> bool:
+        if not self._n or spot[0] - self._rows[0, 0] > SETTLE_S:
             return False
-        last = self._rows[self._n - 1]
-        return bool(np.linalg.norm(place - last[1:]) * UNIT_M > LEAP_M + LEAP_M_S * max(t - last[0], 0.0))
+        last = self._rows[self._n - 1].tolist()
+        return UNIT_M * dist(spot[1:], last[1:]) > LEAP_M + LEAP_M_S * max(spot[0] - last[0], 0.0)
 
     def clear(self) -> None:
         """Forget the flight."""
-        self._n, self._step = 0, STEP_S
+        self._n, self._step, self._last = 0, STEP_S, -np.inf
 
     def rows(self) -> np.ndarray:
         """Copy all points: (n, 4) t [s], scene ENU [10 m]."""
         return self._rows[: self._n].copy()
+
+
+class Trail:
+    """The newest stretch of the flown path, as it was heard: t [s], scene ENU [10 m], Va [m/s]."""
+
+    def __init__(self) -> None:
+        self._rows = np.empty((TRAIL_ROWS, 5))
+        self._n = 0  # ever written; the newest `TRAIL_ROWS` are held
+
+    def add(self, *row: float) -> None:
+        """Add one row of five."""
+        self._rows[self._n % TRAIL_ROWS] = row
+        self._n += 1
+
+    def clear(self) -> None:
+        """Forget it."""
+        self._n = 0
+
+    def rows(self) -> np.ndarray:
+        """Copy what is held, oldest first: (n, 5)."""
+        if self._n <= TRAIL_ROWS:
+            return self._rows[: self._n].copy()
+        return np.roll(self._rows, -(self._n % TRAIL_ROWS), axis=0)
 
 
 def placed(rows: np.ndarray, t: np.ndarray, slack: float = 2.0) -> np.ndarray:

@@ -2,10 +2,10 @@
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from math import isfinite
+from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from fleet.contract import (
     About,
@@ -18,83 +18,25 @@ from fleet.contract import (
     Mission,
     Model,
     Prediction,
+    Rows,
     Sample,
     State,
     Status,
 )
 from viewer.datatime import DataTime
 from viewer.events import Event, closed, merged
+from viewer.forecast import Forecast, Kept
 from viewer.place import UNIT_M, Place
+from viewer.rows import last, stacked
 from viewer.tell import Known, hear
-from viewer.track import Track
+from viewer.track import Track, Trail
 
-TRAIL_ROWS = 900  # about 90 s at 10 Hz
 SILENT_S = 3.0  # without a sample for this long the link counts as lost, whatever was last said [s]
 ABANDONED_S = 30.0  # without a word of any worker for so long, what was last said is no state any more [s]
 LATE_S = 5.0  # a prediction older than this is no news, in wall time [s]
 ENDED_S = 3.0  # a recording whose player is silent for so long is over [s]
 JUMP_S = 5.0  # a step back in time by more than this is another flight: start afresh [s]
 AWAY_S = 86_400.0  # a status whose time lies farther from the samples is of another flight [s]
-_CHORD_S, _MOST_PARTS = 1.5, 4  # look-aheads farther apart get points between, at most so many
-MAX_STEPS, MAX_AHEAD_S = 5_000, 3_600.0  # look-ahead accepted from outside: steps, and time [s]
-
-
-class Forecast(NamedTuple):
-    """A prediction, checked and moved into the scene."""
-
-    t: float  # fleet time it starts at [s since 1970]
-    heard: float  # when it arrived, monotonic [s]
-    ahead: np.ndarray  # look-ahead, rising, (n,) [s]
-    path: np.ndarray  # mean position, scene ENU, (n, 3) [10 m]
-    tube: np.ndarray  # half-axes along, cross, vertical, (n, 3) [10 m]
-    message: Prediction
-
-    @property
-    def until(self) -> float:
-        """Give the look-ahead up to which anything is claimed: the horizon, within what was sent [s]."""
-        horizon = self.message.horizon_s
-        return float(min(max(horizon if np.isfinite(horizon) else 0.0, 0.0), self.ahead[-1]))
-
-    def at(self, ahead: np.ndarray | float) -> np.ndarray:
-        """Interpolate the mean path at look-aheads (k,) [s] -> (k, 3) [10 m]; held beyond both ends."""
-        return np.stack([np.interp(ahead, self.ahead, self.path[:, i]) for i in range(3)], axis=-1)
-
-    def width(self, ahead: np.ndarray) -> np.ndarray:
-        """Interpolate the half-axes at look-aheads (k,) [s] -> (k, 3) [10 m]."""
-        return np.stack([np.interp(ahead, self.ahead, self.tube[:, i]) for i in range(3)], axis=-1)
-
-
-def forecast(message: Prediction, place: Place, heard: float) -> Forecast | None:
-    """Check a prediction and move it into the scene; None where it carries no path.
-
-    Raises:
-        ValueError: when its arrays disagree, are not finite or do not rise in time; the worker must resend.
-    """
-    ahead, path, tube = (a.numpy().astype(float) for a in (message.ahead, message.path, message.tube))
-    n = ahead.shape[0] if ahead.ndim == 1 else -1
-    if n == 0:
-        return None
-    if not 2 <= n <= MAX_STEPS or path.shape != (n, 3) or tube.shape != (n, 3):
-        raise ValueError(
-            f"uav-{message.uav}: prediction has shapes {ahead.shape} {path.shape} {tube.shape}, "
-            f"expected (n,) (n, 3) (n, 3) with 2 to {MAX_STEPS} steps; resend"
-        )
-    if (
-        not (np.isfinite(ahead).all() and np.isfinite(message.t) and (np.diff(ahead) > 0).all())
-        or np.abs(ahead).max() > MAX_AHEAD_S
-    ):
-        raise ValueError(f"uav-{message.uav}: prediction has times that do not rise within an hour; resend")
-    tube = np.clip(np.nan_to_num(tube / UNIT_M), 0.0, 1e4)
-    return Forecast(message.t, heard, *_smooth(ahead, place.local(message.ned_origin(), path), tube), message)
-
-
-def _smooth(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lay points between look-aheads that are seconds apart: a chord would cut a turn by metres."""
-    if np.diff(ahead).max() <= _CHORD_S or len(ahead) < 4:
-        return ahead, path, tube
-    parts = np.minimum(np.ceil(np.diff(ahead) / _CHORD_S), _MOST_PARTS).astype(int)
-    at = np.interp(np.arange(parts.sum() + 1), np.concatenate([[0], np.cumsum(parts)]), ahead)
-    return at, CubicSpline(ahead, path)(at), np.stack([np.interp(at, ahead, column) for column in tube.T], axis=-1)
 
 
 @dataclass
@@ -125,9 +67,10 @@ class Vehicle:
     events: tuple[Event, ...] = ()  # oldest first; replaced as a whole, never changed
     alerts: dict[About, Alert] = field(default_factory=dict)  # replaced as a whole, never changed
     refused: tuple[float, str] = (-np.inf, "")  # when a message was refused, monotonic [s], and why
-    trail: deque = field(default_factory=lambda: deque(maxlen=TRAIL_ROWS))  # t, east, north, up, Va
+    trail: Trail = field(default_factory=Trail)  # the newest stretch of it, as it was heard
     track: Track = field(default_factory=Track)  # the whole flight, thinned
-    past: deque = field(default_factory=lambda: deque(maxlen=60))  # forecasts, about one a second
+    past: deque[Kept] = field(default_factory=lambda: deque(maxlen=40))  # forecasts, about one a second
+    sure: Forecast | None = None  # the newest that did not coast
     fits: deque = field(default_factory=lambda: deque(maxlen=200))  # t, mean fit [%]
 
     @property
@@ -162,7 +105,7 @@ class Vehicle:
             copy.alerts = {
                 about: alert for about, alert in self.alerts.items() if alert.kind is not AlertKind.LINK_LOST
             }
-            copy.forecast = self.past[-1] if self.past else None
+            copy.forecast = self.sure
             copy.prediction = copy.forecast.message if copy.forecast is not None else self.prediction
         return copy
 
@@ -213,35 +156,37 @@ class Vehicle:
         if sample.t < self.t - JUMP_S:
             self.forget()
         self.heard, self.t = now, max(sample.t, self.t)
-        if sample.air is not None and (air := sample.air.x.numpy()).ndim == 2 and len(air) and np.isfinite(air[-1, 0]):
-            self.Va = float(air[-1, 0])
-        if sample.attitude is not None and (turn := sample.attitude.x.numpy()).ndim == 2 and len(turn):
-            phi, theta, psi = (float(x) for x in turn[-1, :3])
-            if np.isfinite([phi, theta, psi]).all():
-                self.attitude = (phi, theta, psi)
+        if sample.air is not None and (air := last(sample.air.x)) and isfinite(air[0]):
+            self.Va = air[0]
+        if sample.attitude is not None and (turn := last(sample.attitude.x)) and all(map(isfinite, turn[:3])):
+            self.attitude = turn[0], turn[1], turn[2]
         if sample.position is not None:
-            self._hear_position(sample.position.t.numpy(), sample.position.x.numpy().astype(float), place)
+            self._hear_position(sample.position, place)
 
-    def _hear_position(self, t: np.ndarray, x: np.ndarray, place: Place) -> None:
-        if x.ndim != 2 or x.shape[1] < 3 or t.shape != (len(x),):
-            raise ValueError(f"uav-{self.uav}: position rows have shape {x.shape}, expected (n, 3) and n times; resend")
-        fix = np.isfinite(x[:, :3]).all(axis=1) & np.isfinite(t) & (np.abs(x[:, :2]).sum(axis=1) > 0)
-        if not fix.any():
+    def _hear_position(self, position: Rows, place: Place) -> None:
+        t, x = stacked(self.uav, position)
+        spots = [
+            (float(at), *place.spot(lat, lon, alt))
+            for at, (lat, lon, alt, *_) in zip(t, x, strict=True)
+            if isfinite(at) and isfinite(lat) and isfinite(lon) and isfinite(alt) and (lat or lon)
+        ]
+        if not spots:
             return
-        enu = place.geodetic(*x[fix, :3].T)
-        if self.track.add(t[fix], enu):
+        if self.track.add(spots):
             self.trail.clear()
             self.floor = np.nan
-        self.trail.extend((float(k), *p, self.Va) for k, p in zip(t[fix], enu.tolist(), strict=True))
+        for spot in spots:
+            self.trail.add(*spot, self.Va)
+        up = spots[-1][3]
         if self.status is not None and self.status.mode and not self.status.armed:  # no mode: not yet known
-            self.floor = float(np.fmin(self.floor, enu[-1, 2]))
-        self.at, self.alt_m = enu[-1], float(x[fix][-1, 2]) * 1e-3
+            self.floor = min(self.floor, up) if isfinite(self.floor) else up
+        self.at, self.alt_m = np.array(spots[-1][1:]), up * UNIT_M + place.origin.alt_mm * 1e-3
 
     def forget(self) -> None:
         """Drop everything that belongs to a flight: the clock went back, or the scene begins anew elsewhere."""
         self.at, self.alerts, self.floor = None, {}, np.nan
         self.time, self.known, self.events = DataTime(), Known(), ()
         self.t, self.forecast, self.prediction, self.model, self.row = -np.inf, None, None, None, None
-        self.controller = self.mismatch = None
+        self.controller = self.mismatch = self.sure = None
         for history in (self.trail, self.past, self.fits, self.track):
             history.clear()

@@ -1,0 +1,59 @@
+"""Samples not yet read: of a small fleet every one, in a crowd the newest of each, and all with news of the mission."""
+
+import threading
+
+import msgspec
+
+CROWD = 300  # above this many a sample that a newer one has replaced is not read
+MOST = 40  # letters kept of one UAV while nobody looks; the newest replaces the last
+MOST_UAVS = 4_000  # of whom letters are kept: ids are written by strangers
+_LEG = b"\xa3leg\x82"  # msgpack: the key, and a map after it, which nil is not
+
+
+class Whose(msgspec.Struct):
+    """Of a message only whose it is."""
+
+    uav: int
+
+
+Letter = tuple[bytes, float]
+"""What came, and when, monotonic [s]."""
+
+
+class Inbox:
+    """Filled by the bus's thread, emptied by whoever reads."""
+
+    def __init__(self) -> None:
+        self.crowd = False
+        self.keen: frozenset[int] = frozenset()  # of whom every letter is kept, also in a crowd
+        self.lost = 0  # letters that name nobody, or came when there was no room
+        self._letters: dict[int, list[Letter]] = {}
+        self._whose = msgspec.msgpack.Decoder(Whose)
+        self._lock = threading.Lock()
+
+    def put(self, payload: bytes, now: float) -> None:
+        """Take in one sample as it came; one that cannot be read at all is counted."""
+        try:
+            uav = self._whose.decode(payload).uav
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            self.lost += 1
+            return
+        with self._lock:
+            held = self._letters.get(uav)
+            if held is None:
+                if len(self._letters) < MOST_UAVS:
+                    self._letters[uav] = [(payload, now)]
+                else:
+                    self.lost += 1
+            elif len(held) < MOST and (not self.crowd or uav in self.keen or _LEG in held[-1][0]):
+                held.append((payload, now))
+            else:
+                held[-1] = payload, now
+
+    def take(self) -> list[Letter]:
+        """Empty it: letters of each UAV in the order they came."""
+        if not self._letters:
+            return []
+        with self._lock:
+            letters, self._letters = self._letters, {}
+        return [letter for held in letters.values() for letter in held]

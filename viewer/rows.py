@@ -1,0 +1,45 @@
+"""Rows of a sample as plain numbers: of a fleet they come by the ten thousand, and one row is no array's work."""
+
+import struct
+from functools import cache
+from typing import Any
+
+from fleet.contract import Array, Rows
+
+_LETTER = {"<f4": "f", "<f8": "d", "<i4": "i", "<i8": "q", "|u1": "B"}
+
+
+@cache
+def _packed(dtype: str, width: int) -> struct.Struct:
+    return struct.Struct(f"<{width}{_LETTER[dtype]}")
+
+
+def last(x: Array) -> tuple[float, ...]:
+    """Give the last row of a table; nothing where there is none.
+
+    Raises:
+        ValueError: when dtype, shape and byte count disagree; the sender must repair it.
+    """
+    shape = x.shape
+    if len(shape) != 2 or not shape[0]:
+        return ()
+    if x.dtype not in _LETTER or not 0 < shape[1] < 100 or len(x.data) != shape[0] * _packed(x.dtype, shape[1]).size:
+        return tuple(map(float, x.numpy()[-1]))  # says what is wrong with it
+    pack = _packed(x.dtype, shape[1])
+    return pack.unpack_from(x.data, (shape[0] - 1) * pack.size)
+
+
+def stacked(uav: int, rows: Rows) -> tuple[Any, Any]:
+    """Give the times (n,) and rows (n, 3 or more) of positions; of one row without an array.
+
+    Raises:
+        ValueError: when their shapes are none of positions; the gateway must resend.
+    """
+    t, x = rows.t, rows.x
+    if x.shape == (1, 3) and t.shape == (1,):
+        at, row = last(Array(t.dtype, (1, 1), t.data)), last(x)
+        return at, (row,)
+    times, places = t.numpy(), x.numpy()
+    if places.ndim != 2 or places.shape[1] < 3 or times.shape != (len(places),):
+        raise ValueError(f"uav-{uav}: position rows have shape {places.shape}, expected (n, 3) and n times; resend")
+    return times.tolist(), places.tolist()
