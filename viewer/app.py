@@ -133,6 +133,7 @@ class App:
         if not self.flock.uavs:
             self.flock.meet(fleet, now)
             self.flock.pose(self.feed, now)
+        self.feed.inbox.keen = frozenset(v.selected for v in self.views.values() if v.selected is not None)
         played = [(v, rows) for v in fleet if v.recorded and len(rows := self.feed.track(v))]
         self.flock.beat({v.uav: placed(rows, v.t - MINUTE, np.inf) for v, rows in played})
         self.flock.meet(fleet, now)

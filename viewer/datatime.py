@@ -1,9 +1,8 @@
 """Data time: what the clock of the flight says, live or recorded years ago, and how fast it runs on this page."""
 
 from datetime import UTC, datetime
+from math import inf, isfinite
 from typing import NamedTuple
-
-import numpy as np
 
 UNDATED_S = 946_684_800.0  # 2000-01-01: a log that never heard of the date counts from here [s since 1970]
 MONTH_S = 30 * 86_400.0  # no log runs for longer: what lies later has a date [s]
@@ -16,10 +15,10 @@ STEADY = 0.2  # a pace this near to 1 is called real time
 class DataTime(NamedTuple):
     """The newest data time heard of a UAV, and the pace it comes at."""
 
-    t: float = -np.inf  # newest, [s since 1970]
-    heard: float = -np.inf  # when, monotonic [s]
+    t: float = -inf  # newest, [s since 1970]
+    heard: float = -inf  # when, monotonic [s]
     pace: float = 1.0  # data seconds per wall second, measured
-    since: tuple[float, float] = (-np.inf, -np.inf)  # t and heard where the measurement began
+    since: tuple[float, float] = (-inf, -inf)  # t and heard where the measurement began
 
     def hear(self, t: float, now: float) -> "DataTime":
         """Take over a time told at `now`, monotonic [s]; an older one than the newest changes nothing."""
@@ -27,7 +26,7 @@ class DataTime(NamedTuple):
             return self
         began_t, began = self.since
         passed = now - began
-        if not np.isfinite(passed):
+        if not isfinite(passed):
             return DataTime(t, now, self.pace, (t, now))
         if passed < MEASURE_S:
             return DataTime(t, now, self.pace, self.since)
@@ -36,7 +35,7 @@ class DataTime(NamedTuple):
 
     def at(self, now: float) -> float:
         """Estimate data time now [s since 1970]; -inf before any was heard."""
-        silent = now - self.heard if np.isfinite(self.heard) else 0.0
+        silent = now - self.heard if isfinite(self.heard) else 0.0
         return self.t + min(silent, COAST_S) * self.pace + max(silent - COAST_S, 0.0)
 
 

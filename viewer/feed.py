@@ -79,7 +79,8 @@ class Feed:
     def place(self) -> Place | None:
         """Give the frame of the scene; None before anybody was anywhere."""
         with self.lock:
-            self._read()
+            if self._place is None or not self.inbox.crowd:
+                self._read()
             return self._place
 
     @property
@@ -96,9 +97,9 @@ class Feed:
         else:
             self._counts["strange"] += 1
 
-    def _read(self) -> None:
-        """Read what was put aside; the lock is held."""
-        for payload, now in self.inbox.take():
+    def _read(self, uav: int | None = None) -> None:
+        """Read what was put aside, or what of it is of one UAV; the lock is held."""
+        for payload, now in self.inbox.take(uav):
             try:
                 sample = decode(Sample, payload)
             except ValueError:
@@ -147,7 +148,7 @@ class Feed:
     def one(self, uav: int) -> Vehicle | None:
         """Copy one UAV; None where it was never heard of."""
         with self.lock:
-            self._read()
+            self._read(uav if self.inbox.crowd else None)
             found = self._vehicles.get(uav)
             return found.still(self._clock()) if found is not None else None
 

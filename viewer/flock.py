@@ -12,6 +12,8 @@ from viewer.vehicle import Vehicle
 CHUNKS, STEPS = 5, 12  # the trail: chunks of 12 s, and a head of up to 12 s, one point a second
 MINUTE = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # how long ago each point of the trail is, (73,) [s]
 COARSE = 4  # seconds between the points of a trail in a crowd
+READ_S = 0.35  # how often the places of a crowd are read [s]
+FASTEST = 30.0  # what went faster has leapt [10 m/s]
 LEAP_M = 1_000.0  # farther within a second is no flight but another one (a recording begun anew): a new trail [m]
 HOVER = ("multirotor", "helicopter")  # kinds of vehicle drawn with rotors
 LOOKS = ("muted", "predicting", "verified", "identifying", "lost", "mismatch")  # names of colours
@@ -41,6 +43,7 @@ class Flock:
         self.fleet: list[Vehicle] = []  # copies, as of the last second
         self.now = 0.0  # when that was, monotonic [s]
         self.uavs: tuple[int, ...] = ()
+        self._rows: dict[int, int] = {}  # the row of each
         self.looks = np.zeros(0, int)  # indices into LOOKS
         self.hover = np.zeros(0, bool)  # who has rotors instead of wings
         self.at = np.zeros((0, 3))  # scene ENU [10 m]
@@ -49,6 +52,7 @@ class Flock:
         self.beats = 0  # seconds of trail
         self.ring = np.zeros((0, len(MINUTE), 3))  # a minute of trail, newest last
         self._ghosts: list[tuple[int, Vehicle]] = []  # whose place is predicted, for they are not heard
+        self._read = (0.0, self.at, self.at)  # when places were last read, monotonic [s], where, and how fast [10 m/s]
 
     @property
     def crowd(self) -> bool:
@@ -67,8 +71,7 @@ class Flock:
 
     def index(self, uav: int | None) -> int | None:
         """Give the row of a UAV; None where it is not drawn."""
-        found = np.searchsorted(self.uavs, uav) if uav is not None and self.uavs else 0
-        return int(found) if found < len(self.uavs) and self.uavs[found] == uav else None
+        return self._rows.get(uav) if uav is not None else None
 
     def meet(self, fleet: list[Vehicle], now: float) -> None:
         """Take over who is there and how they stand; call it once a second."""
@@ -86,17 +89,24 @@ class Flock:
 
     def _enlist(self, uavs: tuple[int, ...], at: np.ndarray) -> None:
         """Begin with another set of UAVs; those who stay keep their trails."""
-        old = {uav: i for i, uav in enumerate(self.uavs)}
         ring = np.repeat(at[:, None], len(MINUTE), axis=1)
         for i, uav in enumerate(uavs):
-            if uav in old:
-                ring[i] = self.ring[old[uav]]
+            if uav in self._rows:
+                ring[i] = self.ring[self._rows[uav]]
         self.ring, self.uavs, self.at, self.changes = ring, uavs, at, self.changes + 1
+        self._rows = {uav: i for i, uav in enumerate(uavs)}
         self.quat = np.tile([1.0, 0.0, 0.0, 0.0], (len(uavs), 1))
 
     def pose(self, feed: Feed, now: float) -> None:
-        """Take over where everybody is; call it as often as the picture moves."""
+        """Take over where everybody is; call it as often as the picture moves.
+
+        In a crowd places are read every `READ_S`; in between everybody goes on as before.
+        """
         if not self.uavs:
+            return
+        since = now - self._read[0]
+        if self.crowd and since < READ_S and len(self._read[1]) == len(self.uavs):
+            self.at = self._read[1] + self._read[2] * since
             return
         places, turns = feed.poses(self.uavs)
         heard = np.isfinite(places[:, 0])
@@ -108,6 +118,15 @@ class Flock:
                 if (spot := vehicle.where(now)) is not None:
                     self.at[i] = spot
         self.quat = scene_quat(*turns.T)
+        self._read = now, self.at.copy(), self._speed(since)
+
+    def _speed(self, since: float) -> np.ndarray:
+        """Give how fast everybody went since places were last read, (n, 3) [10 m/s]; a leap is no speed."""
+        before = self._read[1]
+        if len(before) != len(self.at) or not 0 < since < 2.0:
+            return np.zeros_like(self.at)
+        speed = (self.at - before) / since
+        return np.where(np.linalg.norm(speed, axis=1)[:, None] < FASTEST, speed, 0.0)
 
     def beat(self, played: dict[int, np.ndarray]) -> None:
         """Remember where everyone is, once a second.

@@ -50,10 +50,12 @@ class Inbox:
             else:
                 held[-1] = payload, now
 
-    def take(self) -> list[Letter]:
-        """Empty it: letters of each UAV in the order they came."""
+    def take(self, uav: int | None = None) -> list[Letter]:
+        """Empty it, or take out what is of one UAV: letters of each in the order they came."""
         if not self._letters:
             return []
         with self._lock:
+            if uav is not None:
+                return self._letters.pop(uav, [])
             letters, self._letters = self._letters, {}
         return [letter for held in letters.values() for letter in held]

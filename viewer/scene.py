@@ -8,7 +8,6 @@ import numpy as np
 from viewer.flock import CHUNKS, LOST, MISMATCH, STEPS, Flock
 from viewer.glyphs import Glyphs
 from viewer.ground import Ground
-from viewer.inbox import CROWD
 from viewer.palette import Palette, mix, rgb
 from viewer.routes import NOTHING, Route, circle
 from viewer.strokes import Strokes, chain, dash_lines, faded
@@ -106,9 +105,10 @@ class Scene:
 def predicted(flock: Flock) -> list[Vehicle]:
     """Choose whose predicted paths are drawn: all, in a crowd those who need an eye."""
     told = [v for v in flock.fleet if v.forecast is not None and flock.index(v.uav) is not None]
-    if len(flock.fleet) <= CROWD:
+    if not flock.crowd:
         return told
-    return [v for v in told if flock.exceptions[flock.index(v.uav)]]
+    needy = {flock.uavs[i] for i in np.flatnonzero(flock.exceptions)}
+    return [v for v in told if v.uav in needy]
 
 
 def cut_at_horizon(ahead: np.ndarray, path: np.ndarray, start: float, until: float) -> np.ndarray:

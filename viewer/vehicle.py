@@ -133,11 +133,18 @@ class Vehicle:
 
     def note(self, message: Any, now: float) -> None:
         """Take down what a message tells: data time and events."""
-        if isinstance(message, Sample | Status) and np.isfinite(message.t) and abs(message.t - self.t) < AWAY_S:
+        if isinstance(message, Sample | Status) and abs(message.t - self.t) < AWAY_S:  # also: it is a time at all
             self.time = self.time.hear(message.t, now)
+        if isinstance(message, Sample) and self._no_news(message):
+            return
         self.known, fresh = hear(self.known, message)
         if fresh:
             self.events = merged(self.events, fresh)
+
+    def _no_news(self, sample: Sample) -> bool:
+        """Tell whether a sample names the mission item in force, or none: most do."""
+        leg = sample.leg
+        return leg is None or (leg.x.shape == (1, 1) and leg.t.shape == (1,) and last(leg.x) == (self.known.seq,))
 
     def where(self, now: float) -> np.ndarray | None:
         """Give the place to draw it, (3,) [10 m]: the last sample's, or, link lost, the predicted ghost's."""
@@ -149,7 +156,7 @@ class Vehicle:
 
     def hear_sample(self, sample: Sample, place: Place, now: float) -> None:
         """Take over the newest rows of a sample."""
-        if not np.isfinite(sample.t):
+        if not isfinite(sample.t):
             raise ValueError(
                 f"uav-{self.uav}: sample has time {sample.t}, expected seconds since 1970; check the gateway"
             )

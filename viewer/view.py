@@ -41,7 +41,7 @@ class View:
 
     def choose(self, uav: int) -> None:
         """Select a UAV; it is drawn at once."""
-        if uav in self._feed.vehicles:
+        if self._feed.one(uav) is not None:
             self.selected, self.dirty = uav, True
             self._wake()
 
