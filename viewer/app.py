@@ -18,6 +18,7 @@ from viewer.palette import DARK, LIGHT
 from viewer.place import UNIT_M
 from viewer.routes import home_alt_m
 from viewer.selected import BEYOND_S
+from viewer.timeline.tapes import Tapes
 from viewer.track import placed
 from viewer.vehicle import Vehicle
 from viewer.view import IN_VIEW_M, View, near
@@ -57,6 +58,7 @@ class App:
     def __init__(self, bus: Bus, server: viser.ViserServer, *, light: bool = False) -> None:
         self._palette = LIGHT if light else DARK
         self.feed, self.flock, self._server = Feed(bus), Flock(), server
+        self.tapes = Tapes()
         self.views: dict[int, View] = {}  # by client
         self._wake = threading.Event()
         self._ground, self._cloud = 0.0, np.zeros((0, 3))
@@ -95,6 +97,8 @@ class App:
         now = time.monotonic()
         if tick % SECOND == 0 or not self.flock.uavs:
             self._second(now)
+        elif tick % 2 == 0 and self.flock.uavs:
+            self.tapes.take(self.feed, self.feed.all, now)
         if self.flock.crowd and tick % 2:
             return
         self.flock.pose(self.feed, now)
@@ -124,12 +128,13 @@ class App:
         for number in clients.keys() - self.views.keys():
             client = clients[number]
             with client.atomic():
-                self.views[number] = View(client, self.feed, self._palette, self._wake.set)
+                self.views[number] = View(client, self.feed, self.tapes, self._palette, self._wake.set)
             self.views[number].offset = number * 4 % SECOND
 
     def _second(self, now: float) -> None:
         """Take stock of who is there and how they stand; remember where they are."""
         fleet, place = self.feed.all(), self.feed.place
+        self.tapes.take(self.feed, lambda: fleet, now)
         if not self.flock.uavs:
             self.flock.meet(fleet, now)
             self.flock.pose(self.feed, now)

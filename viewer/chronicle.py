@@ -9,11 +9,17 @@ from viewer.palette import MARK, Palette
 ROWS = 40  # shown; how many came before is said
 
 
-def listing(events: tuple[Event, ...], palette: Palette) -> str:
-    """List events, oldest first in, newest first out; their words are escaped here."""
+def listing(events: tuple[Event, ...], palette: Palette, seek: str = "") -> str:
+    """List events, oldest first in, newest first out; their words are escaped here.
+
+    Args:
+        events: what happened
+        palette: colours
+        seek: the page's code that shows the time in its place `{}`; empty: rows cannot be pressed
+    """
     if not events:
         return '<div class="uav"><b>Events</b> <span class="soft">none yet</span></div>'
-    rows = "".join(_row(event, palette) for event in reversed(events[-ROWS:]))
+    rows = "".join(_row(event, palette, seek) for event in reversed(events[-ROWS:]))
     earlier = len(events) - ROWS
     more = f'<div class="soft">and {earlier} earlier</div>' if earlier > 0 else ""
     return (
@@ -22,9 +28,10 @@ def listing(events: tuple[Event, ...], palette: Palette) -> str:
     )
 
 
-def _row(event: Event, palette: Palette) -> str:
+def _row(event: Event, palette: Palette, seek: str) -> str:
+    press = f' onpointerdown="{seek.format(event.t)}"' if seek else ""
     return (
-        f'<div class="event" data-kind="{event.kind.value}" title="{stamp(event.t)}">'
+        f'<div class="event" data-kind="{event.kind.value}" title="{stamp(event.t)}"{press}>'
         f'<span class="num soft">{moment(event.t)}</span>'
         f'<b style="color:{palette.event(event.kind)}">{MARK[event.kind]}</b><span>{escape(event.text)}</span></div>'
     )

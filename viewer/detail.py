@@ -164,7 +164,11 @@ def _facts(vehicle: Vehicle, now: float) -> str:
         if status is not None
         else "–",
         "recorded" if vehicle.recorded else "data time": stamp(at)
-        + (f", played {times(vehicle.time.pace)}" if vehicle.recorded and not vehicle.ended else ""),
+        + (
+            f", played {times(vehicle.time.pace)}"
+            if vehicle.recorded and vehicle.time.pace and not vehicle.ended
+            else ""
+        ),
         "sample": f"{ago(vehicle.age(now))} old" if isfinite(vehicle.age(now)) else "none yet",
         "prediction": f"{ago(max(at - vehicle.forecast.t, 0.0))} old, coasted {told.coast_s:.0f} s"
         if vehicle.forecast and told

@@ -21,7 +21,7 @@ class Forecast:
         self.t = message.t  # fleet time it starts at [s since 1970]
         self.heard = heard  # when it arrived, monotonic [s]
         self.message = message
-        self._place = place
+        self.place = place
 
     @cached_property
     def until(self) -> float:
@@ -49,7 +49,7 @@ class Forecast:
         told = self.message
         ahead, path, tube = (a.numpy().astype(float) for a in (told.ahead, told.path, told.tube))
         tube = np.clip(np.nan_to_num(tube / UNIT_M), 0.0, 1e4)
-        return smooth(ahead, self._place.local(told.ned_origin(), path), tube)
+        return smooth(ahead, self.place.local(told.ned_origin(), path), tube)
 
     def at(self, ahead: np.ndarray | float) -> np.ndarray:
         """Interpolate the mean path at look-aheads (k,) [s] -> (k, 3) [10 m]; held beyond both ends."""
@@ -64,7 +64,7 @@ class Forecast:
         path = self.message.path.numpy()
         n = int(np.searchsorted(self.message.ahead.numpy(), KEPT_S, side="right"))
         ahead = self.message.ahead.numpy()[:n].copy()
-        return Kept(self.t, self.until, ahead, path[:n].copy(), self.message.origin, self._place)
+        return Kept(self.t, self.until, ahead, path[:n].copy(), self.message.origin, self.place)
 
 
 class Kept(NamedTuple):

@@ -26,6 +26,7 @@ class Panels:
         self._gui, self._palette, self._choose = client.gui, palette, choose
         self._commands: dict[int, Any] = {}
         self._beat = False
+        self.seek = ""  # the page's code that shows the time of an event
         self._gui.configure_theme(
             dark_mode=palette.dark, show_logo=False, show_share_button=False, brand_color=triple(palette.predicting)
         )
@@ -92,7 +93,7 @@ class Panels:
         nobody = '<div class="uav soft">Nobody is selected: click a row or an aircraft, or press Ctrl+K.</div>'
         self._about.content = about(chosen, self._palette, now) if chosen is not None else nobody
         self._facts.content = facts(chosen, now) if chosen is not None else ""
-        told = listing(chosen.events, self._palette) if chosen is not None else ""
+        told = listing(chosen.events, self._palette, self.seek) if chosen is not None else ""
         if told != self._events.content:  # written anew, a list somebody scrolls would jump to its top
             self._events.content = told
         self._charts.draw(chosen, feed, now)

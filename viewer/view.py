@@ -17,6 +17,8 @@ from viewer.place import UNIT_M, Place
 from viewer.routes import NOTHING, route
 from viewer.scene import Scene
 from viewer.selected import Selection
+from viewer.timeline.deck import Timeline
+from viewer.timeline.tapes import Tapes
 
 NEAR_M = 800.0  # items of the route within this are shown with an aircraft one turns to [m]
 ROOM = 1.35  # how much more than what was flown is framed, while it grows [-]
@@ -26,11 +28,13 @@ IN_VIEW_M = 20_000.0  # what is farther from the middle of the fleet is not fram
 class View:
     """The page of one client: its scene, its panels, its camera, its selection."""
 
-    def __init__(self, client: Any, feed: Feed, palette: Palette, wake: Callable[[], None]) -> None:
+    def __init__(self, client: Any, feed: Feed, tapes: Tapes, palette: Palette, wake: Callable[[], None]) -> None:
         self.client, self._feed, self.palette, self._wake = client, feed, palette, wake
         self.scene = Scene(client.scene, palette, self.choose)
         self.selection, self._labels = Selection(client.scene, palette), Labels(client.scene)
         self.panels = Panels(client, palette, self.visit)
+        self.timeline = Timeline(client, feed, tapes, palette, self._stir)
+        self.panels.seek = self.timeline.sender()
         self.camera = Camera(client)
         self.selected: int | None = None
         self.dirty = True  # something was chosen that is not drawn yet
@@ -39,16 +43,21 @@ class View:
         self._framed = np.zeros((2, 3))  # corners of what the camera was last framed on [10 m]
         self._followed: tuple[int, np.ndarray] | None = None
 
+    def _stir(self) -> None:
+        """Have everything drawn at once: another time is shown."""
+        self.dirty = True
+        self._wake()
+
     def choose(self, uav: int) -> None:
         """Select a UAV; it is drawn at once."""
-        if self._feed.one(uav) is not None:
+        if self.timeline.one(uav) is not None:
             self.selected, self.dirty = uav, True
             self._wake()
 
     def visit(self, uav: int) -> None:
         """Select a UAV that may be out of sight, and turn the camera to it."""
         self.choose(uav)
-        vehicle, place = self._feed.one(uav), self._feed.place
+        vehicle, place = self.timeline.one(uav), self._feed.place
         if vehicle is None or place is None or (at := vehicle.where(time.monotonic())) is None:
             return
         told = [vehicle.forecast.path] if vehicle.forecast is not None else []
@@ -58,21 +67,25 @@ class View:
 
     def move(self, flock: Flock, now: float, tick: int) -> None:
         """Draw what moves: aircraft at the full rate, heads of trails, stems and the selected UAV more slowly."""
+        flock = self.timeline.flock(flock, self.selected, now)
         self.scene.glyphs.draw(flock)
         if tick % (10 if flock.crowd else 2) == 0:
             self.scene.draw_heads(flock)
             self.scene.draw_stems(flock)
             self.scene.draw_alerts(flock)
+        if tick % 5 == 0 and not self.timeline.player.live:
+            self.timeline.draw(self.selected)
         if tick % 2 == 0:
             self.point(flock, now)
         self._follow(now)
 
     def point(self, flock: Flock, now: float) -> None:
         """Draw the selected UAV, size everybody for where the camera is, and label."""
+        flock = self.timeline.flock(flock, self.selected, now)
         sight, scene = self.camera.sight(), self.scene
         size = self.panels.glyph.value
         scene.glyphs.look(flock, selected=self.selected, eye=sight.eye, look_at=sight.look_at, size=size)
-        chosen = self._feed.one(self.selected) if self.selected is not None else None
+        chosen = self.timeline.one(self.selected) if self.selected is not None else None
         if chosen is None:
             self.selection.clear()
         else:
@@ -82,9 +95,11 @@ class View:
 
     def settle(self, flock: Flock, now: float, ground: float) -> None:
         """Draw what changes slowly: trails, predicted paths, routes, panels; once a second and on a new selection."""
+        flock = self.timeline.flock(flock, self.selected, now)
         self.dirty = False
         if self.selected is None and (known := [v for v in flock.fleet if flock.index(v.uav) is not None]):
             self.selected = max(known, key=lambda v: (v.forecast is not None, -v.uav)).uav
+        self.timeline.draw(self.selected)
         self.panels.draw(flock.fleet, self._feed, flock.now, self.selected)
         place, options, scene = self._feed.place, self.panels, self.scene
         if place is None or not flock.uavs:
@@ -103,7 +118,7 @@ class View:
 
     def _draw_chosen(self, now: float, place: Place, ground: float) -> None:
         """Draw the selected UAV's flown path and mission."""
-        chosen = self._feed.one(self.selected) if self.selected is not None else None
+        chosen = self.timeline.one(self.selected) if self.selected is not None else None
         if chosen is None:
             return
         self.selection.draw_flight(chosen, self._feed.track(chosen), now, self.scene.glyphs.unit)
@@ -118,7 +133,9 @@ class View:
             seen: what makes a new picture, whatever its extent
             ground: height of the ground [10 m]
         """
-        chosen, place = self._feed.one(self.selected) if self.selected is not None else None, self._feed.place
+        if not self.timeline.player.live:
+            return
+        chosen, place = self.timeline.one(self.selected) if self.selected is not None else None, self._feed.place
         own = route(chosen.mission, place, ground) if chosen is not None and place is not None else NOTHING
         flown = self._feed.track(chosen)[:, 1:] if chosen is not None else NOTHING.points
         cloud = near(np.vstack([cloud, own.points, own.circles.reshape(-1, 3), flown]), IN_VIEW_M / UNIT_M)
@@ -132,7 +149,7 @@ class View:
         self.camera.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, ground]]))
 
     def _follow(self, now: float) -> None:
-        vehicle = self._feed.one(self.selected) if self.panels.follow.value and self.selected is not None else None
+        vehicle = self.timeline.one(self.selected) if self.panels.follow.value and self.selected is not None else None
         at = vehicle.where(now) if vehicle is not None else None
         if vehicle is None or at is None:
             self._followed = None

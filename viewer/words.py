@@ -94,7 +94,7 @@ def _recording(fleet: list[Vehicle], now: float) -> str:
     if not played:
         return ""
     newest = max(played, key=lambda vehicle: (not vehicle.ended, vehicle.clock(now)))
-    pace = "ended" if newest.ended else f"played {times(newest.time.pace)}"
+    pace = "ended" if newest.ended else f"played {times(newest.time.pace)}" if newest.time.pace else "paused"
     return f'<div class="soft">Recording · <span class="now">{stamp(newest.clock(now))}</span> · {pace}</div>'
 
 

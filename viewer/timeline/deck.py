@@ -1,0 +1,177 @@
+"""The timeline of one page: its player, its panel, and the fleet as it was at the time shown."""
+
+import threading
+from collections.abc import Callable
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from viewer.datatime import stamp
+from viewer.events import Event
+from viewer.feed import Feed
+from viewer.flock import MINUTE, Flock
+from viewer.palette import Palette
+from viewer.place import scene_quat
+from viewer.timeline import strip
+from viewer.timeline.after import After
+from viewer.timeline.panel import Panel
+from viewer.timeline.past import Past, as_it_was
+from viewer.timeline.player import Player, Span, last_before, next_after
+from viewer.timeline.tapes import Tapes
+from viewer.track import placed
+from viewer.vehicle import Vehicle
+
+SNAP = 0.008  # of the bar: a press this near to an event means the event
+OTHERS = 40  # events of each other UAV looked at: the newest
+
+
+class Timeline:
+    """What one page shows: the fleet as it is, or as it was."""
+
+    def __init__(self, client: Any, feed: Feed, tapes: Tapes, palette: Palette, changed: Callable[[], None]) -> None:
+        self.player = Player()
+        self._feed, self._tapes, self._palette, self._changed = feed, tapes, palette, changed
+        self._lock = threading.Lock()
+        self._span, self._shift = Span(0.0, 0.0), dict[int, float]()
+        self._lead: int | None = None
+        self._then, self._drawn_at = Flock(), (-np.inf, -np.inf)  # the fleet as it was; wall and data time of it
+        self._panel = Panel(client.gui, palette, self.asked)
+        self._after = After(client.scene, palette)
+
+    # --- what is shown ---
+
+    def flock(self, flock: Flock, selected: int | None, now: float) -> Flock:
+        """Give the fleet to draw: the one given, which is now, or, at another time, as it was."""
+        passed = now - self._drawn_at[0]
+        with self._lock:
+            self._measure(flock.fleet, selected)
+            self.player.advance(passed if isfinite(passed) else 0.0, self._span)
+            t = self.player.t
+        before, self._drawn_at = self._drawn_at, (now, t or -np.inf)
+        if t is None:
+            return flock
+        if self._drawn_at != before:
+            self._remember(flock.fleet, t, now)
+        return self._then
+
+    def one(self, uav: int) -> Vehicle | None:
+        """Give one UAV as it is shown; None where it is not there."""
+        vehicle, t = self._feed.one(uav), self.player.t
+        if vehicle is None or t is None or uav not in self._tapes.of:
+            return vehicle if t is None else None
+        return self._past(vehicle, t)
+
+    def _past(self, vehicle: Vehicle, t: float) -> Past | None:
+        then = t + self._shift.get(vehicle.uav, 0.0)
+        return as_it_was(vehicle, self._tapes.of[vehicle.uav], then, self.player.rate)
+
+    def _remember(self, fleet: list[Vehicle], t: float, now: float) -> None:
+        """Make the fleet of a time gone by."""
+        found = [past for one in fleet if one.uav in self._tapes.of and (past := self._past(one, t)) is not None]
+        then = self._then
+        then.meet(list(found), now)
+        shown = [past for past in found if then.index(past.uav) is not None]
+        then.at = np.array([past.where(now) for past in shown]).reshape(-1, 3)
+        then.quat = scene_quat(*np.array([past.attitude for past in shown]).reshape(-1, 3).T)
+        minute = [placed(past.tape.path(past.then - MINUTE[0], past.t), past.then - MINUTE, np.inf) for past in shown]
+        then.ring = np.array([np.where(np.isfinite(r), r, a) for r, a in zip(minute, then.at, strict=True)])
+        then.ring = then.ring.reshape(-1, len(MINUTE), 3)
+        then.changes, then.beats = min(then.changes, 0) - 1, 0  # other than those of now, and other every time
+
+    def _measure(self, fleet: list[Vehicle], selected: int | None) -> None:
+        """Find what can be shown, on the clock of the selected UAV."""
+        taped = {one.uav: one for one in fleet if len(self._tapes.of.get(one.uav, ()))}
+        if not taped:
+            self._span, self._shift, self._lead = Span(0.0, 0.0), {}, None
+            return self.player.go_live()
+        self._lead = selected if selected in taped else max(taped, key=lambda uav: taped[uav].heard)
+        self._span, self._shift = self._tapes.measure(taped[self._lead], list(taped.values()))
+
+    # --- being asked ---
+
+    def sender(self) -> str:
+        """Give the page's code that shows the time in its place `{}`."""
+        return self._panel.sender("at:")
+
+    def asked(self, what: str) -> None:
+        """Do what a press means; anything else is somebody's mischief."""
+        with self._lock:
+            if self._lead is None:
+                return
+            if what == "Pause":
+                self.player.pause(self._span)
+            elif what in ("1×", "4×"):
+                self.player.play(float(what[0]), self._span)
+            elif what == "● Live":
+                self.player.go_live()
+            elif "▸" in what or "◂" in what:
+                self._step(what.strip("◂▸ "), 1 if "▸" in what else -1)
+            else:
+                self._seek(*what.partition(":")[::2])
+        self._changed()
+
+    def _seek(self, how: str, text: str) -> None:
+        try:
+            value = float(text[:20])
+        except ValueError:
+            return
+        if not isfinite(value) or how not in ("share", "at"):
+            return
+        span = self._span
+        if how == "share":
+            value = span.begin + min(max(value, 0.0), 1.0) * (span.end - span.begin)
+            near = min((e.t for e in self._events()), key=lambda t: abs(t - value), default=value)
+            value = near if abs(near - value) < SNAP * (span.end - span.begin) else value
+        self.player.seek(value, span)
+        self.player.rate = 0.0
+
+    def _step(self, what: str, way: int) -> None:
+        self.player.pause(self._span)
+        t = self.player.t or 0.0
+        if what == "1 s":
+            found: float | None = t + way
+        else:
+            rows = self._tapes.of[self._lead or 0].t.tolist()
+            times = [event.t for event in self._events()] if what == "event" else rows
+            found = next_after(t, times) if way > 0 else last_before(t, times)
+        if found is not None:
+            self.player.seek(found, self._span)
+
+    def _events(self) -> list[Event]:
+        tape = self._tapes.of.get(-1 if self._lead is None else self._lead)
+        return list(tape.events) if tape is not None else []
+
+    # --- the panel ---
+
+    def draw(self, selected: int | None) -> None:
+        """Draw the panel and what happened after the time shown; call it about once a second and when it changes."""
+        one = self.one(selected) if selected is not None and not self.player.live else None
+        past = one if isinstance(one, Past) else None
+        misses = self._after.draw(past)
+        t, span = self.player.t, self._span
+        if self._lead is None:
+            return self._panel.draw("", '<span class="soft">nothing is kept yet</span>', "", "")
+        tapes = [tape for uav, tape in list(self._tapes.of.items()) if uav != self._lead]
+        others = [e for tape in tapes for e in tape.events[-OTHERS:] if span.begin <= e.t <= span.end]
+        bar = strip.strip(self._events(), others, span, t, self._palette)
+        words = ""
+        if past is not None:
+            told = past.forecast
+            words = strip.compared(misses, told.t if told is not None else None, past.then, self._palette)
+        self._panel.draw(bar, self._head(t, span), words, self._banner(t, span))
+
+    def _head(self, t: float | None, span: Span) -> str:
+        behind = "live" if t is None else f"{strip.length(span.end - t)} before the newest"
+        pace = "" if t is None else " · paused" if not self.player.rate else f" · playing {self.player.rate:g}×"
+        lasts, apart = strip.length(span.end - span.begin), f"predictions {self._tapes.apart_s:.0f} s apart"
+        kept = f"{lasts} of {len(self._tapes.of)} kept, {apart}, {strip.size(self._tapes.nbytes())}"
+        return (
+            f'<div class="head"><b class="now">{stamp(span.end if t is None else t)}</b>'
+            f'<span class="soft">{behind}{pace} · {kept}</span></div>'
+        )
+
+    def _banner(self, t: float | None, span: Span) -> str:
+        if t is None:
+            return ""
+        return f"Not live: this is {stamp(t)}, {strip.length(span.end - t)} before the newest. Press ● Live to go on."

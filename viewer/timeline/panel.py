@@ -1,0 +1,51 @@
+"""The floating panel of the timeline: bar, transport, steps, and one line of comparison."""
+
+from collections.abc import Callable
+from typing import Any
+
+import viser
+
+from viewer.palette import Palette
+from viewer.timeline.strip import touched
+
+TRANSPORT = ("Pause", "1×", "4×", "● Live")
+STEPS = ("◂ event", "◂ 1 s", "◂ frame", "frame ▸", "1 s ▸", "event ▸")
+SEND = (
+    "var m=window.__viserMutable;m&&m.sendMessage({{type:'GuiUpdateMessage',uuid:'UUID',updates:{{value:'TAG'+{}}}}})"
+)
+
+
+class Panel:
+    """Handles of the page; `asked(what)` is called with what a press means."""
+
+    def __init__(self, gui: Any, palette: Palette, asked: Callable[[str], None]) -> None:
+        self._gui, self._palette = gui, palette
+        self._asked = gui.add_text("asked", "", visible=False)
+        self._banner = gui.add_html("")
+        panel = gui.add_panel()
+        with panel.add_tab("Timeline", viser.Icon.CLOCK_PLAY):
+            self._bar = gui.add_html("")
+            transport = gui.add_button_group("Replay", TRANSPORT)
+            steps = gui.add_button_group("Step", STEPS)
+            self._words = gui.add_html("")
+        panel.float(x=40, y=-14, width=600)
+        self._asked.on_update(lambda _: asked(self._asked.value))
+        transport.on_click(lambda _: asked(transport.value))
+        steps.on_click(lambda _: asked(steps.value))
+        for label, what in (("pause", "Pause"), ("play at 1×", "1×"), ("play at 4×", "4×"), ("live", "● Live")):
+            command = gui.add_command(f"Timeline: {label}", icon=viser.Icon.CLOCK_PLAY)
+            command.on_trigger(lambda _, what=what: asked(what))
+
+    def sender(self, tag: str) -> str:
+        """Give the page's code that asks for `tag` and a value in its place `{}`."""
+        return SEND.replace("UUID", self._asked._impl.uuid).replace("TAG", tag)
+
+    def draw(self, bar: str, head: str, words: str, banner: str) -> None:
+        """Write the parts anew where they are others."""
+        for node, text in (
+            (self._bar, f'<div class="uav time"><div {touched(self.sender("share:"))}>{bar}</div>{head}</div>'),
+            (self._words, f'<div class="uav time soft">{words}</div>'),
+            (self._banner, f'<div class="then">{banner}</div>' if banner else ""),
+        ):
+            if node.content != text:
+                node.content = text

@@ -1,0 +1,93 @@
+"""The bar of the timeline as HTML: event marks in colour, the time shown, and what to send when it is touched."""
+
+from collections.abc import Iterable
+from html import escape
+
+from viewer.datatime import moment
+from viewer.events import Event, Kind
+from viewer.palette import MARK, Palette
+from viewer.timeline.compare import Miss
+from viewer.timeline.player import Span
+
+WIDTH = 1000  # of the drawing; the page stretches it
+GRAVE = {Kind.ALERT, Kind.MISMATCH, Kind.LOST, Kind.NO_MODEL, Kind.BLIND}  # of others, these alone are marked
+MAX_MARKS = 150  # drawn of one row: the newest
+TICKS_S = (10, 30, 60, 120, 300, 600, 1800, 3600)  # between upright ticks, so that there are at most twelve
+
+
+def strip(own: Iterable[Event], others: Iterable[Event], span: Span, t: float | None, palette: Palette) -> str:
+    """Draw the bar.
+
+    Args:
+        own: events of the selected UAV, above
+        others: those of the rest of the fleet, below; only grave ones are drawn
+        span: what can be shown
+        t: the time shown [s since 1970]; None is live
+        palette: colours
+    """
+    grave = [event for event in others if event.kind in GRAVE]
+    marks = _marks(list(own), span, palette, 3, 11) + _marks(grave, span, palette, 18, 5)
+    at = WIDTH * span.share(span.end if t is None else t)
+    ticks = "".join(f'<rect x="{x:.1f}" y="23" width="1" height="4" class="tick"/>' for x in _ticks(span))
+    return (
+        f'<svg class="strip" viewBox="0 0 {WIDTH} 28" preserveAspectRatio="none">'
+        f'<rect x="0" y="14" width="{WIDTH}" height="4" rx="2" class="rail"/>'
+        f'<rect x="0" y="14" width="{at:.1f}" height="4" rx="2" fill="{palette.predicting}"/>{ticks}{marks}'
+        f'<rect x="{min(at, WIDTH - 3):.1f}" y="0" width="3" height="28" fill="{palette.ink}"/></svg>'
+    )
+
+
+def _marks(events: list[Event], span: Span, palette: Palette, top: int, height: int) -> str:
+    shown = [event for event in events if span.begin <= event.t <= span.end][-MAX_MARKS:]
+    return "".join(
+        f'<rect x="{WIDTH * span.share(event.t) - 2.5:.1f}" y="{top}" width="5" height="{height}" '
+        f'fill="{palette.event(event.kind)}" class="mark" data-kind="{event.kind.value}">'
+        f"<title>{moment(event.t)} {MARK[event.kind]} {escape(event.text)}</title></rect>"
+        for event in shown
+    )
+
+
+def _ticks(span: Span) -> list[float]:
+    length = span.end - span.begin
+    step = next((s for s in TICKS_S if length / s <= 12), length)
+    first = -(-span.begin // step) * step
+    return [WIDTH * span.share(first + k * step) for k in range(int((span.end - first) / max(step, 1e-9)) + 1)]
+
+
+def touched(send: str) -> str:
+    """Give the attributes of whatever wraps the bar: a press or a drag sends the share of its width.
+
+    Args:
+        send: the page's code that asks for a value in its place `{}`
+    """
+    share = "((event.clientX-r.left)/r.width).toFixed(5)"
+    code = f"var r=this.getBoundingClientRect();{send.format(share)}"
+    return f'onpointerdown="{code}" onpointermove="if(event.buttons&1){{{code}}}"'
+
+
+def compared(misses: list[Miss], told_t: float | None, then: float, palette: Palette) -> str:
+    """Say what was predicted then against what happened, look-ahead by look-ahead."""
+    if told_t is None:
+        return "nothing was predicted at this time"
+    if not misses:
+        return "what was predicted here is not answered yet"
+    parts = "".join(
+        f'<span class="miss"><b>+{one.ahead:g} s</b> {one.miss:.1f} m '
+        f'<span style="color:{palette.verified if one.held else palette.mismatch}">'
+        f"{'✓ inside' if one.held else '✕ outside'}</span></span>"
+        for one in misses
+    )
+    age = f" {then - told_t:.0f} s before" if then - told_t > 1 else ""
+    return f"predicted{age}, against flown: {parts}"
+
+
+def length(seconds: float) -> str:
+    """Say a length of time: 2:13."""
+    minutes, rest = divmod(int(max(seconds, 0.0)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def size(n: int) -> str:
+    """Say how much memory it takes."""
+    return f"{n / 1e6:.1f} MB" if n >= 1e5 else f"{n / 1e3:.0f} kB"
