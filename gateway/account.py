@@ -117,7 +117,7 @@ class Tally:
             unrecorded=taped.lost + taped.dropped,
             unwritten=taped.waiting,
             share=share.now,
-            sentence="; ".join(filter(None, (taped.trouble, share.sentence))),
+            sentence="; ".join(filter(None, (taped.trouble, share.sentence, getattr(link, "damage", "")))),
         )
 
 

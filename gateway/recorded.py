@@ -54,6 +54,11 @@ class Replay:
         return self.recording.name
 
     @property
+    def damage(self) -> str:
+        """Say what could not be read of it, known once it is at its end; empty: nothing."""
+        return "; ".join(self.recording.skipped)
+
+    @property
     def share(self) -> float:
         """Tell how far reading has come, 0..1."""
         return self.recording.share

@@ -8,7 +8,8 @@ from fleet.bus import connect
 from fleet.cli import guarded, parser_for, stop_on_signal
 from fleet.config import entry, router_arguments
 from fleet.logs import log_arguments, say
-from viewer.app import App, quiet, serve
+from viewer.app import App
+from viewer.door import quiet, serve
 
 EXAMPLES = """
   viewer
@@ -29,6 +30,11 @@ def main(argv: list[str] | None = None) -> int:
     )
     router_arguments(parser)
     log_arguments(parser)
+    parser.add_argument(
+        "--name",
+        default="",
+        help="host name under which a reverse proxy shows the page; any other but this machine's own is refused",
+    )
     parser.add_argument("--light", action="store_true", help="light colours, for bright surroundings")
     return guarded("viewer", run, parser.parse_args(argv))
 
@@ -38,13 +44,13 @@ def run(args: argparse.Namespace) -> int:
 
     Raises:
         ValueError: when the port is no port.
-        OSError: when the port is taken or nobody answers at the router.
+        OSError: when the port is taken.
     """
     if not 0 < args.port < 65536:
         raise ValueError(f"--port: found {args.port}, expected 1 to 65535; name another")
     stop = stop_on_signal()
-    with connect(entry(args, VIEWER)) as bus:
-        server = serve(args.host, args.port)
+    with connect(entry(args, VIEWER), patient=True) as bus:  # no router yet is said on the page
+        server = serve(args.host, args.port, args.name)
         try:
             app = App(bus, server, light=args.light)
             say("viewer", f"http://{args.host}:{args.port}")

@@ -1,14 +1,11 @@
 """The server of the page: one feed, one render thread, a view for each who looks."""
 
 import contextlib
-import io
 import threading
 import time
-import warnings
 
 import numpy as np
 import viser
-from viser import _messages
 
 from fleet.bus import Bus
 from viewer.camera import start_at
@@ -26,30 +23,6 @@ from viewer.view import IN_VIEW_M, View, near
 TICK_S = 0.1
 SECOND = 10  # ticks of a second
 SLOW_S = 10.0  # how often what is missing is asked for again [s]
-
-
-def serve(host: str, port: int) -> viser.ViserServer:
-    """Open the web server on exactly this port, without the public share tunnel.
-
-    Raises:
-        OSError: when the port is taken; viser itself would silently take the next one.
-    """
-    # A page may close while it is drawn: what was on its way to it then goes nowhere, which is no news.
-    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-    with quiet():
-        server = viser.ViserServer(host=host, port=port, verbose=False)
-    for share in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
-        server._websock_server.unregister_handler(share)
-    if server.get_port() != port:
-        with quiet():
-            server.stop()
-        raise OSError(f"--port: found {port} taken by another program, expected a free one; stop it or name another")
-    return server
-
-
-def quiet() -> contextlib.redirect_stdout:
-    """Keep the library's own banner off our output."""
-    return contextlib.redirect_stdout(io.StringIO())
 
 
 class App:

@@ -10,6 +10,7 @@ from viewer.palette import Palette
 from viewer.vehicle import Vehicle
 from viewer.words import CLAIMS_S, ago, fit, horizon_s, standing
 
+LETTERS = 500  # of a sentence from outside
 REFUSED_S = 10.0  # how long a refused message is spoken of [s]
 
 
@@ -62,7 +63,9 @@ def why(vehicle: Vehicle, now: float) -> list[str]:
             "check that `twin_worker` runs on this router."
         )
     elif vehicle.forecast is None:
-        said.append("No horizon yet: nothing is claimed before a model is verified.")
+        said.append(
+            f"No horizon yet, heard for {ago(_known_s(vehicle, now))}: nothing is claimed before a model is verified."
+        )
     if late := vehicle.late(now):
         said.append(
             f"The newest prediction is {ago(late)} old: its worker has fallen behind; play the recording more slowly, "
@@ -79,24 +82,35 @@ def why(vehicle: Vehicle, now: float) -> list[str]:
     return said
 
 
+def _known_s(vehicle: Vehicle, now: float) -> float:
+    """Give for how long its flight has been heard, in data time [s]."""
+    rows = vehicle.track.rows()
+    return vehicle.clock(now) - float(rows[0, 0]) if len(rows) else 0.0
+
+
+def clip(text: str) -> str:
+    """Cut what came from outside and is longer than anybody reads."""
+    return text if len(text) <= LETTERS else text[: LETTERS - 1] + "…"
+
+
 def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
     cards = [
-        f'<div class="say" style="border-color:{palette.mismatch}">▲ {escape(a.sentence)}</div>'
+        f'<div class="say" style="border-color:{palette.mismatch}">▲ {escape(clip(a.sentence))}</div>'
         for a in vehicle.alerts.values()
     ]
     cards.insert(0, mismatch.card(vehicle.mismatch, palette))
     said = why(vehicle, now)
-    cards += [f'<div class="say">{escape(text)}</div>' for text in said]
+    cards += [f'<div class="say">{escape(clip(text))}</div>' for text in said]
     verdict = vehicle.model.verdict if vehicle.model is not None else None
     if verdict is not None:
         colour = palette.verified if verdict.outcome is Outcome.VERIFIED else palette.identifying
         cards.append(
             f'<div class="say" style="border-color:{colour}"><b>{escape(verdict.outcome.value.replace("_", " "))}</b> '
             f'<span class="soft">newest try, number {verdict.tries}, threshold {verdict.threshold:.0f} %</span><br>'
-            f"{escape(verdict.sentence)}</div>"
+            f"{escape(clip(verdict.sentence))}</div>"
         )
     elif vehicle.row is not None and not any(vehicle.row.verdict in text for text in ("", *said)):
-        cards.append(f'<div class="say">{escape(vehicle.row.verdict)}</div>')
+        cards.append(f'<div class="say">{escape(clip(vehicle.row.verdict))}</div>')
     return "".join(cards)
 
 
@@ -181,7 +195,8 @@ def _facts(vehicle: Vehicle, now: float) -> str:
     return (
         "<table>"
         + "".join(
-            f'<tr><td class="soft key">{k}</td><td class="value">{escape(v)}</td></tr>' for k, v in figures.items()
+            f'<tr><td class="soft key">{k}</td><td class="value">{escape(clip(v))}</td></tr>'
+            for k, v in figures.items()
         )
         + "</table>"
     )

@@ -34,6 +34,8 @@ from viewer.vehicle import ENDED_S, JUMP_S, Vehicle
 MAX_VEHICLES = 2_000  # ids are written by strangers: more than this many are counted, not kept
 COASTING_S = 1.0  # a prediction so long after the last sample is of no flight that anything can be laid beside [s]
 _SAMPLES = encoding(Sample)
+MAX_AWAY = 10_000  # UAVs without room that are counted
+MAX_LINKS = 64  # links whose sentences are kept
 MAX_WRITERS = 16  # workers whose sentences are kept: a restarted one is another
 # asked for at the start, so that a late viewer is complete
 LATE = (Status, Mission, Model, Prediction, Alert, Mismatch, FleetState, Account)
@@ -48,6 +50,8 @@ class Feed:
         self._place: Place | None = None
         self.sentences: dict[int, str] = {}  # what each worker says of itself
         self._counts: Counter[str] = Counter()
+        self.links: dict[str, str] = {}  # what gateways say of their links, where they say something
+        self.away: set[int] = set()  # UAVs that there was no room for
         self.since = clock()
         self.lock = threading.Lock()
         self._bus, self._clock, self._fence = bus, clock, Fence(clock)
@@ -107,6 +111,11 @@ class Feed:
                 continue
             self._hear(Sample, sample, None, now)
         self.inbox.crowd = len(self._vehicles) > CROWD
+
+    @property
+    def router(self) -> bool:
+        """Tell whether a router is there to hear anything through."""
+        return bool(self._bus.router)
 
     @property
     def listening(self) -> str:
@@ -200,6 +209,8 @@ class Feed:
     def _vehicle(self, uav: int) -> Vehicle:
         if uav not in self._vehicles:
             if len(self._vehicles) >= MAX_VEHICLES or not 0 <= uav < 1_000_000:
+                if len(self.away) < MAX_AWAY:
+                    self.away.add(uav)
                 raise ValueError(
                     f"uav-{uav}: found {len(self._vehicles)} UAVs already or no id below 1,000,000, "
                     f"expected at most {MAX_VEHICLES}; open another viewer"
@@ -284,6 +295,10 @@ class Feed:
 
     def _account(self, account: Account, _: Stamp | None, now: float) -> None:
         """Learn who is played from a recording, and that the player still speaks; one who flies now is live again."""
+        for link in account.per_link[:MAX_LINKS]:
+            self.links.pop(link.link, None)
+            if link.sentence and len(self.links) < MAX_LINKS:
+                self.links[link.link] = link.sentence
         played = bool(account.links) and all(link.startswith("replay:") for link in account.links)
         for uav in account.uavs:
             vehicle = self._vehicles.get(uav)

@@ -12,6 +12,7 @@ from viewer.chronicle import listing
 from viewer.detail import about, facts
 from viewer.feed import Feed
 from viewer.palette import WORD, Palette, triple
+from viewer.states import Router, notices
 from viewer.vehicle import Vehicle
 from viewer.words import alerts, empty, summary, table
 
@@ -26,6 +27,7 @@ class Panels:
         self._gui, self._palette, self._choose = client.gui, palette, choose
         self._commands: dict[int, Any] = {}
         self._beat = False
+        self._router = Router()
         self.seek = ""  # the page's code that shows the time of an event
         self._gui.configure_theme(
             dark_mode=palette.dark, show_logo=False, show_share_button=False, brand_color=triple(palette.predicting)
@@ -42,6 +44,7 @@ class Panels:
     def _build_left(self) -> None:
         gui, tabs = self._gui, self._gui.add_tab_group()
         with tabs.add_tab("Fleet", viser.Icon.DRONE):
+            self._notices = gui.add_html("")
             self._summary = gui.add_html("")
             self._search = gui.add_text("Search", "")
             self._show = gui.add_button_group("Show", ("All", "Alerts", "Selected"))
@@ -80,6 +83,7 @@ class Panels:
         """Write everything anew; call it about once a second, and when the selection changes."""
         self._beat = not self._beat
         self._banner.content = f'<div class="stale {"a" if self._beat else "b"}">{STALE}</div>'
+        self._notices.content = notices(feed, self._router.say(feed.router, now), self._palette)
         chosen = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
         if not fleet:
             self._summary.content, self._table.content = empty(feed, now), ""

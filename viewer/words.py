@@ -153,7 +153,7 @@ def alerts(fleet: list[Vehicle], feed: Feed, palette: Palette) -> str:
     )
     cards += "".join(
         f'<div class="say" style="border-color:{palette.mismatch}"><b>▲ {vehicle.name}</b> '
-        f'<span class="soft">{escape(kind.value.replace("_", " "))}</span><br>{escape(alert.sentence)}</div>'
+        f'<span class="soft">{escape(kind.value.replace("_", " "))}</span><br>{escape(alert.sentence[:300])}</div>'
         for vehicle, kind, alert in found[:MAX_ROWS]
     )
     return f'<div class="uav">{cards or "<div class=soft>No alert is in force.</div>"}</div>'

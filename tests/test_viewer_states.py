@@ -1,0 +1,89 @@
+"""What is wrong with the picture as a whole, said in words: no router, too many UAVs, damaged recordings, no fleet."""
+
+import pytest
+from pretend_feed import HOSTILE, STAMP, Clock, PretendUav, T, feed_of
+
+from fleet.bus import MemoryBus
+from fleet.contract import Account, LinkAccount, Status
+from viewer import feed as feeds
+from viewer.detail import about
+from viewer.feed import Feed
+from viewer.palette import DARK
+from viewer.states import LETTERS, Router, notices
+from viewer.words import empty, summary
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+class Adrift(MemoryBus):
+    router = ""
+
+
+def damaged(sentence: str, link: str = "replay:flight.tlog?speed=4") -> Account:
+    return Account(t=T, links=(link,), per_link=(LinkAccount(link=link, sentence=sentence),))
+
+
+def test_a_router_that_is_away_is_said_with_its_seconds_and_forgotten_when_it_is_back(clock: Clock) -> None:
+    feed, router = Feed(Adrift(), clock), Router()
+    assert not feed.router and "No router</b> for 0 s" in router.say(feed.router, 50.0)
+    assert "for 12 s" in notices(feed, router.say(feed.router, 62.0), DARK)
+    assert router.say(True, 63.0) == "" == notices(Feed(MemoryBus(), clock), "", DARK)
+    assert "for 0 s" in router.say(False, 70.0)
+
+
+def test_more_uavs_than_fit_are_counted_once_each(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feeds, "MAX_VEHICLES", 3)
+    monkeypatch.setattr(feeds, "MAX_AWAY", 4)
+    feed, _, bus = feed_of(clock, 3)
+    for _ in range(3):
+        for uav in (7, 8, 5_000_000, -1, 9, 10):
+            bus.publish(Status(uav=uav, t=T))
+    assert len(feed.vehicles) == 3 and len(feed.away) == 4
+    assert "Too many UAVs" in notices(feed, "", DARK) and ", 4 more are heard" in notices(feed, "", DARK)
+    assert "3 UAVs" in summary(feed.all(), feed, DARK, clock.now)
+
+
+def test_what_could_not_be_read_of_a_recording_is_said_and_escaped(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    bus.publish(damaged(f"flight.tlog: 73750 damaged bytes skipped {HOSTILE} {'x' * 10_000}"))
+    said = notices(feed, "", DARK)
+    assert "Recording damaged" in said and "73750 damaged bytes" in said
+    assert "<img" not in said and len(said) < 3 * LETTERS
+    bus.publish(damaged(""))
+    assert notices(feed, "", DARK) == ""
+
+
+def test_links_without_end_are_bounded(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    for k in range(500):
+        bus.publish(damaged("late", f"udpin:0.0.0.0:{k}"))
+    assert len(feed.links) == feeds.MAX_LINKS and "<b>Link</b>: late" in notices(feed, "", DARK)
+
+
+def test_no_fleet_is_said_with_what_is_listened_to_and_what_to_check(clock: Clock) -> None:
+    feed = Feed(MemoryBus(), clock)
+    clock.now += 42
+    said = empty(feed, clock.now)
+    assert "No vehicles yet" in said and "parauav/*/sample" in said and "42 s" in said and "0 messages" in said
+    assert "fleet status" in said
+
+
+def test_ten_thousand_letters_of_status_are_cut_and_words_stay_words(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    bus.publish(Status(uav=0, t=T + 1, mode=HOSTILE * 50, sentence=HOSTILE + "y" * 10_000))
+    page = about(feed.one(0), DARK, clock.now)
+    assert "<img" not in page and "yyy" in page and len(page) < 4_000
+
+
+def test_identifying_says_why_there_is_no_horizon_and_for_how_long(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 2)
+    uav = PretendUav(1)
+    for k in range(1, 46):
+        clock.now += 1
+        bus.publish(uav.sample(T + k - 1, T + k))
+        bus.publish(uav.model(T + k), STAMP)
+    page = about(feed.one(1), DARK, clock.now)
+    assert "No horizon yet" in page and "window has 41 samples" in page and "heard for 45 s" in page

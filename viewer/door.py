@@ -1,0 +1,126 @@
+"""The door of the page: who may come in, and what they are given first. All that bends the page library is here."""
+
+import contextlib
+import gzip
+import http
+import io
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import viser
+import websockets.asyncio.server as sockets
+from viser import _messages
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+HOME = ("localhost", "127.0.0.1", "::1")  # names of this machine, for itself
+POLICY = (  # nothing is fetched from anywhere else, and nobody may frame the page
+    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' ws: wss: data: blob:; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+Answering = Callable[[Any, Request], Response | None]
+
+
+def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
+    """Open the web server on exactly this port, without the public share tunnel.
+
+    Args:
+        host: address to bind
+        port: TCP port; 0 takes any free one
+        name: host name that a reverse proxy shows the page under; empty: none does
+    Raises:
+        OSError: when the port is taken; viser itself would silently take the next one.
+    """
+    # A page may close while it is drawn: what was on its way to it then goes nowhere, which is no news.
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
+    with quiet(), _guarded({*HOME, host.strip("[]").lower(), *filter(None, [name.lower()])}, anyone=_is_any(host)):
+        server = viser.ViserServer(host=host, port=port, verbose=False)
+    for share in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
+        server._websock_server.unregister_handler(share)
+    if port and server.get_port() != port:
+        with quiet():
+            server.stop()
+        raise OSError(f"--port: found {port} taken by another program, expected a free one; stop it or name another")
+    return server
+
+
+def quiet() -> contextlib.redirect_stdout:
+    """Keep the library's own banner off our output."""
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+def _is_any(host: str) -> bool:
+    """Tell whether an address means every interface: then we cannot know by what name we are called."""
+    return host in ("", "0.0.0.0", "::", "[::]")
+
+
+@contextlib.contextmanager
+def _guarded(names: set[str], *, anyone: bool) -> Iterator[None]:
+    """Put our own doorman before the library's, while it opens its server."""
+    original = sockets.serve
+
+    def guarded(*args: Any, process_request: Answering, **options: Any) -> Any:
+        return original(*args, process_request=doorman(process_request, names, anyone=anyone), **options)
+
+    sockets.serve = guarded  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        sockets.serve = original  # type: ignore[misc]
+
+
+def doorman(inner: Answering, names: set[str], *, anyone: bool) -> Answering:
+    """Wrap what answers a request: strangers are refused, the page carries its rules and its first words.
+
+    A page of another site that runs in the operator's browser may neither open our socket (its `Origin` is another) nor
+    reach us under a name of its own (its `Host` is none of ours).
+
+    Args:
+        inner: the library's own answer
+        names: host names we are known by
+        anyone: take any host name, as when bound to every interface
+    """
+    page = _page()
+
+    def answer(connection: Any, request: Request) -> Response | None:
+        host = _name(request.headers.get("Host", ""))
+        origin = request.headers.get("Origin")
+        if not anyone and host not in names:
+            return _refusal(f"viewer: found host {host[:80]!r}, expected {sorted(names)}; start it with --name")
+        if origin is not None and _name(origin.partition("://")[2]) != host:
+            return _refusal("viewer: found a request of another site, expected this page's own; open the page itself")
+        if request.headers.get("Upgrade", "").lower() == "websocket":
+            return inner(connection, request)
+        if request.path.partition("?")[0] in ("/", "/index.html"):
+            return _response(http.HTTPStatus.OK, page, {"Content-Type": "text/html", "Content-Encoding": "gzip"})
+        return inner(connection, request)
+
+    return answer
+
+
+def _name(address: str) -> str:
+    """Take the port off `name:port` or `[::1]:port`."""
+    if address.startswith("["):
+        return address[1:].partition("]")[0].lower()
+    return address.partition(":")[0].lower()
+
+
+def _page() -> bytes:
+    """Give the library's page, gzipped, with our title and with words for a browser that cannot draw."""
+    source = Path(viser.__file__).with_name("client") / "build" / "index.html"
+    text, first = source.read_text(encoding="utf-8"), Path(__file__).with_name("first.html").read_text(encoding="utf-8")
+    at = text.index("<body")
+    at = text.index(">", at) + 1
+    return gzip.compress((text[:at] + first + text[at:]).encode())
+
+
+def _refusal(sentence: str) -> Response:
+    return _response(http.HTTPStatus.FORBIDDEN, f"{sentence}\n".encode(), {"Content-Type": "text/plain"})
+
+
+def _response(status: http.HTTPStatus, body: bytes, more: dict[str, str]) -> Response:
+    rules = {"Content-Security-Policy": POLICY, "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
+    headers = Headers({"Content-Length": str(len(body)), "Cache-Control": "no-cache", **rules, **more})
+    return Response(status.value, status.phrase, headers, body)
