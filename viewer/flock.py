@@ -11,7 +11,7 @@ from viewer.vehicle import Vehicle
 
 CHUNKS, STEPS = 5, 12  # the trail: chunks of 12 s, and a head of up to 12 s, one point a second
 MINUTE = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # how long ago each point of the trail is, (73,) [s]
-COARSE = 4  # seconds between the points of a trail in a crowd
+COARSE = ((60, 1), (CROWD, 2))  # of a fleet up to so many, seconds between the drawn points of a trail; else 4
 READ_S = 0.35  # how often the places of a crowd are read [s]
 FASTEST = 30.0  # what went faster has leapt [10 m/s]
 LEAP_M = 1_000.0  # farther within a second is no flight but another one (a recording begun anew): a new trail [m]
@@ -62,7 +62,12 @@ class Flock:
     @property
     def stride(self) -> int:
         """Give the seconds between the drawn points of a trail."""
-        return COARSE if self.crowd else 1
+        return next((step for most, step in COARSE if len(self.uavs) <= most), 4)
+
+    @property
+    def chunks(self) -> int:
+        """Give how many closed chunks of trail are drawn."""
+        return 2 if self.crowd else CHUNKS
 
     @property
     def exceptions(self) -> np.ndarray:

@@ -5,12 +5,14 @@ from typing import Any
 import numpy as np
 
 from viewer.numerals import written
-from viewer.palette import Palette, rgb, triple
+from viewer.palette import Palette, rgb
 from viewer.place import UNIT_M
 from viewer.routes import circle
-from viewer.strokes import Strokes
+from viewer.strokes import Strokes, chain
 
 RINGS_M = (500, 1000, 2000, 5000, 10_000)
+NETS = ((100, 1_200, 0.5), (500, 6_000, 1.0), (5_000, 30_000, 1.0))  # lines so far apart, so far out [m], how strong
+PARTS = 12  # a line of the grid fades in so many steps
 
 
 class Ground:
@@ -18,29 +20,12 @@ class Ground:
 
     def __init__(self, scene: Any, palette: Palette) -> None:
         self.height = 0.0  # scene [10 m]
-        top, bottom = rgb(palette.sky[0]), rgb(palette.sky[1])
-        w = (np.linspace(0, 1, 256) ** 1.2)[:, None, None]
-        scene.set_background_image(np.repeat(top * (1 - w) + bottom * w, 2, axis=1).astype(np.uint8), format="png")
+        scene.set_background_image(_sky(palette), format="png")
         scene.configure_default_lights(True, cast_shadow=False)
         # No fog: with it the client fails to draw the outline of an aircraft under the mouse, and then the whole frame.
         self._node = scene.add_frame("/env", show_axes=False)
-        scene.add_grid(
-            "/env/grid",
-            width=6000.0,
-            height=6000.0,
-            cell_size=10.0,
-            section_size=50.0,
-            cell_color=triple(palette.grid),
-            section_color=triple(palette.section),
-            cell_thickness=0.6,
-            section_thickness=1.0,
-            plane_color=triple(palette.ground),
-            plane_opacity=0.92,
-            fade_distance=1500.0,
-            fade_strength=1.2,
-            shadow_opacity=0.0,
-            position=(0.0, 0.0, -0.05),
-        )
+        lines, colours = zip(*[_grid(palette, *net) for net in NETS], strict=True)
+        Strokes(scene, "/env/grid", 1.0).draw(np.concatenate(lines), np.concatenate(colours))
         rings = [circle(np.array([0, 0, 0.02]), m / UNIT_M, 128) for m in RINGS_M]
         Strokes(scene, "/env/rings", 1.2).draw(np.concatenate([*rings, *map(_distance, RINGS_M)]), rgb(palette.ring))
 
@@ -49,6 +34,32 @@ class Ground:
         if abs(height - self.height) > 0.05:
             self.height = height
             self._node.position = (0.0, 0.0, height)
+
+
+def _sky(palette: Palette) -> np.ndarray:
+    """Paint the background: sky above, the colour of the ground from the upper third down, (256, 2, 3)."""
+    share = np.clip(np.linspace(0, 3, 256), 0, 1)[:, None, None] ** 0.7
+    return np.repeat(rgb(palette.sky[0]) * (1 - share) + rgb(palette.ground) * share, 2, axis=1).astype(np.uint8)
+
+
+def _grid(palette: Palette, apart: float, reach: float, strong: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lay a net of lines that fade outwards, as the renderer's own grid would take most of a software renderer's time.
+
+    Args:
+        palette: colours
+        apart, reach: of the lines, [m]
+        strong: share of the full colour in the middle [-]
+    Returns:
+        segments (n, 2, 3) [10 m] and the colours of their ends (n, 2, 3)
+    """
+    offsets = np.arange(-reach, reach + 1, apart) / UNIT_M
+    along = np.linspace(-reach, reach, PARTS + 1) / UNIT_M
+    x, y = np.meshgrid(along, offsets)
+    lines = chain(np.stack([x, y, np.zeros_like(x)], axis=-1)).reshape(-1, 2, 3)
+    lines = np.concatenate([lines, lines[..., [1, 0, 2]]])
+    away = np.clip(np.linalg.norm(lines, axis=-1) * UNIT_M / reach, 0, 1)[..., None]
+    share = strong * (1 - away) ** 0.8
+    return lines, share * rgb(palette.section) + (1 - share) * rgb(palette.ground)
 
 
 def _distance(metres: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from viewer.routes import NOTHING, Route, circle
 from viewer.strokes import Strokes, chain, dash_lines, faded
 from viewer.vehicle import Vehicle
 
-DASHES = 28  # dashes of one predicted path
+DASHES, FEW = 28, 60  # dashes of one predicted path, half as many where there are more UAVs than a few
 ALERT_DASHES = 18  # dashes of the ring on the ground under who needs an eye
 
 
@@ -30,17 +30,17 @@ class Scene:
         self.stems = Strokes(scene, "/fleet/stems", 1.2)
         self.routes = Strokes(scene, "/fleet/routes", 1.4)
         self.alert = Strokes(scene, "/alert", 2.2)
-        self._drawn = (-1, -1)  # changes and closed chunks of the flock when trails were last drawn
+        self._drawn: tuple = (None, -1)  # who, and how many closed chunks there were, when trails were last drawn
         self._looks = np.zeros(0, int)  # the looks they were coloured by
         self._head_looks = np.zeros(0, int)
 
-    def draw_trails(self, flock: Flock) -> None:
-        """Draw what is new of the closed chunks: one when a chunk closes, all when who is drawn changes."""
+    def draw_trails(self, flock: Flock, selected: int | None) -> None:
+        """Draw what is new of the closed chunks: one when a chunk closes, all when who is drawn or selected changes."""
         closed, recoloured = flock.beats // STEPS, not np.array_equal(flock.looks, self._looks)
         changes, before = self._drawn
-        if (flock.changes, closed) == self._drawn and not recoloured:
+        if (who := (flock.changes, selected)) == changes and closed == before and not recoloured:
             return
-        fresh = range(CHUNKS) if flock.changes != changes or closed > before + 1 else range(closed - before)
+        fresh = range(CHUNKS) if who != changes or closed > before + 1 else range(closed - before)
         if fresh == range(1):  # the oldest is drawn anew as the newest; the others only fade
             self.trails = [self.trails[-1], *self.trails[:-1]]
         colours = self.glyphs.colours(flock)
@@ -48,15 +48,17 @@ class Scene:
             ages = age * STEPS + np.arange(STEPS, -1, -flock.stride)
             shares = np.interp(ages, [-STEPS, CHUNKS * STEPS], [0.95, 0.03]) * (0.6 if flock.crowd else 1.0)
             shades = faded(colours, rgb(self._palette.ground), shares)
-            if age in fresh:
-                strokes.draw(chain(flock.chunk(age)), shades.reshape(-1, 2, 3))
+            if age >= flock.chunks:
+                strokes.draw(NOTHING.legs)
+            elif age in fresh:
+                strokes.draw(chain(_bare(flock, flock.chunk(age), selected)), shades.reshape(-1, 2, 3))
             else:
                 strokes.colour(shades.reshape(-1, 2, 3), shades.shape[0] * shades.shape[1])
-        self._drawn, self._looks = (flock.changes, closed), flock.looks.copy()
+        self._drawn, self._looks = (who, closed), flock.looks.copy()
 
-    def draw_heads(self, flock: Flock) -> None:
+    def draw_heads(self, flock: Flock, selected: int | None) -> None:
         """Draw the newest stretch of every trail up to where the aircraft is: an array of fixed size."""
-        lines = chain(flock.head())
+        lines = chain(_bare(flock, flock.head(), selected))
         if np.array_equal(flock.looks, self._head_looks):
             return self.head.draw(lines)
         self._head_looks = flock.looks.copy()
@@ -69,11 +71,12 @@ class Scene:
         who = [v for v in predicted(flock) if v.uav != selected]
         if not who:
             return self.predicted.draw(NOTHING.legs)
+        dashes = DASHES if len(flock.uavs) <= FEW else DASHES // 2
         told = [(v.forecast, v.clock(now)) for v in who if v.forecast is not None]
-        lines = [cut_at_horizon(one.ahead, one.path, clock - one.t, one.until) for one, clock in told]
+        lines = [cut_at_horizon(one.ahead, one.path, clock - one.t, one.until, dashes) for one, clock in told]
         looks = flock.looks[[i for v in who if (i := flock.index(v.uav)) is not None]]
         tints = 0.35 * np.array([rgb(c) for c in self._palette.looks()]) + 0.65 * rgb(self._palette.ink)
-        shades = faded(tints, rgb(self._palette.ground), np.linspace(0.85, 0.3, 2 * DASHES))[:, ::2]
+        shades = faded(tints, rgb(self._palette.ground), np.linspace(0.85, 0.3, 2 * dashes))[:, ::2]
         self.predicted.draw(np.concatenate(lines), shades[looks].reshape(-1, 2, 3))
 
     def draw_stems(self, flock: Flock) -> None:
@@ -102,6 +105,14 @@ class Scene:
         self.routes.draw(np.concatenate([*lines, NOTHING.legs]), mix(self._palette.route, self._palette.ground, 0.45))
 
 
+def _bare(flock: Flock, points: np.ndarray, selected: int | None) -> np.ndarray:
+    """Take away the trail of the selected UAV, points (n, k, 3): it has its own, finer path."""
+    if (row := flock.index(selected)) is not None:
+        points = points.copy()
+        points[row] = points[row, :1]
+    return points
+
+
 def predicted(flock: Flock) -> list[Vehicle]:
     """Choose whose predicted paths are drawn: all, in a crowd those who need an eye."""
     told = [v for v in flock.fleet if v.forecast is not None and flock.index(v.uav) is not None]
@@ -111,16 +122,17 @@ def predicted(flock: Flock) -> list[Vehicle]:
     return [v for v in told if v.uav in needy]
 
 
-def cut_at_horizon(ahead: np.ndarray, path: np.ndarray, start: float, until: float) -> np.ndarray:
+def cut_at_horizon(ahead: np.ndarray, path: np.ndarray, start: float, until: float, dashes: int = 28) -> np.ndarray:
     """Cut a path into dashes between two look-aheads.
 
     Args:
         ahead: look-ahead of each point, rising, (n,) [s]
         path: positions, (n, 3)
         start, until: where drawing begins, and the horizon where it must end [s]
+        dashes: how many
     Returns:
-        (DASHES, 2, 3); without length where nothing may be claimed any more
+        (dashes, 2, 3); without length where nothing may be claimed any more
     """
-    at = np.linspace(min(max(start, 0.0), until), until, 2 * DASHES)
+    at = np.linspace(min(max(start, 0.0), until), until, 2 * dashes)
     points = np.stack([np.interp(at, ahead, path[:, i]) for i in range(3)], axis=-1)
     return chain(points)[::2]

@@ -70,7 +70,7 @@ class View:
         flock = self.timeline.flock(flock, self.selected, now)
         self.scene.glyphs.draw(flock)
         if tick % (10 if flock.crowd else 2) == 0:
-            self.scene.draw_heads(flock)
+            self.scene.draw_heads(flock, self.selected)
             self.scene.draw_stems(flock)
             self.scene.draw_alerts(flock)
         if tick % 5 == 0 and not self.timeline.player.live:
@@ -105,7 +105,7 @@ class View:
         if place is None or not flock.uavs:
             return
         scene.ground.raise_to(ground)
-        scene.draw_trails(flock)
+        scene.draw_trails(flock, self.selected)
         scene.draw_predicted(flock, now, self.selected if options.tube.value else None)
         scene.predicted.show(options.predicted.value)
         scene.stems.show(options.stems.value)

@@ -28,10 +28,14 @@ class Standing(NamedTuple):
 
 
 def standing(vehicle: Vehicle, palette: Palette, now: float) -> Standing:
-    """Say how a UAV stands: its twin's state, or that its recording is over."""
+    """Say how a UAV stands: its twin's state, what is wrong with it, or that its recording is over."""
     if vehicle.ended:
         return Standing(MARK[Kind.END], "recording ended", palette.event(Kind.END))
     state = vehicle.state(now)
+    if state is not State.LINK_LOST and in_force(vehicle.mismatch):
+        return Standing("▲", "mismatch", palette.mismatch)
+    if state is not State.LINK_LOST and vehicle.alerts:
+        return Standing("▲", next(iter(vehicle.alerts.values())).kind.value.replace("_", " "), palette.mismatch)
     return Standing(GLYPH[state], WORD[state], palette.state(state))
 
 
@@ -74,7 +78,7 @@ def empty(feed: Feed, now: float) -> str:
 
 def summary(fleet: list[Vehicle], feed: Feed, palette: Palette, now: float) -> str:
     """Count the fleet by state, with the median horizon and the measured coverage."""
-    worst = sorted(fleet, key=lambda vehicle: severity(vehicle, now)[1])
+    worst = sorted(fleet, key=lambda vehicle: severity(vehicle, now)[:2])
     chips = "".join(
         f'<span class="chip"><b style="color:{one.colour}">{one.glyph}</b><b>{n}</b>'
         f'<span class="soft">{one.word}</span></span>'
@@ -125,21 +129,23 @@ def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pic
 
 def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, *, on: bool, longest: float) -> str:
     one, horizon, mean = standing(vehicle, palette, now), horizon_s(vehicle), fit(vehicle)
-    warned = bool(vehicle.alerts) or in_force(vehicle.mismatch)
-    colour = palette.mismatch if warned else one.colour
-    glyph = "▲" if warned else one.glyph
     word = f"{one.word} {ago(vehicle.age(now))}" if one.word == WORD[State.LINK_LOST] else one.word
-    if vehicle.mismatch is not None and in_force(vehicle.mismatch):
-        word += f'<br><span style="color:{palette.mismatch}">{escape(short(vehicle.mismatch))}</span>'
-    bar = f'<i><i style="width:{min(horizon / longest, 1) * 100:.0f}%;background:{colour}"></i></i>'
+    bar = f'<i><i style="width:{min(horizon / longest, 1) * 100:.0f}%;background:{one.colour}"></i></i>'
     percent, seconds = "–" if mean is None else f"{mean:.0f}", f"{horizon:.0f} s" if horizon >= CLAIMS_S else "–"
     return (
-        f'<tr class="pick{" on" if on else ""}" data-uav="{vehicle.uav}" onpointerdown="{pick.format(vehicle.uav)}">'
-        f'<td style="color:{colour}">{glyph}</td><td>{vehicle.name}</td>'
+        f'<tr class="pick{" on" if on else ""}" data-uav="{vehicle.uav}" title="{escape(_finding(vehicle))}" '
+        f'onpointerdown="{pick.format(vehicle.uav)}">'
+        f'<td style="color:{one.colour}">{one.glyph}</td><td>{vehicle.name}</td>'
         f'<td style="color:{one.colour}">{word}</td><td class="num">{percent}</td>'
         f'<td><div class="bar">{bar}<span class="num" style="width:30px">{seconds}</span>'
         "</div></td></tr>"
     )
+
+
+def _finding(vehicle: Vehicle) -> str:
+    """Say what is wrong with a UAV, for who rests on its row; not yet escaped."""
+    said = [short(vehicle.mismatch)] if vehicle.mismatch is not None and in_force(vehicle.mismatch) else []
+    return "; ".join([*said, *(alert.sentence[:200] for alert in vehicle.alerts.values())])
 
 
 def alerts(fleet: list[Vehicle], feed: Feed, palette: Palette) -> str:

@@ -103,6 +103,11 @@ class Page:
             "page_errors": len(self.errors),
         }
 
+    def await_pose(self) -> None:
+        """Wait until a new place of the probe is on the screen, as after a restart of the server."""
+        self.page.bring_to_front()
+        self.page.wait_for_function("window.__told.ages.length > 0", timeout=60_000, polling=10)
+
     def clicks(self, n: int) -> dict[str, float]:
         """Select by row clicks; give how long until the panel shows the new one [ms]."""
         took = []
