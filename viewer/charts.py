@@ -5,11 +5,14 @@ from typing import Any
 import numpy as np
 from viser import uplot
 
+from viewer.errors import AHEADS_S, by_ahead, errors
 from viewer.feed import Feed
+from viewer.mismatch import within
 from viewer.palette import Palette
 from viewer.place import UNIT_M
 from viewer.vehicle import Vehicle
 
+AHEAD_S = 5.0  # look-ahead whose error is shown over time [s]
 PAST_S = 60.0  # how far the histories reach back [s]
 
 
@@ -19,14 +22,16 @@ class Charts:
     def __init__(self, gui: Any, palette: Palette) -> None:
         self._gui, p = gui, palette
         two = np.array([0.0, 1.0])
-        self._tube = self._chart(
-            "Band, m",
-            (("along", p.predicting), ("cross", p.verified), ("vertical", p.identifying), ("horizon", p.horizon)),
-            (two,) * 5,
+        self._band = self._chart(
+            "Prediction error against look-ahead, m",
+            (("measured", p.flown), ("band", p.tube), ("horizon", p.horizon)),
+            (two,) * 4,
+        )
+        self._error = self._chart(
+            f"Error {AHEAD_S:.0f} s ahead, m", (("measured", p.muted), ("located mismatch", p.mismatch)), (two,) * 3
         )
         self._fit = self._chart("Mean fit of each verdict, %", (("fit", p.verified),), (two, two))
         self._alt = self._chart("Altitude, m", (("flown", p.flown), ("predicted", p.predicting)), (two,) * 3)
-        self._va = self._chart("Airspeed, m/s", (("Va", p.flown),), (two,) * 2)
 
     def _chart(self, title: str, lines: tuple, data: tuple) -> tuple[Any, Any]:
         legend = " ".join(f'<span style="color:{colour};white-space:nowrap">━ {name}</span>' for name, colour in lines)
@@ -47,10 +52,15 @@ class Charts:
 
     def draw(self, vehicle: Vehicle | None, feed: Feed, now: float) -> None:
         """Replace the data; a chart without any is hidden."""
-        trail = feed.trail(vehicle) if vehicle is not None else np.zeros((0, 5))
-        _put(self._tube, band(vehicle))
-        _put(self._fit, _history(feed.fits(vehicle), 1) if vehicle is not None else None)
-        _put(self._va, _history(trail[np.isfinite(trail[:, 4])], 4))
+        if vehicle is None:
+            for chart in (self._band, self._error, self._fit, self._alt):
+                _put(chart, None)
+            return
+        trail = feed.trail(vehicle)
+        made, off = errors(feed.past(vehicle), trail)
+        _put(self._band, band(vehicle, off))
+        _put(self._error, over_time(made, off, vehicle))
+        _put(self._fit, _history(feed.fits(vehicle), 1))
         _put(self._alt, _altitude(vehicle, trail, now))
 
 
@@ -77,16 +87,42 @@ def scale(y: np.ndarray) -> tuple[float, float]:
     return float(np.floor(low / step) * step), float((np.floor(high / step) + 1) * step)
 
 
-def band(vehicle: Vehicle | None) -> tuple[np.ndarray, ...] | None:
-    """Give half-axes against look-ahead, and an upright line at the horizon: x, along, cross, vertical, horizon."""
+def band(vehicle: Vehicle | None, off: np.ndarray) -> tuple[np.ndarray, ...] | None:
+    """Give the measured error and the band's widest half-axis against look-ahead, and an upright line at the horizon.
+
+    Args:
+        vehicle: whose
+        off: as `errors` gives it, (k, 30) [m]
+    Returns:
+        x [s], measured, band, horizon [m]
+    """
     if vehicle is None or (told := vehicle.forecast) is None:
         return None
-    x = np.sort(np.concatenate([np.linspace(0, told.ahead[-1], 60), [told.until, told.until + 1e-3]]))
-    axes = told.width(x) * UNIT_M
-    at = np.searchsorted(x, [told.until, told.until + 1e-3])
+    last = min(float(told.ahead[-1]), max(1.4 * told.until, 10.0))
+    horizon = [told.until, told.until + 1e-3]
+    x = np.unique(np.concatenate([AHEADS_S[last >= AHEADS_S], np.linspace(0, last, 40), horizon]))
+    wide = told.width(x).max(axis=1) * UNIT_M
+    measured = by_ahead(off)
+    known = np.isfinite(measured)
+    line = np.full(len(x), np.nan)
+    if known.any():
+        ends = AHEADS_S[known][[0, -1]]
+        inside = (x >= ends[0]) & (x <= ends[1])
+        line[inside] = np.interp(x[inside], AHEADS_S[known], measured[known])
     upright = np.full(len(x), np.nan)
-    upright[at] = [0.0, axes[:, :2].max()]
-    return x, axes[:, 0], axes[:, 1], axes[:, 2], upright
+    upright[np.searchsorted(x, horizon)] = [0.0, wide.max()]
+    return x, line, wide, upright
+
+
+def over_time(made: np.ndarray, off: np.ndarray, vehicle: Vehicle) -> tuple[np.ndarray, ...] | None:
+    """Give the error at one look-ahead against seconds ago, and once more where a mismatch was located."""
+    at = int(AHEAD_S - AHEADS_S[0])
+    known = np.isfinite(off[:, at])
+    if known.sum() < 2:
+        return None
+    due, error = made[known] + AHEAD_S, off[known, at]
+    strange = np.where(within(due, vehicle.mismatch), error, np.nan)
+    return due - due[-1], error, strange
 
 
 def _history(rows: np.ndarray, column: int) -> tuple[np.ndarray, ...] | None:

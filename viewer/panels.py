@@ -1,7 +1,6 @@
 """The panels: left the fleet, its alerts and what to show; right the selected UAV."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,23 +8,32 @@ import viser
 
 from viewer.charts import Charts
 from viewer.chronicle import listing
+from viewer.commands import Commands
 from viewer.detail import about, facts
 from viewer.feed import Feed
 from viewer.palette import WORD, Palette, triple
+from viewer.since import Presence, since
 from viewer.states import Router, notices
 from viewer.vehicle import Vehicle
-from viewer.words import alerts, empty, summary, table
+from viewer.words import MAX_ROWS, alerts, empty, legend, severity, summary, table
 
 STALE = "The viewer has stopped sending: this picture is old. Restart it; the page comes back by itself."
-COMMANDS = 50  # UAVs offered in the command palette (Ctrl+K)
+NOBODY = "–"  # of the menu that selects where rows cannot be clicked
 
 
 class Panels:
     """All that is not 3-D, on one page."""
 
-    def __init__(self, client: viser.ClientHandle, palette: Palette, choose: Callable[[int], None]) -> None:
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        palette: Palette,
+        choose: Callable[[int], None],
+        actions: dict[str, Callable[[], None]],
+    ) -> None:
         self._gui, self._palette, self._choose = client.gui, palette, choose
-        self._commands: dict[int, Any] = {}
+        self._presence = Presence(client)
+        self._commands = Commands(client.gui, choose, actions)
         self._beat = False
         self._router = Router()
         self.seek = ""  # the page's code that shows the time of an event
@@ -37,7 +45,7 @@ class Panels:
         self._gui.main_panel.set_width(340)
         css = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
         self._gui.add_html(f"<style>:root{{--muted:{palette.muted}}}{css}</style>")
-        self._banner = self._gui.add_html("")
+        self._banner, self._legend = self._gui.add_html(""), self._gui.add_html("")
         self._build_left()
         self._build_right()
 
@@ -50,8 +58,11 @@ class Panels:
             self._show = gui.add_button_group("Show", ("All", "Alerts", "Selected"))
             self._filter = "All"
             self._table = gui.add_html("")
+            self._menu = gui.add_dropdown("Select", (NOBODY,))
             self._picked = gui.add_text("picked", "", visible=False)
         with tabs.add_tab("Alerts", viser.Icon.ALERT_TRIANGLE):
+            self._since = gui.add_html("")
+            self._read = gui.add_button("I have read it", visible=False)
             self._alerts = gui.add_html("")
         with tabs.add_tab("Display", viser.Icon.ADJUSTMENTS):
             self.predicted = gui.add_checkbox("Predicted paths", True)
@@ -59,8 +70,10 @@ class Panels:
             self.stems = gui.add_checkbox("Altitude stems", True)
             self.tube = gui.add_checkbox("Tube of selected", True)
             self.routes = gui.add_checkbox("Routes of all", False)
-            self.follow = gui.add_checkbox("Follow selected", False)
+            self.follow: Any = gui.add_checkbox("Follow selected", False)
             self.glyph = gui.add_slider("Aircraft size", min=0.5, max=4.0, step=0.1, initial_value=1.0)
+        self._read.on_click(lambda _: self._presence.seen())
+        self._menu.on_update(lambda _: self._pick(self._menu.value.removeprefix("UAV-")))
         self._picked.on_update(lambda _: self._pick(self._picked.value))
         self._show.on_click(lambda _: setattr(self, "_filter", self._show.value))
 
@@ -68,9 +81,9 @@ class Panels:
         panel = self._gui.add_panel()
         with panel.add_tab("Selected", viser.Icon.FOCUS_2):
             self._about = self._gui.add_html("")
+            self._charts = Charts(self._gui, self._palette)
             self._events = self._gui.add_html("")
             self._facts = self._gui.add_html("")
-            self._charts = Charts(self._gui, self._palette)
         panel.dock_right()
         panel.set_width(350)
 
@@ -93,7 +106,12 @@ class Panels:
             self._table.content = table(
                 kept, self._palette, now, total=len(fleet), pick=self._handler(), selected=selected
             )
-        self._alerts.content = alerts(fleet, feed, self._palette)
+            self._list(kept, now)
+        self._legend.content = legend(fleet, self._palette)
+        self._presence.here()
+        self._since.content = since(fleet, self._presence.away, self._palette, self._handler())
+        self._read.visible = bool(self._since.content)
+        self._alerts.content = alerts(fleet, feed, self._palette, self._handler())
         nobody = '<div class="uav soft">Nobody is selected: click a row or an aircraft, or press Ctrl+K.</div>'
         self._about.content = about(chosen, self._palette, now) if chosen is not None else nobody
         self._facts.content = facts(chosen, now) if chosen is not None else ""
@@ -101,7 +119,7 @@ class Panels:
         if told != self._events.content:  # written anew, a list somebody scrolls would jump to its top
             self._events.content = told
         self._charts.draw(chosen, feed, now)
-        self._offer(fleet)
+        self._commands.offer(fleet)
 
     def _passes(self, vehicle: Vehicle, now: float, selected: int | None) -> bool:
         if self._filter == "Alerts" and not vehicle.alerts:
@@ -117,13 +135,8 @@ class Panels:
         message = f"{{{{type:'GuiUpdateMessage',uuid:'{self._picked._impl.uuid}',updates:{{{{value:'{{}}'}}}}}}}}"
         return f"var m=window.__viserMutable;m&&m.sendMessage({message})"
 
-    def _offer(self, fleet: list[Vehicle]) -> None:
-        """Offer the first UAVs in the command palette."""
-        for vehicle in fleet[:COMMANDS]:
-            if vehicle.uav not in self._commands and len(self._commands) < COMMANDS:
-                command = self._gui.add_command(f"Select {vehicle.name}", icon=viser.Icon.DRONE)
-                command.on_trigger(partial(self._on_command, vehicle.uav))
-                self._commands[vehicle.uav] = command
-
-    def _on_command(self, uav: int, _: Any) -> None:
-        self._choose(uav)
+    def _list(self, kept: list[Vehicle], now: float) -> None:
+        """Offer the rows of the table in the menu, too."""
+        names = tuple(v.name for v in sorted(kept, key=lambda v: severity(v, now))[:MAX_ROWS])
+        if self._menu.options != (NOBODY, *names):
+            self._menu.options = (NOBODY, *names)

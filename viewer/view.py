@@ -9,7 +9,7 @@ import numpy as np
 from viewer.callouts import callouts
 from viewer.camera import Camera
 from viewer.feed import Feed
-from viewer.flock import Flock
+from viewer.flock import LOST, MISMATCH, Flock, look
 from viewer.labels import Labels
 from viewer.palette import Palette
 from viewer.panels import Panels
@@ -32,7 +32,7 @@ class View:
         self.client, self._feed, self.palette, self._wake = client, feed, palette, wake
         self.scene = Scene(client.scene, palette, self.choose)
         self.selection, self._labels = Selection(client.scene, palette), Labels(client.scene)
-        self.panels = Panels(client, palette, self.visit)
+        self.panels = Panels(client, palette, self.visit, self._actions())
         self.timeline = Timeline(client, feed, tapes, palette, self._stir)
         self.panels.seek = self.timeline.sender()
         self.camera = Camera(client)
@@ -40,6 +40,7 @@ class View:
         self.dirty = True  # something was chosen that is not drawn yet
         self.offset = 0  # tick of the second at which what is slow is drawn
         self._seen: tuple = ()
+        self._again = False  # frame once more, wherever the camera is
         self._framed = np.zeros((2, 3))  # corners of what the camera was last framed on [10 m]
         self._followed: tuple[int, np.ndarray] | None = None
 
@@ -47,6 +48,30 @@ class View:
         """Have everything drawn at once: another time is shown."""
         self.dirty = True
         self._wake()
+
+    def _actions(self) -> dict[str, Callable[[], None]]:
+        """Give what the command palette does beside selecting."""
+        return {
+            "Show the whole fleet": self.show_all,
+            "Next that needs an eye": self.next_exception,
+            "Follow the selected aircraft, or no longer": self.toggle_follow,
+        }
+
+    def show_all(self) -> None:
+        """Frame everything again, though the camera was moved."""
+        self.panels.follow.value = False
+        self._seen, self._again = (), True
+
+    def next_exception(self) -> None:
+        """Turn to the next UAV that needs an eye, in the order of their ids."""
+        needy = [v.uav for v in self._feed.all() if look(v, time.monotonic()) in (MISMATCH, LOST)]
+        later = [uav for uav in needy if self.selected is None or uav > self.selected]
+        if needy:
+            self.visit((later or needy)[0])
+
+    def toggle_follow(self) -> None:
+        """Follow the selected UAV, or stop."""
+        self.panels.follow.value = not self.panels.follow.value
 
     def choose(self, uav: int) -> None:
         """Select a UAV; it is drawn at once."""
@@ -146,7 +171,8 @@ class View:
         self._framed = np.stack([cloud.min(axis=0), cloud.max(axis=0)])
         if grown:  # it will go on growing: make room, rather than move the picture every second
             cloud = cloud.mean(axis=0) + (cloud - cloud.mean(axis=0)) * [ROOM, ROOM, 1.0]
-        self.camera.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, ground]]))
+        self.camera.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, ground]]), again=self._again)
+        self._again = False
 
     def _follow(self, now: float) -> None:
         vehicle = self.timeline.one(self.selected) if self.panels.follow.value and self.selected is not None else None

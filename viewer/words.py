@@ -6,7 +6,7 @@ from math import isfinite
 from typing import NamedTuple
 
 from fleet.contract import State
-from viewer.datatime import stamp, times
+from viewer.datatime import moment, stamp, times
 from viewer.events import Kind
 from viewer.feed import Feed
 from viewer.mismatch import in_force, short
@@ -103,15 +103,8 @@ def _recording(fleet: list[Vehicle], now: float) -> str:
 
 
 def _fleet_coverage(fleet: list[Vehicle]) -> str:
-    told = [
-        v.prediction
-        for v in fleet
-        if v.prediction is not None and v.prediction.held_n > 0 and isfinite(v.prediction.held)
-    ]
-    n = sum(p.held_n for p in told)
-    if not n:
-        return ""
-    return f" · cov. {sum(p.held * p.held_n for p in told) / n * 100:.0f}/{told[0].quantile * 100:.0f} %"
+    n, held, quantile = held_so_far(fleet)
+    return f" · band held {held * 100:.0f} of {quantile * 100:.0f} %" if n else ""
 
 
 def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pick: str, selected: int | None) -> str:
@@ -148,21 +141,40 @@ def _finding(vehicle: Vehicle) -> str:
     return "; ".join([*said, *(alert.sentence[:200] for alert in vehicle.alerts.values())])
 
 
-def alerts(fleet: list[Vehicle], feed: Feed, palette: Palette) -> str:
-    """List the mismatches and the alerts in force, newest first, at most 50 of each."""
-    found = feed.alerts()
+def alerts(fleet: list[Vehicle], feed: Feed, palette: Palette, pick: str = "") -> str:
+    """List the mismatches and the alerts in force, newest first, at most 50 of each; `pick` as for `table`."""
     strange = [(v, v.mismatch) for v in fleet if v.mismatch is not None and in_force(v.mismatch)]
+    told = [(v, "mismatch", one.t, short(one)) for v, one in sorted(strange, key=lambda one: -one[1].t)[:MAX_ROWS]]
+    found = [(v, kind.value.replace("_", " "), a.t, a.sentence) for v, kind, a in feed.alerts()[:MAX_ROWS]]
     cards = "".join(
-        f'<div class="say" style="border-color:{palette.mismatch}"><b>▲ {vehicle.name}</b> '
-        f'<span class="soft">mismatch</span><br>{escape(short(told))}</div>'
-        for vehicle, told in sorted(strange, key=lambda one: -one[1].t)[:MAX_ROWS]
-    )
-    cards += "".join(
-        f'<div class="say" style="border-color:{palette.mismatch}"><b>▲ {vehicle.name}</b> '
-        f'<span class="soft">{escape(kind.value.replace("_", " "))}</span><br>{escape(alert.sentence[:300])}</div>'
-        for vehicle, kind, alert in found[:MAX_ROWS]
+        f'<div class="say pick" style="border-color:{palette.mismatch}" onpointerdown="{pick.format(vehicle.uav)}">'
+        f'<b>▲ {vehicle.name}</b> <span class="soft">{escape(kind)}</span>'
+        f'<span class="soft when">{moment(t)}</span><br>{escape(text[:300])}</div>'
+        for vehicle, kind, t, text in [*told, *found]
     )
     return f'<div class="uav">{cards or "<div class=soft>No alert is in force.</div>"}</div>'
+
+
+def legend(fleet: list[Vehicle], palette: Palette) -> str:
+    """Say what the lines mean and how often the band held, measured: it stays on the screen whatever else is shown."""
+    n, held, quantile = held_so_far(fleet)
+    said = f"held {held * 100:.0f} %, n = {n:,}".replace(",", " ") if n else "not measured yet"
+    parts = (
+        f'<i class="line" style="background:{palette.flown}"></i>flown',
+        f'<i class="line dash" style="color:{palette.ink}"></i>predicted',
+        f'<i class="band" style="background:{palette.tube}"></i>{quantile * 100:.0f} % band: <b>{said}</b>',
+        f'<i class="ring" style="border-color:{palette.horizon}"></i>horizon: error reaches 10 %',
+        f'<i class="line dash" style="color:{palette.muted}"></i>beyond it nothing is claimed',
+    )
+    return f'<div class="legend">{"".join(f"<span>{part}</span>" for part in parts)}</div>'
+
+
+def held_so_far(fleet: list[Vehicle]) -> tuple[int, float, float]:
+    """Give how many predictions were answered, the share of them inside the band, and the share it is meant to hold."""
+    told = [v.prediction for v in fleet if v.prediction is not None]
+    sure = [p for p in told if p.held_n > 0 and isfinite(p.held)]
+    n = sum(p.held_n for p in sure)
+    return n, sum(p.held * p.held_n for p in sure) / n if n else 0.0, told[0].quantile if told else 0.9
 
 
 def ago(seconds: float) -> str:
