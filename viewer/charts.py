@@ -58,20 +58,24 @@ class Charts:
             return
         trail = feed.trail(vehicle)
         made, off = errors(feed.past(vehicle), trail)
-        _put(self._band, band(vehicle, off))
-        _put(self._error, over_time(made, off, vehicle))
+        _put(self._band, band(vehicle, off), from_zero=True)
+        _put(self._error, over_time(made, off, vehicle), from_zero=True)
         _put(self._fit, _history(feed.fits(vehicle), 1))
         _put(self._alt, _altitude(vehicle, trail, now))
 
 
-def _put(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None) -> None:
+def _put(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None, *, from_zero: bool = False) -> None:
     """Show data, x first. The y scale is given: a gap (not a number) would spoil the chart's own."""
     for part in chart:
         part.visible = data is not None
     if data is None:
         return
+    zero = [np.zeros(1)] if from_zero else []
     x0, x1 = np.floor(data[0][0] / 10) * 10, np.ceil(data[0][-1] / 10) * 10
-    scales = {"x": {"time": False, "range": (float(x0), float(x1))}, "y": {"range": scale(np.concatenate(data[1:]))}}
+    scales = {
+        "x": {"time": False, "range": (float(x0), float(x1))},
+        "y": {"range": scale(np.concatenate([*data[1:], *zero]))},
+    }
     if chart[1].scales != scales:  # a new scale builds the chart anew: rarely, please
         chart[1].scales = scales
     chart[1].data = data

@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 
 from viewer.flock import LOST, MISMATCH, Flock
+from viewer.labels import Sight
 from viewer.palette import Palette, mesh_colour, rgb
 from viewer.shapes import aircraft, dart, rotorcraft
 
-SHARE, CROWD_SHARE = 0.035, 0.016  # of the height of the picture that an aircraft spans in its middle [-]
+SHARE, LEAST_SHARE = 0.042, 0.016  # of the height of the picture that an aircraft spans in its middle [-]
+FEW = 60  # in view, up to which aircraft are as large as that; of more each is smaller
 NEARNESS = 0.5  # 1: all look equally large, however far; 0: as perspective has it [-]
 EXCEPTION, CHOSEN = 1.7, 1.25  # how much larger who needs an eye in a crowd, and who is selected
 QUIET = 0.62  # in a crowd the colour of who is well is so much its own, the rest the ground's [-]
@@ -36,20 +38,22 @@ class Glyphs:
             batch.batched_positions = flock.at[rows]
             batch.batched_wxyzs = flock.quat[rows]
 
-    def look(self, flock: Flock, *, selected: int | None, eye: np.ndarray, look_at: np.ndarray, size: float) -> None:
+    def look(self, flock: Flock, sight: Sight, *, selected: int | None, size: float) -> None:
         """Colour and size them; call it a few times a second.
 
         Args:
             flock: who is drawn
+            sight: what the camera sees
             selected: the UAV of this page
-            eye, look_at: where the camera is and looks, (3,) [10 m]
             size: as the operator wishes, 1 is usual [-]
         """
         if not self._batches or not len(flock.looks):
             return
-        middle = float(np.linalg.norm(look_at - eye)) or 1.0
-        self.unit = size * middle * (CROWD_SHARE if flock.crowd else SHARE)
-        away = np.linalg.norm(flock.at - eye, axis=1) / middle
+        middle = float(np.linalg.norm(sight.look_at - sight.eye)) or 1.0
+        spots, depth = sight.project(flock.at)
+        seen = int(((depth > 0) & (np.abs(spots) < [sight.aspect / 2, 0.5]).all(axis=1)).sum())
+        self.unit = size * middle * max(SHARE * min(1.0, FEW / max(seen, 1)) ** 0.5, LEAST_SHARE)
+        away = np.linalg.norm(flock.at - sight.eye, axis=1) / middle
         scale = self.unit * np.clip(away, 0.05, 20.0) ** NEARNESS
         if flock.crowd:
             scale = np.where(flock.exceptions, EXCEPTION * scale, scale)

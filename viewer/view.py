@@ -109,7 +109,7 @@ class View:
         flock = self.timeline.flock(flock, self.selected, now)
         sight, scene = self.camera.sight(), self.scene
         size = self.panels.glyph.value
-        scene.glyphs.look(flock, selected=self.selected, eye=sight.eye, look_at=sight.look_at, size=size)
+        scene.glyphs.look(flock, sight, selected=self.selected, size=size)
         chosen = self.timeline.one(self.selected) if self.selected is not None else None
         if chosen is None:
             self.selection.clear()

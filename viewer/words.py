@@ -104,7 +104,7 @@ def _recording(fleet: list[Vehicle], now: float) -> str:
 
 def _fleet_coverage(fleet: list[Vehicle]) -> str:
     n, held, quantile = held_so_far(fleet)
-    return f" · band held {held * 100:.0f} of {quantile * 100:.0f} %" if n else ""
+    return f" · cov. {held * 100:.0f}/{quantile * 100:.0f} %" if n else ""
 
 
 def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pick: str, selected: int | None) -> str:
@@ -158,7 +158,7 @@ def alerts(fleet: list[Vehicle], feed: Feed, palette: Palette, pick: str = "") -
 def legend(fleet: list[Vehicle], palette: Palette) -> str:
     """Say what the lines mean and how often the band held, measured: it stays on the screen whatever else is shown."""
     n, held, quantile = held_so_far(fleet)
-    said = f"held {held * 100:.0f} %, n = {n:,}".replace(",", " ") if n else "not measured yet"
+    said = f"held {held * 100:.0f} %, n = {n}" if n else "not measured yet"
     parts = (
         f'<i class="line" style="background:{palette.flown}"></i>flown',
         f'<i class="line dash" style="color:{palette.ink}"></i>predicted',
