@@ -22,6 +22,7 @@ from viewer.view import IN_VIEW_M, View, near
 
 TICK_S = 0.1
 SECOND = 10  # ticks of a second
+MOST_CLOSE = 50  # UAVs of a crowd that need an eye and are read every time
 SLOW_S = 10.0  # how often what is missing is asked for again [s]
 
 
@@ -111,7 +112,9 @@ class App:
         if not self.flock.uavs:
             self.flock.meet(fleet, now)
             self.flock.pose(self.feed, now)
-        self.feed.inbox.keen = frozenset(v.selected for v in self.views.values() if v.selected is not None)
+        needy = [self.flock.uavs[i] for i in np.flatnonzero(self.flock.exceptions)[:MOST_CLOSE]]
+        chosen = [view.selected for view in self.views.values() if view.selected is not None]
+        self.feed.inbox.keen = frozenset((*needy, *chosen))
         played = [(v, rows) for v in fleet if v.recorded and len(rows := self.feed.track(v))]
         self.flock.beat({v.uav: placed(rows, v.t - MINUTE, np.inf) for v, rows in played})
         self.flock.meet(fleet, now)

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -101,9 +101,9 @@ class Feed:
         else:
             self._counts["strange"] += 1
 
-    def _read(self, uav: int | None = None) -> None:
-        """Read what was put aside, or what of it is of one UAV; the lock is held."""
-        for payload, now in self.inbox.take(uav):
+    def _read(self, uavs: Iterable[int] | None = None) -> None:
+        """Read what was put aside, or what of it is of some UAVs; the lock is held."""
+        for payload, now in self.inbox.take(uavs):
             try:
                 sample = decode(Sample, payload)
             except ValueError:
@@ -145,11 +145,13 @@ class Feed:
     def poses(self, uavs: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
         """Give where some UAVs are and how they are turned: scene ENU [10 m], phi theta psi [rad], two (n, 3).
 
+        What was put aside of others is left there.
+
         A place that nobody told is not a number.
         """
         nowhere = np.full(3, np.nan)
         with self.lock:
-            self._read()
+            self._read(uavs if self.inbox.crowd else None)
             found = [self._vehicles[uav] for uav in uavs]
             places = [one.at if one.at is not None else nowhere for one in found]
             return np.array(places).reshape(-1, 3), np.array([one.attitude for one in found]).reshape(-1, 3)
@@ -157,7 +159,7 @@ class Feed:
     def one(self, uav: int) -> Vehicle | None:
         """Copy one UAV; None where it was never heard of."""
         with self.lock:
-            self._read(uav if self.inbox.crowd else None)
+            self._read((uav,) if self.inbox.crowd else None)
             found = self._vehicles.get(uav)
             return found.still(self._clock()) if found is not None else None
 

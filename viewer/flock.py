@@ -12,7 +12,7 @@ from viewer.vehicle import Vehicle
 CHUNKS, STEPS = 5, 12  # the trail: chunks of 12 s, and a head of up to 12 s, one point a second
 MINUTE = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # how long ago each point of the trail is, (73,) [s]
 COARSE = ((60, 1), (CROWD, 2))  # of a fleet up to so many, seconds between the drawn points of a trail; else 4
-READ_S = 0.35  # how often the places of a crowd are read [s]
+READ_S = 0.55  # how often the places of a crowd are read [s]
 FASTEST = 30.0  # what went faster has leapt [10 m/s]
 LEAP_M = 1_000.0  # farther within a second is no flight but another one (a recording begun anew): a new trail [m]
 HOVER = ("multirotor", "helicopter")  # kinds of vehicle drawn with rotors
@@ -67,7 +67,7 @@ class Flock:
     @property
     def chunks(self) -> int:
         """Give how many closed chunks of trail are drawn."""
-        return 2 if self.crowd else CHUNKS
+        return CHUNKS if len(self.uavs) <= COARSE[0][0] else 2 if self.crowd else 3
 
     @property
     def exceptions(self) -> np.ndarray:
@@ -105,13 +105,18 @@ class Flock:
     def pose(self, feed: Feed, now: float) -> None:
         """Take over where everybody is; call it as often as the picture moves.
 
-        In a crowd places are read every `READ_S`; in between everybody goes on as before.
+        In a crowd places are read every `READ_S`, in between everybody goes on as before; of who needs an eye or is
+        selected they are read every time.
         """
         if not self.uavs:
             return
         since = now - self._read[0]
         if self.crowd and since < READ_S and len(self._read[1]) == len(self.uavs):
             self.at = self._read[1] + self._read[2] * since
+            if close := [i for uav in sorted(feed.inbox.keen) if (i := self._rows.get(uav)) is not None]:
+                places, turns = feed.poses(tuple(self.uavs[i] for i in close))
+                self.at[close] = np.where(np.isfinite(places), places, self.at[close])
+                self.quat[close] = scene_quat(*turns.T)
             return
         places, turns = feed.poses(self.uavs)
         heard = np.isfinite(places[:, 0])

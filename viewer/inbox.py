@@ -1,6 +1,7 @@
 """Samples not yet read: of a small fleet every one, in a crowd the newest of each, and all with news of the mission."""
 
 import threading
+from collections.abc import Iterable
 
 import msgspec
 
@@ -50,12 +51,12 @@ class Inbox:
             else:
                 held[-1] = payload, now
 
-    def take(self, uav: int | None = None) -> list[Letter]:
-        """Empty it, or take out what is of one UAV: letters of each in the order they came."""
+    def take(self, uavs: Iterable[int] | None = None) -> list[Letter]:
+        """Empty it, or take out what is of some UAVs: letters of each in the order they came."""
         if not self._letters:
             return []
         with self._lock:
-            if uav is not None:
-                return self._letters.pop(uav, [])
+            if uavs is not None:
+                return [letter for uav in uavs for letter in self._letters.pop(uav, ())]
             letters, self._letters = self._letters, {}
         return [letter for held in letters.values() for letter in held]

@@ -13,7 +13,7 @@ from viewer.routes import NOTHING, Route, circle
 from viewer.strokes import Strokes, chain, dash_lines, faded
 from viewer.vehicle import Vehicle
 
-DASHES, FEW = 28, 60  # dashes of one predicted path, half as many where there are more UAVs than a few
+DASHES, FEW = 28, 60  # dashes of one predicted path; half as many, and no feet, where there are more than a few
 ALERT_DASHES = 18  # dashes of the ring on the ground under who needs an eye
 
 
@@ -84,10 +84,10 @@ class Scene:
         if flock.crowd or not flock.uavs:
             return self.stems.draw(NOTHING.legs)
         foot = flock.at * [1, 1, 0] + [0, 0, self.ground.height + 0.05]
-        hexagon = circle(np.zeros(3), 0.3 * self.glyphs.unit, 6)
+        hexagon = circle(np.zeros(3), 0.3 * self.glyphs.unit, 6)[: 6 if len(flock.uavs) <= FEW else 0]
         lines = np.concatenate([np.stack([flock.at, foot], axis=1)[:, None], foot[:, None, None] + hexagon], axis=1)
         tints = np.array([mix(colour, self._palette.ground, 0.5) for colour in self._palette.looks()])
-        self.stems.draw(lines.reshape(-1, 2, 3), np.repeat(tints[flock.looks], 7, axis=0))
+        self.stems.draw(lines.reshape(-1, 2, 3), np.repeat(tints[flock.looks], lines.shape[1], axis=0))
 
     def draw_alerts(self, flock: Flock) -> None:
         """Ring the ground under who needs an eye, with a stem up to the aircraft; lost links only in a small fleet."""

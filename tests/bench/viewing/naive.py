@@ -12,7 +12,7 @@ import numpy as np
 import viser
 
 from fleet.bus import connect
-from viewer.app import quiet
+from viewer.door import quiet
 from viewer.feed import Feed
 from viewer.place import scene_quat
 from viewer.shapes import aircraft
