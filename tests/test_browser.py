@@ -6,28 +6,27 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from cable import Cable
 from conftest import ROOT, unused_port
 from pretend_feed import HOSTILE, PretendFleet
 
 from fleet.bus import connect, open_router
+from fleet.contract import Array, Rows, Sample
 
 pytestmark = pytest.mark.browser
-UAVS, EVIL = 20, 3
-ARGS = [
-    "--headless=new",
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--no-first-run",
-]
+UAVS, EVIL, LONG, NOWHERE, ABROAD = 20, 3, 17, 18, 19
+PLAIN = ["--headless=new", "--no-sandbox", "--disable-background-networking", "--disable-component-update"]
+PLAIN += ["--no-first-run"]
+ARGS = [*PLAIN, "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 IN_SCENE = "window.__viserMutable && window.__viserMutable.nodeRefFromName['/fleet/vehicles']"
 NODES = "Object.keys(window.__viserMutable.nodeRefFromName).length"
 SHOWN = "name => [...document.querySelectorAll('.uav .head h1')].some(e => e.textContent === name)"
@@ -44,6 +43,32 @@ PROJECT = """n => {
 }"""
 
 
+BANNER = "state => [...document.querySelectorAll('.stale')].some(e => getComputedStyle(e).visibility === state)"
+FRAMES = """ms => new Promise(done => {
+  const times = []; let last = performance.now(), until = last + ms;
+  const step = now => { times.push(now - last); last = now; now < until ? requestAnimationFrame(step) : done(times); };
+  requestAnimationFrame(step);
+})"""
+
+
+def odd(fleet: PretendFleet) -> PretendFleet:
+    """Make three of them odd: ten thousand letters of status, no sound position, another continent."""
+
+    def misplaced(make, lat: float, lon: float, alt: float):
+        def sample(t0: float, t: float) -> Sample:
+            good = make(t0, t)
+            n = len(good.position.t.numpy())
+            x = Array.of(np.tile([lat, lon, alt], (n, 1)), "<f8")
+            return msgspec.structs.replace(good, position=Rows(t=good.position.t, x=x))
+
+        return sample
+
+    fleet.uavs[LONG].text = "y" * 10_000
+    fleet.uavs[NOWHERE].sample = misplaced(fleet.uavs[NOWHERE].sample, np.nan, np.nan, np.nan)
+    fleet.uavs[ABROAD].sample = misplaced(fleet.uavs[ABROAD].sample, -338_600_000, 1_512_000_000, 90_000)
+    return fleet
+
+
 class Viewer:
     """The viewer process under test."""
 
@@ -58,6 +83,11 @@ class Viewer:
         line = self.process.stdout.readline().decode()
         assert line == f"viewer: http://127.0.0.1:{self.port}\n", line + self.process.stdout.read().decode()
 
+    def cpu_s(self) -> float:
+        """Give the processor time it has used [s]."""
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
     def kill(self) -> None:
         self.process.kill()
         self.process.communicate(timeout=10)
@@ -69,7 +99,7 @@ def router() -> Iterator[str]:
     address, stop = f"tcp/127.0.0.1:{unused_port()}", threading.Event()
     session = open_router(address)
     with connect(address) as bus:
-        fleet = PretendFleet(bus, UAVS, hostile=EVIL)
+        fleet = odd(PretendFleet(bus, UAVS, hostile=EVIL))
 
         def publish() -> None:
             while not stop.wait(0.1):
@@ -91,12 +121,19 @@ def viewer(router: str) -> Iterator[Viewer]:
 
 
 @pytest.fixture(scope="module")
+def cable(viewer: Viewer) -> Iterator[Cable]:
+    one = Cable(viewer.port)
+    yield one
+    one.close()
+
+
+@pytest.fixture(scope="module")
 def errors() -> list[str]:
     return []
 
 
 @pytest.fixture(scope="module")
-def page(chromium: str, viewer: Viewer, errors: list[str], tmp_path_factory: pytest.TempPathFactory) -> Iterator:
+def page(chromium: str, cable: Cable, errors: list[str], tmp_path_factory: pytest.TempPathFactory) -> Iterator:
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -109,7 +146,7 @@ def page(chromium: str, viewer: Viewer, errors: list[str], tmp_path_factory: pyt
         )
         one = context.pages[0]
         one.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
-        one.goto(f"http://127.0.0.1:{viewer.port}/?fixedDpr=0.5")
+        one.goto(f"http://127.0.0.1:{cable.port}/?fixedDpr=0.5")
         one.wait_for_function(IN_SCENE, timeout=30_000)
         yield one
         context.close()
@@ -199,18 +236,60 @@ def test_hostile_words_stay_words(page, errors: list[str]) -> None:
     assert errors == []
 
 
+def test_letters_without_end_and_places_that_are_none_break_nothing(page, errors: list[str]) -> None:
+    for uav, words in ((LONG, "y" * 400), (ABROAD, "km from the fleet's first"), (NOWHERE, "mean fit")):
+        page.locator(f'tr[data-uav="{uav}"]').click()
+        selected(page, f"UAV-{uav:03d}")
+        page.locator(".uav .say", has_text=words).first.wait_for(timeout=8_000)
+    assert max(page.evaluate("[...document.querySelectorAll('.uav .say')].map(e => e.innerText.length)")) < 700
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth") and errors == []
+
+
+def test_another_time_is_shown_and_now_again(page, errors: list[str]) -> None:
+    page.get_by_role("button", name="Pause").click()
+    page.get_by_text("Not live: this is").wait_for(timeout=8_000)
+    bar = page.locator(".strip").bounding_box()
+    page.mouse.click(bar["x"] + 0.5 * bar["width"], bar["y"] + 0.5 * bar["height"])
+    page.get_by_text("before the newest · paused").wait_for(timeout=8_000)
+    page.get_by_text("predicted").first.wait_for(timeout=8_000)
+    then = page.locator(".time b.now").inner_text()
+    page.get_by_role("button", name="1 s ▸").click()
+    page.wait_for_function("then => document.querySelector('.time b.now').innerText > then", arg=then, timeout=8_000)
+    page.get_by_role("button", name="4×").click()
+    page.get_by_text("playing 4×").wait_for(timeout=8_000)
+    page.get_by_role("button", name="● Live").click()
+    page.wait_for_function("!document.querySelector('.then')", timeout=8_000)
+    assert page.evaluate(NODES) <= 48 and errors == []
+
+
+def test_what_it_costs(page, viewer: Viewer, cable: Cable, record_property) -> None:
+    """Bound the bytes of a tick; processor and frame time are told, they are the machine's."""
+    bytes_, cpu_s, began = cable.received, viewer.cpu_s(), time.monotonic()
+    frames = page.evaluate(FRAMES, 3_000)
+    passed = time.monotonic() - began
+    per_tick, share = (cable.received - bytes_) / passed / 10, (viewer.cpu_s() - cpu_s) / passed
+    record_property("bytes_per_tick", round(per_tick))
+    record_property("server_cpu", round(share, 3))
+    record_property("frame_ms", round(float(np.median(frames)), 1))
+    print(f"{per_tick / 1e3:.1f} kB a tick, server {share:.1%} of a core, frame {np.median(frames):.0f} ms, median")
+    assert 0 < per_tick <= 60_000
+
+
+def test_a_pulled_cable_is_announced_and_the_page_comes_back(page, cable: Cable) -> None:
+    cable.pull()
+    page.wait_for_function(BANNER, arg="visible", timeout=12_000)
+    cable.put_back()
+    page.bring_to_front()
+    page.wait_for_function(f"!({BANNER})('visible')", timeout=20_000)
+    page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=10_000)
+
+
 def test_a_killed_server_is_announced_and_comes_back(page, viewer: Viewer) -> None:
     viewer.kill()
-    page.wait_for_function(
-        "[...document.querySelectorAll('.stale')].some(e => getComputedStyle(e).visibility === 'visible')",
-        timeout=12_000,
-    )
+    page.wait_for_function(BANNER, arg="visible", timeout=12_000)
     viewer.start()
     page.bring_to_front()
-    page.wait_for_function(
-        "[...document.querySelectorAll('.stale')].every(e => getComputedStyle(e).visibility === 'hidden')",
-        timeout=20_000,
-    )
+    page.wait_for_function(f"!({BANNER})('visible')", timeout=20_000)
     page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=10_000)
     page.locator('tr[data-uav="9"]').dispatch_event("pointerdown")
     selected(page, "UAV-009")
@@ -230,6 +309,14 @@ def test_an_empty_page_says_what_it_waits_for(page) -> None:
         rest, _ = other.process.communicate(timeout=15)
         session.close()
     assert (other.process.returncode, rest) == (0, b"")
+
+
+def test_without_webgl_the_page_says_so(chromium: str, viewer: Viewer) -> None:
+    with tempfile.TemporaryDirectory() as profile:
+        command = [chromium, *PLAIN, f"--user-data-dir={profile}", "--disable-3d-apis", "--disable-gpu"]
+        command += ["--virtual-time-budget=4000", "--dump-dom", f"http://127.0.0.1:{viewer.port}/"]
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert "display: flex" in ended.stdout and "it has no WebGL 2" in ended.stdout
 
 
 def test_a_taken_port_is_a_sentence(router: str, free_port: int) -> None:

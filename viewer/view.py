@@ -108,6 +108,7 @@ class View:
         """Draw the selected UAV, size everybody for where the camera is, and label."""
         flock = self.timeline.flock(flock, self.selected, now)
         sight, scene = self.camera.sight(), self.scene
+        scene.glyphs.draw(flock)  # at another time others may be there
         size = self.panels.glyph.value
         scene.glyphs.look(flock, sight, selected=self.selected, size=size)
         chosen = self.timeline.one(self.selected) if self.selected is not None else None

@@ -28,7 +28,7 @@ class Panel:
             transport = gui.add_button_group("Replay", TRANSPORT)
             steps = gui.add_button_group("Step", STEPS)
             self._words = gui.add_html("")
-        panel.float(x=40, y=-14, width=600)
+        panel.float(x=12, y=-14, width=556)
         self._asked.on_update(lambda _: asked(self._asked.value))
         transport.on_click(lambda _: asked(transport.value))
         steps.on_click(lambda _: asked(steps.value))
