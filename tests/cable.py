@@ -13,7 +13,8 @@ class Cable:
         self._ends: list[socket.socket] = []
         self._door = socket.create_server(("127.0.0.1", 0))
         self.port = self._door.getsockname()[1]
-        threading.Thread(target=self._accept, daemon=True).start()
+        self._acceptor = threading.Thread(target=self._accept, daemon=True)
+        self._acceptor.start()
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):  # closed
@@ -28,8 +29,14 @@ class Cable:
                     continue
                 far.settimeout(None)
                 self._ends += [near, far]
-                for ends in ((near, far, False), (far, near, True)):
-                    threading.Thread(target=self._pump, args=ends, daemon=True).start()
+                threading.Thread(target=self._carry, args=(near, far), daemon=True).start()
+
+    def _carry(self, near: socket.socket, far: socket.socket) -> None:
+        with near, far:
+            back = threading.Thread(target=self._pump, args=(near, far, False), daemon=True)
+            back.start()
+            self._pump(far, near, True)
+            back.join()
 
     def _pump(self, source: socket.socket, sink: socket.socket, counted: bool) -> None:
         with contextlib.suppress(OSError):
@@ -55,4 +62,6 @@ class Cable:
     def close(self) -> None:
         """Pull it for good."""
         self.pull()
+        self._door.shutdown(socket.SHUT_RDWR)
         self._door.close()
+        self._acceptor.join()
