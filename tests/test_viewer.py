@@ -23,7 +23,7 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin, body_to_ned, to_geodetic
-from viewer.camera import FOV, frame
+from viewer.camera import FOV, frame, near
 from viewer.charts import band, scale
 from viewer.chronicle import listing
 from viewer.detail import about, facts, law, why
@@ -34,7 +34,7 @@ from viewer.routes import route
 from viewer.scene import DASHES, cut_at_horizon
 from viewer.shapes import aircraft, diamond, rotorcraft
 from viewer.tube import curtain, marks, rings, skin
-from viewer.view import ROOM, near, outgrown
+from viewer.view import ROOM, outgrown
 from viewer.words import empty, summary, table
 
 

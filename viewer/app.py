@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from fleet.bus import Bus
-from viewer.camera import start_at
+from viewer.camera import IN_VIEW_M, near, start_at
 from viewer.feed import Feed
 from viewer.flock import MINUTE, Flock
 from viewer.palette import DARK, LIGHT
@@ -18,7 +18,7 @@ from viewer.selected import BEYOND_S
 from viewer.timeline.tapes import Tapes
 from viewer.track import placed
 from viewer.vehicle import Vehicle
-from viewer.view import IN_VIEW_M, View, near
+from viewer.view import View
 
 TICK_S = 0.1
 SECOND = 10  # ticks of a second

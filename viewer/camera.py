@@ -7,6 +7,7 @@ import numpy as np
 from viewer.labels import Sight
 
 FOV = np.radians(50.0)  # vertical field of view [rad]
+IN_VIEW_M = 20_000.0  # what is farther from the middle of the fleet is not framed [m]
 CLOSEST = 5.0  # no nearer, however little there is to see [10 m]
 VIEW = (np.radians(-125.0), np.radians(38.0))  # where the camera stands: azimuth from east, elevation [rad]
 
@@ -40,6 +41,12 @@ def frame(points: np.ndarray, aspect: float, margin: float = 1.1) -> tuple[np.nd
 
 def _middle(x: np.ndarray) -> float:
     return float(x.min() + x.max()) / 2
+
+
+def near(points: np.ndarray, reach: float) -> np.ndarray:
+    """Keep the points (n, 3) within `reach` of the most central one: never none [10 m]."""
+    centre = points[np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1))]
+    return points[np.linalg.norm(points - centre, axis=1) < reach]
 
 
 class Camera:

@@ -5,9 +5,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import viser
 
 from viewer.callouts import callouts
-from viewer.camera import Camera
+from viewer.camera import IN_VIEW_M, Camera, near
+from viewer.export.panel import Export
 from viewer.feed import Feed
 from viewer.flock import LOST, MISMATCH, Flock, look
 from viewer.labels import Labels
@@ -22,7 +24,6 @@ from viewer.timeline.tapes import Tapes
 
 NEAR_M = 800.0  # items of the route within this are shown with an aircraft one turns to [m]
 ROOM = 1.35  # how much more than what was flown is framed, while it grows [-]
-IN_VIEW_M = 20_000.0  # what is farther from the middle of the fleet is not framed [m]
 
 
 class View:
@@ -35,6 +36,8 @@ class View:
         self.panels = Panels(client, palette, self.visit, self._actions())
         self.timeline = Timeline(client, feed, tapes, palette, self._stir)
         self.panels.seek = self.timeline.sender()
+        with self.timeline.tab("Export", viser.Icon.DOWNLOAD):
+            Export(client, feed, tapes, palette, lambda: self.selected)
         self.camera = Camera(client)
         self.selected: int | None = None
         self.dirty = True  # something was chosen that is not drawn yet
@@ -184,12 +187,6 @@ class View:
         if self._followed is not None and self._followed[0] == vehicle.uav:
             self.camera.follow(at - self._followed[1])
         self._followed = vehicle.uav, at
-
-
-def near(points: np.ndarray, reach: float) -> np.ndarray:
-    """Keep the points (n, 3) within `reach` of the most central one: never none [10 m]."""
-    centre = points[np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1))]
-    return points[np.linalg.norm(points - centre, axis=1) < reach]
 
 
 def outgrown(cloud: np.ndarray, framed: np.ndarray) -> bool:

@@ -10,16 +10,14 @@ import numpy as np
 from viewer.datatime import stamp
 from viewer.events import Event
 from viewer.feed import Feed
-from viewer.flock import MINUTE, Flock
+from viewer.flock import Flock
 from viewer.palette import Palette
-from viewer.place import scene_quat
 from viewer.timeline import strip
 from viewer.timeline.after import After
 from viewer.timeline.panel import Panel
-from viewer.timeline.past import Past, as_it_was
+from viewer.timeline.past import Past, as_it_was, remember
 from viewer.timeline.player import Player, Span, last_before, next_after
 from viewer.timeline.tapes import Tapes
-from viewer.track import placed
 from viewer.vehicle import Vehicle
 
 SNAP = 0.008  # of the bar: a press this near to an event means the event
@@ -69,15 +67,7 @@ class Timeline:
     def _remember(self, fleet: list[Vehicle], t: float, now: float) -> None:
         """Make the fleet of a time gone by."""
         found = [past for one in fleet if one.uav in self._tapes.of and (past := self._past(one, t)) is not None]
-        then = self._then
-        then.meet(list(found), now)
-        shown = [past for past in found if then.index(past.uav) is not None]
-        then.at = np.array([past.where(now) for past in shown]).reshape(-1, 3)
-        then.quat = scene_quat(*np.array([past.attitude for past in shown]).reshape(-1, 3).T)
-        minute = [placed(past.tape.path(past.then - MINUTE[0], past.t), past.then - MINUTE, np.inf) for past in shown]
-        then.ring = np.array([np.where(np.isfinite(r), r, a) for r, a in zip(minute, then.at, strict=True)])
-        then.ring = then.ring.reshape(-1, len(MINUTE), 3)
-        then.changes, then.beats = min(then.changes, 0) - 1, 0  # other than those of now, and other every time
+        remember(self._then, found, now)
 
     def _measure(self, fleet: list[Vehicle], selected: int | None) -> None:
         """Find what can be shown, on the clock of the selected UAV."""
@@ -89,6 +79,10 @@ class Timeline:
         self._span, self._shift = self._tapes.measure(taped[self._lead], list(taped.values()))
 
     # --- being asked ---
+
+    def tab(self, label: str, icon: Any) -> Any:
+        """Give another tab beside the timeline, to be filled in a `with` statement."""
+        return self._panel.window.add_tab(label, icon)
 
     def sender(self) -> str:
         """Give the page's code that shows the time in its place `{}`."""

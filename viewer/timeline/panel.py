@@ -22,7 +22,7 @@ class Panel:
         self._gui, self._palette = gui, palette
         self._asked = gui.add_text("asked", "", visible=False)
         self._banner = gui.add_html("")
-        panel = gui.add_panel()
+        self.window = panel = gui.add_panel()
         with panel.add_tab("Timeline", viser.Icon.CLOCK_PLAY):
             self._bar = gui.add_html("")
             transport = gui.add_button_group("Replay", TRANSPORT)

@@ -8,9 +8,12 @@ import numpy as np
 from fleet.contract import FleetRow, State
 from viewer.datatime import DataTime
 from viewer.events import Event
+from viewer.flock import MINUTE, Flock
 from viewer.forecast import Forecast
+from viewer.place import UNIT_M, scene_quat
 from viewer.timeline.stood import Stood
 from viewer.timeline.tape import Tape
+from viewer.track import placed
 from viewer.vehicle import Vehicle
 
 TRAIL_S = 90.0  # of the fine trail [s]
@@ -117,7 +120,7 @@ def _figures(vehicle: Vehicle, row: np.ndarray, how: Stood, told: Forecast | Non
         status = msgspec.structs.replace(status, mode=how.mode, armed=how.armed, link=how.link, sentence=how.sentence)
     return {
         "at": row[:3],
-        "alt_m": vehicle.alt_m + (row[2] - vehicle.at[2]) * 10.0 if vehicle.at is not None else np.nan,
+        "alt_m": vehicle.alt_m + (row[2] - vehicle.at[2]) * UNIT_M if vehicle.at is not None else np.nan,
         "attitude": tuple(float(angle) for angle in row[3:6]),
         "Va": float(row[6]),
         "status": status,
@@ -131,3 +134,15 @@ def _figures(vehicle: Vehicle, row: np.ndarray, how: Stood, told: Forecast | Non
         ),
         "ended": False,
     }
+
+
+def remember(flock: Flock, pasts: list[Past], now: float) -> None:
+    """Make a flock that of a time gone by; `now` is monotonic [s]."""
+    flock.meet(list(pasts), now)
+    shown = [past for past in pasts if flock.index(past.uav) is not None]
+    flock.at = np.array([past.where(now) for past in shown]).reshape(-1, 3)
+    flock.quat = scene_quat(*np.array([past.attitude for past in shown]).reshape(-1, 3).T)
+    minute = [placed(past.tape.path(past.then - MINUTE[0], past.t), past.then - MINUTE, np.inf) for past in shown]
+    ring = [np.where(np.isfinite(rows), rows, at) for rows, at in zip(minute, flock.at, strict=True)]
+    flock.ring = np.array(ring).reshape(-1, len(MINUTE), 3)
+    flock.changes, flock.beats = min(flock.changes, 0) - 1, 0  # others than those of now, and others every time

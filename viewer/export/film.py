@@ -1,0 +1,111 @@
+"""A stretch of flight as one HTML file that plays anywhere: the scene of the page, without any server."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from viewer.camera import FOV, IN_VIEW_M, frame, near, start_at
+from viewer.datatime import stamp
+from viewer.door import quiet, serve
+from viewer.feed import Feed
+from viewer.flock import Flock
+from viewer.labels import Labels, Sight
+from viewer.palette import Palette
+from viewer.place import UNIT_M
+from viewer.routes import route
+from viewer.scene import Scene
+from viewer.selected import Selection
+from viewer.timeline.past import Past, as_it_was, remember
+from viewer.timeline.tapes import Tapes
+
+FRAMES, FRAME_S = 400, 0.1  # of a film at most, and how long each is shown [s]
+ASPECT = 1.6  # the shape of window its camera is set for [-]
+
+
+class Film:
+    """Draws every instant on a server of its own that nobody sees, and keeps what was drawn."""
+
+    def __init__(self, feed: Feed, tapes: Tapes, palette: Palette) -> None:
+        self._feed, self._tapes, self._palette = feed, tapes, palette
+
+    def html(self, selected: int, told: Callable[[float], None] = lambda _: None) -> str:
+        """Film all that is kept on the clock of one UAV.
+
+        Args:
+            selected: the UAV
+            told: called with how far it is, 0..1
+        Raises:
+            ValueError: when nothing is kept of it yet; wait for its first sample.
+        """
+        fleet = [one for one in self._feed.all() if len(self._tapes.of.get(one.uav, ()))]
+        lead = next((one for one in fleet if one.uav == selected), None)
+        if lead is None:
+            raise ValueError(f"export: found nothing kept of uav-{selected}, expected a flight; wait for its samples")
+        span, shift = self._tapes.measure(lead, fleet)
+        times = np.linspace(span.begin, span.end, int(np.clip((span.end - span.begin) / 0.5, 2, FRAMES)))
+        server = serve("127.0.0.1", 0)
+        try:
+            stage = _Stage(server, self._feed, self._palette, selected)
+            frames = [self._pasts(fleet, shift, t) for t in times[[0, len(times) // 2, -1]]]
+            stage.look_at([past for pasts in frames for past in pasts])
+            serializer = server.get_scene_serializer()
+            for k, t in enumerate(times):
+                stage.draw(self._pasts(fleet, shift, float(t)))
+                serializer.insert_sleep(FRAME_S)
+                told((k + 1) / len(times))
+            text = serializer.as_html(dark_mode=self._palette.dark)
+        finally:
+            with quiet():
+                server.stop()
+        return text.replace("<title>Viser</title>", "<title>ParaUAV: a flight</title>", 1)
+
+    def _pasts(self, fleet: list[Any], shift: dict[int, float], t: float) -> list[Past]:
+        found = (as_it_was(one, self._tapes.of[one.uav], t + shift.get(one.uav, 0.0)) for one in fleet)
+        return [past for past in found if past is not None]
+
+
+class _Stage:
+    """The scene of the film."""
+
+    def __init__(self, server: Any, feed: Feed, palette: Palette, selected: int) -> None:
+        self._server, self._feed, self._selected = server, feed, selected
+        self._scene, self._flock = Scene(server.scene, palette, lambda _: None), Flock()
+        self._selection, self._labels = Selection(server.scene, palette), Labels(server.scene)
+        self._sight = Sight(np.zeros(3), np.ones(3), float(FOV), ASPECT)
+
+    def look_at(self, pasts: list[Past]) -> None:
+        """Set the camera to what will be seen: all places and paths."""
+        paths = [past.tape.path(-np.inf, np.inf)[:, 1:] for past in pasts]
+        cloud = near(np.vstack([*paths, np.zeros((0, 3))]), IN_VIEW_M / UNIT_M)
+        ground = min(float(cloud[:, 2].min()) - 0.5, 0.0)
+        self._scene.ground.raise_to(ground)
+        cloud = np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, ground]])
+        start_at(self._server, cloud)
+        self._sight = Sight(*frame(cloud, ASPECT), float(FOV), ASPECT)
+
+    def draw(self, pasts: list[Past]) -> None:
+        """Draw one instant."""
+        flock, scene, sight = self._flock, self._scene, self._sight
+        remember(flock, pasts, 0.0)
+        if not flock.uavs:
+            return
+        scene.glyphs.draw(flock)
+        scene.glyphs.look(flock, selected=self._selected, eye=sight.eye, look_at=sight.look_at, size=1.0)
+        scene.draw_trails(flock, self._selected)
+        scene.draw_heads(flock, self._selected)
+        scene.draw_stems(flock)
+        scene.draw_alerts(flock)
+        scene.draw_predicted(flock, 0.0, self._selected)
+        self._draw_chosen(next((past for past in pasts if past.uav == self._selected), None))
+
+    def _draw_chosen(self, chosen: Past | None) -> None:
+        place, unit, ground = self._feed.place, self._scene.glyphs.unit, self._scene.ground.height
+        if chosen is None or place is None:
+            return self._selection.clear()
+        self._selection.draw(chosen, self._feed, 0.0, ground=ground, unit=unit)
+        self._selection.draw_flight(chosen, self._feed.track(chosen), 0.0, unit)
+        self._selection.draw_route(chosen, route(chosen.mission, place, ground), self._sight, unit)
+        tags = self._selection.tags
+        tags[:1] = [tag._replace(text=f"{tag.text} · {stamp(chosen.then)}") for tag in tags[:1]]
+        self._labels.draw([*tags, *self._selection.marks], self._sight)
