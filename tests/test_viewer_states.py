@@ -29,8 +29,8 @@ def damaged(sentence: str, link: str = "replay:flight.tlog?speed=4") -> Account:
 def test_a_router_that_is_away_is_said_with_its_seconds_and_forgotten_when_it_is_back(clock: Clock) -> None:
     feed, router = Feed(Adrift(), clock), Router()
     assert not feed.router and "No router</b> for 0 s" in router.say(feed.router, 50.0)
-    assert "for 12 s" in notices(feed, router.say(feed.router, 62.0), DARK)
-    assert router.say(True, 63.0) == "" == notices(Feed(MemoryBus(), clock), "", DARK)
+    assert "for 12 s" in notices(feed, router.say(feed.router, 62.0), "", DARK)
+    assert router.say(True, 63.0) == "" == notices(Feed(MemoryBus(), clock), "", "", DARK)
     assert "for 0 s" in router.say(False, 70.0)
 
 
@@ -42,25 +42,25 @@ def test_more_uavs_than_fit_are_counted_once_each(clock: Clock, monkeypatch: pyt
         for uav in (7, 8, 5_000_000, -1, 9, 10):
             bus.publish(Status(uav=uav, t=T))
     assert len(feed.vehicles) == 3 and len(feed.away) == 4
-    assert "Too many UAVs" in notices(feed, "", DARK) and ", 4 more are heard" in notices(feed, "", DARK)
+    assert "Too many UAVs" in notices(feed, "", "", DARK) and ", 4 more are heard" in notices(feed, "", "", DARK)
     assert "3 UAVs" in summary(feed.all(), feed, DARK, clock.now)
 
 
 def test_what_could_not_be_read_of_a_recording_is_said_and_escaped(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 1)
     bus.publish(damaged(f"flight.tlog: 73750 damaged bytes skipped {HOSTILE} {'x' * 10_000}"))
-    said = notices(feed, "", DARK)
+    said = notices(feed, "", "", DARK)
     assert "Recording damaged" in said and "73750 damaged bytes" in said
     assert "<img" not in said and len(said) < 3 * LETTERS
     bus.publish(damaged(""))
-    assert notices(feed, "", DARK) == ""
+    assert notices(feed, "", "", DARK) == ""
 
 
 def test_links_without_end_are_bounded(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 1)
     for k in range(500):
         bus.publish(damaged("late", f"udpin:0.0.0.0:{k}"))
-    assert len(feed.links) == feeds.MAX_LINKS and "<b>Link</b>: late" in notices(feed, "", DARK)
+    assert len(feed.links) == feeds.MAX_LINKS and "<b>Link</b>: late" in notices(feed, "", "", DARK)
 
 
 def test_no_fleet_is_said_with_what_is_listened_to_and_what_to_check(clock: Clock) -> None:

@@ -10,10 +10,13 @@ from fleet.config import entry, router_arguments
 from fleet.logs import log_arguments, say
 from viewer.app import App
 from viewer.door import quiet, serve
+from viewer.terrain.land import Land
+from viewer.terrain.raster import read
 
 EXAMPLES = """
   viewer
   viewer --port 8081 --light
+  viewer --terrain dem.tif --imagery aerial.png@47.30,8.40,47.45,8.60
   viewer --router tcp/10.0.0.5:7447
 """
 
@@ -35,6 +38,10 @@ def main(argv: list[str] | None = None) -> int:
         default="",
         help="host name under which a reverse proxy shows the page; any other but this machine's own is refused",
     )
+    parser.add_argument(
+        "--terrain", metavar="FILE", help="heights of the ground in metres: GeoTIFF, or FILE@south,west,north,east"
+    )
+    parser.add_argument("--imagery", metavar="FILE", help="picture of the ground: GeoTIFF, PNG or JPEG, likewise")
     parser.add_argument("--light", action="store_true", help="light colours, for bright surroundings")
     return guarded("viewer", run, parser.parse_args(argv))
 
@@ -49,10 +56,12 @@ def run(args: argparse.Namespace) -> int:
     if not 0 < args.port < 65536:
         raise ValueError(f"--port: found {args.port}, expected 1 to 65535; name another")
     stop = stop_on_signal()
+    terrain = read(args.terrain, colours=False) if args.terrain else None
+    land = Land(terrain, read(args.imagery, colours=True) if args.imagery else None)
     with connect(entry(args, VIEWER), patient=True) as bus:  # no router yet is said on the page
         server = serve(args.host, args.port, args.name)
         try:
-            app = App(bus, server, light=args.light)
+            app = App(bus, server, light=args.light, land=land)
             say("viewer", f"http://{args.host}:{args.port}")
             app.run(stop)
         finally:

@@ -15,6 +15,7 @@ from viewer.palette import DARK, LIGHT
 from viewer.place import UNIT_M
 from viewer.routes import home_alt_m
 from viewer.selected import BEYOND_S
+from viewer.terrain.land import Land
 from viewer.timeline.tapes import Tapes
 from viewer.track import placed
 from viewer.vehicle import Vehicle
@@ -29,10 +30,10 @@ SLOW_S = 10.0  # how often what is missing is asked for again [s]
 class App:
     """Draws what the feed knows: aircraft ten times a second, in a crowd five, the rest more slowly."""
 
-    def __init__(self, bus: Bus, server: viser.ViserServer, *, light: bool = False) -> None:
+    def __init__(self, bus: Bus, server: viser.ViserServer, *, light: bool = False, land: Land | None = None) -> None:
         self._palette = LIGHT if light else DARK
         self.feed, self.flock, self._server = Feed(bus), Flock(), server
-        self.tapes = Tapes()
+        self.tapes, self._land = Tapes(), land or Land(None, None)
         self.views: dict[int, View] = {}  # by client
         self._wake = threading.Event()
         self._ground, self._cloud = 0.0, np.zeros((0, 3))
@@ -79,6 +80,8 @@ class App:
         for view in self.views.values():
             with view.client.atomic():
                 if tick % SECOND == view.offset or view.dirty:
+                    self._land.show(view.client, self.feed.place, self._palette, self._ground)
+                    view.panels.ground_said = self._land.sentence
                     view.settle(self.flock, now, self._ground)
                     if len(self._cloud):
                         view.frame(self._cloud, self._news(), self._ground)

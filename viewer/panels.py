@@ -36,6 +36,7 @@ class Panels:
         self._commands = Commands(client.gui, choose, actions)
         self._beat = False
         self._router = Router()
+        self.ground_said = ""  # what is wrong with the files of the ground
         self.seek = ""  # the page's code that shows the time of an event
         self._gui.configure_theme(
             dark_mode=palette.dark, show_logo=False, show_share_button=False, brand_color=triple(palette.predicting)
@@ -96,7 +97,7 @@ class Panels:
         """Write everything anew; call it about once a second, and when the selection changes."""
         self._beat = not self._beat
         self._banner.content = f'<div class="stale {"a" if self._beat else "b"}">{STALE}</div>'
-        self._notices.content = notices(feed, self._router.say(feed.router, now), self._palette)
+        self._notices.content = notices(feed, self._router.say(feed.router, now), self.ground_said, self._palette)
         chosen = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
         if not fleet:
             self._summary.content, self._table.content = empty(feed, now), ""

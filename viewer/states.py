@@ -30,9 +30,10 @@ class Router:
         )
 
 
-def notices(feed: Feed, router: str, palette: Palette) -> str:
-    """Give what is wrong, as cards; `router` is what `Router` says."""
+def notices(feed: Feed, router: str, ground: str, palette: Palette) -> str:
+    """Give what is wrong, as cards; `router` is what `Router` says, `ground` what is wrong with the ground's files."""
     said = [router] if router else []
+    said += [f"<b>No ground</b>: {escape(ground)}"] if ground else []
     if feed.away:
         said.append(
             f"<b>Too many UAVs</b>: {MAX_VEHICLES:,} are shown, {len(feed.away):,} more are heard and not shown. "

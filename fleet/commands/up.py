@@ -58,6 +58,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--for", dest="seconds", type=float, default=0.0, help="stop this long after the first sample")
     parser.add_argument("--no-viewer", action="store_true", help="without the web page")
     parser.add_argument("--port", type=int, default=8080, help="port of the web page (8080)")
+    parser.add_argument("--terrain", metavar="FILE", help="heights of the ground for the page, as in viewer --help")
+    parser.add_argument("--imagery", metavar="FILE", help="picture of the ground for the page, as in viewer --help")
     parser.add_argument("--seed", type=int, default=1, help="seed of the simulated aircraft (1)")
     router_arguments(parser)
     parser.add_argument(
@@ -141,7 +143,8 @@ def _start(children: Children, args: argparse.Namespace) -> None:
         aircraft += [] if args.fault_uav is None else [f"--fault-uav={args.fault_uav}"]
         children.start("aircraft", "fleet.cli", "fly", *aircraft)
     if not args.no_viewer:
-        children.start("viewer", "viewer", "--port", str(args.port), *router)
+        ground = [f"--{name}={file}" for name in ("terrain", "imagery") if (file := getattr(args, name))]
+        children.start("viewer", "viewer", "--port", str(args.port), *ground, *router)
 
 
 def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threading.Event) -> int:
