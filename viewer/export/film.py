@@ -91,7 +91,7 @@ class _Stage:
         if not flock.uavs:
             return
         scene.glyphs.draw(flock)
-        scene.glyphs.look(flock, selected=self._selected, eye=sight.eye, look_at=sight.look_at, size=1.0)
+        scene.glyphs.look(flock, sight, selected=self._selected, size=1.0)
         scene.draw_trails(flock, self._selected)
         scene.draw_heads(flock, self._selected)
         scene.draw_stems(flock)
