@@ -3,7 +3,9 @@
 import argparse
 import contextlib
 import gc
+import logging
 import sys
+import threading
 from pathlib import Path
 
 from rich.console import Console
@@ -33,6 +35,8 @@ from gateway.recorded import Replay
 from gateway.spec import read_forward, read_spec
 
 SWITCH_S = 5e-4  # how long a receiving thread waits while messages are made [s]
+COLD_S = 2.0  # compiling that takes longer is said [s]
+COLD = "compiling the decoder for this machine, once; links open when that is done"
 GARBAGE = 50_000  # objects made before cycles are looked for; messages make thousands a tick, and no cycles
 DEFAULT_LINK = "udpin:127.0.0.1:14550"
 EXAMPLES = """
@@ -62,6 +66,8 @@ settings behind a #, joined by &:
 A file of keys has lines of NAME and 64 hex digits, and only its owner may read it (chmod 600).
 """
 
+_log = logging.getLogger(__name__)
+
 
 def run(args: argparse.Namespace) -> int:
     """Open the links, join the bus, work until told to stop or the recordings end."""
@@ -73,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     budget = Budget(args.record, read_size(args.record_budget, "--record-budget")) if args.record is not None else None
     stop = stop_on_signal()
     sys.setswitchinterval(SWITCH_S)
-    warm_up()
+    compiled()
     gc.freeze()
     gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
     with connect(entry(args, GATEWAY), patient=budget is not None) as bus, contextlib.ExitStack() as held:
@@ -107,6 +113,16 @@ def run(args: argparse.Namespace) -> int:
                 _say(f"counters at {held.enter_context(served(args.metrics, counters(pump.publisher.newest)))}")
             pump.run(stop)
     return 0
+
+
+def compiled() -> None:
+    """Compile the decoder, or load it, and say so where it takes long: a machine does it once."""
+    slow = threading.Timer(COLD_S, _log.warning, (COLD,))
+    slow.start()
+    try:
+        warm_up()
+    finally:
+        slow.cancel()
 
 
 def _say(line: str) -> None:

@@ -17,6 +17,7 @@ from fleet.bus import MemoryBus, connect
 from fleet.contract import Account, Mission, Params, Sample, Status
 from fleet.telemetry.heard import Heard
 from fleet.telemetry.recordings import replay_messages
+from gateway.__main__ import COLD, compiled
 from gateway.link import Batch
 from gateway.links.udp import Udp
 from gateway.pump import Pump
@@ -252,7 +253,7 @@ def test_the_gateway_stops_cleanly(router, number):
         assert child.stdout.readline().startswith("gateway: udpin")
         child.send_signal(number)
         _, errors = child.communicate(timeout=PATIENCE_S)
-    assert (child.returncode, errors) == (0, "")
+    assert (child.returncode, errors.replace(f"gateway: {COLD}\n", "")) == (0, "")
 
 
 def test_a_port_in_use_and_a_missing_router_end_with_a_sentence(router):
@@ -278,9 +279,18 @@ def test_fleet_replay_joins_a_running_fleet(router, tmp_path):
             "-m", "fleet.cli", "replay", str(path), "--speed", "20", "--offset", "-1", "--router", router
         ) as child:
             _, errors = child.communicate(timeout=PATIENCE_S)
-        assert (child.returncode, errors) == (0, "")
+        assert (child.returncode, errors.replace(f"gateway: {COLD}\n", "")) == (0, "")
         ear.wait(lambda e: sum(len(s.attitude.t.numpy()) for s in e.of(Sample, 8)) > 350)
     with start("-m", "fleet.cli", "replay", str(tmp_path / "none.tlog"), "--router", router) as child:
         _, errors = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 2
     assert "found no such file" in errors
+
+
+def test_compiling_that_takes_long_is_said(monkeypatch):
+    monkeypatch.setattr("gateway.__main__.COLD_S", 0.0)
+    said = threading.Event()
+    monkeypatch.setattr("gateway.__main__._log.warning", lambda *_: said.set())
+    monkeypatch.setattr("gateway.__main__.warm_up", lambda: said.wait(PATIENCE_S))
+    compiled()
+    assert said.is_set()
