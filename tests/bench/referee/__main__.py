@@ -24,7 +24,7 @@ from fleet.contract import Claim
 from twin_worker.claims.owner import owners
 
 from . import faults
-from .site import PACE, Site, until
+from .site import PACE, Site, Worker, until
 
 LIMITS = {  # by fault: what is measured, and the most that is allowed
     "kill": {"taken_s": 0.5, "gap_s": 0.5},
@@ -57,13 +57,15 @@ def happen(site: Site, name: str, rng: np.random.Generator) -> dict[str, Any]:
     """Do one fault to a worker drawn by lot, then bring the fleet back to its size."""
     most = site.wanted
     if name == "join" and len(site.workers) > most:
-        faults.leave(site, site.workers[0])
+        faults.leave(site, _oldest(site))
     site.reader.forget()
     usual_since = time.monotonic()
-    able = [one for one in site.workers if one.way is not None or faults.ALL[name] not in faults.ON_THE_WAY]
+    fault = faults.ALL[name]
+    able = [one for one in site.workers if one.way is not None or fault not in faults.ON_THE_WAY]
+    able = [one for one in able if one is not site.spared or fault not in faults.ENDS]
     worker = able[int(rng.integers(len(able)))]
     try:
-        found = faults.ALL[name](site, worker)
+        found = fault(site, worker)
     except TimeoutError as error:
         claims = {claim.worker[-4:]: (sorted(uav for uav, _ in claim.held), claim.bare, claim.leaving)
                   for claim, _ in site.reader.bus.ask(Claim)}  # fmt: skip
@@ -81,9 +83,13 @@ def happen(site: Site, name: str, rng: np.random.Generator) -> dict[str, Any]:
     while len(site.workers) < most:
         site.add()
     while len(site.workers) > most:
-        faults.leave(site, site.workers[0])
+        faults.leave(site, _oldest(site))
     settle(site)
     return found
+
+
+def _oldest(site: Site) -> Worker:
+    return next(worker for worker in site.workers if worker is not site.spared)
 
 
 def settle(site: Site) -> None:

@@ -169,3 +169,4 @@ def blink(site: Site, worker: Worker) -> dict[str, Any]:
 
 ALL = {one.__name__: one for one in (kill, freeze, leave, join, restart_router, cut, stall, delay, blink)}
 ON_THE_WAY = (cut, stall, delay)  # for a worker that has a way of its own
+ENDS = (kill, leave)  # for a worker that is not spared

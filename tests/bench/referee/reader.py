@@ -94,6 +94,12 @@ class Reader:
         at = [*heard[max(k - 1, 0) :], time.monotonic()]
         return np.diff(at).tolist() or [float("inf")]
 
+    def silent(self, uavs: set[int], longer_s: float) -> set[int]:
+        """Name those of which nothing was accepted for longer [s]."""
+        now = time.monotonic()
+        with self.lock:
+            return {uav for uav in uavs if not self.came[uav] or now - self.came[uav][-1].heard > longer_s}
+
     def forget(self) -> None:
         """Forget all but the newest of each, so that a long run stays small."""
         with self.lock:

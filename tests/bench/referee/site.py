@@ -45,6 +45,11 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+def rss_mb(pid: int) -> float:
+    """Give the resident memory of a process [MB]."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
 def fly(path: Path, seconds: float = 1200.0) -> Path:
     """Fly one pretend aircraft in wind and turbulence, and record it."""
     to_tlog(path, [PretendUav(0, 3, wind=3.0, turbulence=2)], seconds=seconds, loss=0.01, seed=3)
@@ -87,7 +92,7 @@ class Worker:
     @property
     def rss_mb(self) -> float:
         """Give its resident memory [MB]."""
-        return int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+        return rss_mb(self.process.pid)
 
 
 class Site(AbstractContextManager):
@@ -105,6 +110,7 @@ class Site(AbstractContextManager):
         self.uavs, self.router, self.zenohd, self.pace, self.ways = uavs, router, zenohd, pace, ways
         self.workers: list[Worker] = []
         self.wanted = 0  # workers that there should be
+        self.spared: Worker | None = None  # it is never killed nor sent away
         self.reader: Reader = None  # type: ignore[assignment]
         self._stack = ExitStack()
         self._running: list[subprocess.Popen] = []
