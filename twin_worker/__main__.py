@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import gc
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,8 @@ from twin_worker.engine.pace import read_pace
 if TYPE_CHECKING:
     from twin_worker.diagnose.baseline import Baseline
 
+SWITCH_S = 5e-4  # how long a thread of the bus waits for the interpreter while another holds it [s]
+GARBAGE = 50_000  # objects made before cycles are looked for
 EXAMPLES = """
   twin_worker --uavs 0-49
   twin_worker --uavs 0-199 --pace identify=5,predict=5,ensemble=5,renew=0.1       many aircraft, ten times a second
@@ -57,6 +60,13 @@ def _bases(given: list[str]) -> "dict[int, Baseline]":
     return {int(uav) if uav else ALL: load_baseline(Path(path))[0] for uav, _, path in pairs}
 
 
+def _share() -> None:
+    """Let whoever hears wait less for who works out, and look for cycles rarely: twins make none, messages neither."""
+    sys.setswitchinterval(SWITCH_S)
+    gc.freeze()
+    gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
+
+
 def _run(args: argparse.Namespace) -> int:
     airframe, bases = load(args.airframe), _bases(args.baseline)
     stop = stop_on_signal()
@@ -81,6 +91,7 @@ def _run(args: argparse.Namespace) -> int:
             diagnosis=None if args.no_diagnosis else Live(hand, bases, adapt=not args.no_adapt),
         )
         warm_up()  # before anything is claimed: who compiles cannot take over
+        _share()
         say(f"twin_worker {bus.writer:016x}", f"may hold UAVs {args.uavs.start}-{args.uavs.stop - 1}")
         with contextlib.ExitStack() as held:
             held.callback(hand.close)

@@ -89,7 +89,9 @@ def happen(site: Site, name: str, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def _oldest(site: Site) -> Worker:
-    return next(worker for worker in site.workers if worker is not site.spared)
+    """Give who goes to make room: the oldest, but nobody who is spared, and whose way can be cut last."""
+    able = [worker for worker in site.workers if worker is not site.spared]
+    return next((worker for worker in able if worker.way is None), able[0])
 
 
 def settle(site: Site) -> None:
