@@ -2,16 +2,19 @@
 
 import gzip
 import http.client
+import re
 import socket
 from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
-from conftest import unused_port
+from conftest import ROOT, unused_port
 from viser import _messages
 from websockets.datastructures import Headers
 from websockets.http11 import Request
 
+from fleet.bus import MemoryBus
+from viewer.app import App
 from viewer.door import POLICY, doorman, quiet, serve
 
 PASSED = "the library's own answer"
@@ -108,3 +111,32 @@ def test_nobody_can_open_a_tunnel(server: SimpleNamespace) -> None:
 def test_a_taken_port_is_refused_and_not_replaced(server: SimpleNamespace) -> None:
     with pytest.raises(OSError, match=rf"--port: found {server.port} taken"):
         serve("127.0.0.1", server.port)
+
+
+# --- behind a reverse proxy, and what the viewer may do on the bus ---
+
+
+def test_the_recipe_for_a_reverse_proxy_hands_on_what_the_door_asks_for() -> None:
+    recipe = (ROOT / "deploy" / "nginx.conf").read_text()
+    assert recipe.count("{") == recipe.count("}") and "auth_basic_user_file" in recipe
+    name = re.search(r"viewer --name (\S+)", recipe)[1]
+    assert f"server_name {name};" in recipe and "proxy_pass         http://127.0.0.1:8080;" in recipe
+    sent = dict(re.findall(r"proxy_set_header\s+(\w+)\s+(\S+);", recipe))
+    assert sent["Host"] == "$host" and sent["Upgrade"] == "$http_upgrade" and "Origin" not in sent
+    assert answer(**SOCKET, host=name, origin=f"https://{name}") == PASSED
+
+
+class Mute(MemoryBus):
+    """A bus on which one may only listen and ask."""
+
+    def put(self, *_: object) -> None:
+        raise AssertionError("the viewer published")
+
+    publish = answer = present = put
+
+
+def test_to_hear_and_to_ask_is_all_it_needs_of_the_bus(server: SimpleNamespace) -> None:
+    app = App(Mute(), server.viser)
+    for tick in range(12):
+        app.tick(tick)
+    app.feed.catch_up()

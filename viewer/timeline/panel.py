@@ -25,20 +25,24 @@ class Panel:
         self.window = panel = gui.add_panel()
         with panel.add_tab("Timeline", viser.Icon.CLOCK_PLAY):
             self._bar = gui.add_html("")
-            transport = gui.add_button_group("Replay", TRANSPORT)
-            steps = gui.add_button_group("Step", STEPS)
+            gui.add_html(self._buttons())
             self._words = gui.add_html("")
         panel.float(x=12, y=-14, width=556)
         self._asked.on_update(lambda _: asked(self._asked.value))
-        transport.on_click(lambda _: asked(transport.value))
-        steps.on_click(lambda _: asked(steps.value))
         for label, what in (("pause", "Pause"), ("play at 1×", "1×"), ("play at 4×", "4×"), ("live", "● Live")):
             command = gui.add_command(f"Timeline: {label}", icon=viser.Icon.CLOCK_PLAY)
             command.on_trigger(lambda _, what=what: asked(what))
 
+    def _buttons(self) -> str:
+        """Lay all buttons in one row, as the page library's own would take two, each with room for a name."""
+        send = self.sender("")
+        row = (*STEPS[:3], *TRANSPORT, *STEPS[3:])
+        made = (f'<button onclick="{send.format(repr(what))}">{what}</button>' for what in row)
+        return f'<div class="uav time buttons">{"".join(made)}</div>'
+
     def sender(self, tag: str) -> str:
         """Give the page's code that asks for `tag` and a value in its place `{}`."""
-        return SEND.replace("UUID", self._asked._impl.uuid).replace("TAG", tag)
+        return SEND.replace("UUID", str(self._asked._impl.uuid)).replace("TAG", tag)
 
     def draw(self, bar: str, head: str, words: str, banner: str) -> None:
         """Write the parts anew where they are others."""
