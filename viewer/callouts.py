@@ -15,10 +15,8 @@ MOST = 6  # named at once; those that do not fit are left out
 
 def callouts(flock: Flock, selected: int | None, unit: float) -> list[Tag]:
     """Name the worst few where they fly; `unit` is the drawn span of an aircraft [10 m]."""
-    flying = [v for v in flock.fleet if v.uav != selected and not v.ended]
-    needy = [v for v in flying if v.alerts or in_force(v.mismatch) or v.state(flock.now) is State.LINK_LOST]
-    worst = sorted(needy, key=lambda v: severity(v, flock.now))
-    rows = [(v, i) for v in worst if (i := flock.index(v.uav)) is not None][:MOST]
+    needy = [(v, i) for v, i in flock.needy if v.uav != selected and not v.ended]
+    rows = sorted(needy, key=lambda one: severity(one[0], flock.now))[:MOST]
     above = np.array([0.0, 0.0, 0.9 * unit])
     return [
         Tag(

@@ -41,6 +41,7 @@ class Flock:
 
     def __init__(self) -> None:
         self.fleet: list[Vehicle] = []  # copies, as of the last second
+        self._shown: list[Vehicle] = []  # those who are drawn
         self.now = 0.0  # when that was, monotonic [s]
         self.uavs: tuple[int, ...] = ()
         self._rows: dict[int, int] = {}  # the row of each
@@ -74,6 +75,11 @@ class Flock:
         """Tell who needs an eye, (n,)."""
         return (self.looks == MISMATCH) | (self.looks == LOST)
 
+    @property
+    def needy(self) -> list[tuple[Vehicle, int]]:
+        """Give who needs an eye, with their rows."""
+        return [(self._shown[i], i) for i in np.flatnonzero(self.exceptions).tolist()]
+
     def index(self, uav: int | None) -> int | None:
         """Give the row of a UAV; None where it is not drawn."""
         return self._rows.get(uav) if uav is not None else None
@@ -82,7 +88,8 @@ class Flock:
         """Take over who is there and how they stand; call it once a second."""
         self.fleet, self.now = fleet, now
         shown = [(vehicle, at) for vehicle in fleet if (at := vehicle.where(now)) is not None]
-        uavs = tuple(vehicle.uav for vehicle, _ in shown)
+        self._shown = [vehicle for vehicle, _ in shown]
+        uavs = tuple(vehicle.uav for vehicle in self._shown)
         self.looks = np.array([look(vehicle, now) for vehicle, _ in shown], int)
         hover = np.array([v.status is not None and v.status.vehicle in HOVER for v, _ in shown], bool)
         if uavs != self.uavs or not np.array_equal(hover, self.hover):

@@ -5,6 +5,8 @@ from collections.abc import Iterable
 
 import msgspec
 
+from fleet.contract import Rows
+
 CROWD = 300  # above this many a sample that a newer one has replaced is not read
 MOST = 40  # letters kept of one UAV while nobody looks; the newest replaces the last
 MOST_UAVS = 4_000  # of whom letters are kept: ids are written by strangers
@@ -15,6 +17,12 @@ class Whose(msgspec.Struct):
     """Of a message only whose it is."""
 
     uav: int
+
+
+class Leg(msgspec.Struct):
+    """Of a sample only the mission item in force."""
+
+    leg: Rows
 
 
 Letter = tuple[bytes, float]
@@ -29,6 +37,9 @@ class Inbox:
         self.keen: frozenset[int] = frozenset()  # of whom every letter is kept, also in a crowd
         self.lost = 0  # letters that name nobody, or came when there was no room
         self._letters: dict[int, list[Letter]] = {}
+        self._kept: set[int] = set()  # whose last letter has news of the mission
+        self._item: dict[int, bytes] = {}  # the mission item each named last
+        self._leg = msgspec.msgpack.Decoder(Leg)
         self._whose = msgspec.msgpack.Decoder(Whose)
         self._lock = threading.Lock()
 
@@ -39,6 +50,7 @@ class Inbox:
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             self.lost += 1
             return
+        news = self.crowd and _LEG in payload and self._is_news(uav, payload)
         with self._lock:
             held = self._letters.get(uav)
             if held is None:
@@ -46,10 +58,24 @@ class Inbox:
                     self._letters[uav] = [(payload, now)]
                 else:
                     self.lost += 1
-            elif len(held) < MOST and (not self.crowd or uav in self.keen or _LEG in held[-1][0]):
+            elif len(held) < MOST and (not self.crowd or uav in self.keen or uav in self._kept):
                 held.append((payload, now))
             else:
                 held[-1] = payload, now
+            self._kept.discard(uav)
+            if news:
+                self._kept.add(uav)
+
+    def _is_news(self, uav: int, payload: bytes) -> bool:
+        """Tell whether a sample names another mission item than the one before; one that cannot be read may."""
+        try:
+            told = self._leg.decode(payload).leg.x
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            return True
+        before = self._item.get(uav)
+        if len(self._item) < MOST_UAVS or before is not None:
+            self._item[uav] = told.data
+        return before != told.data
 
     def take(self, uavs: Iterable[int] | None = None) -> list[Letter]:
         """Empty it, or take out what is of some UAVs: letters of each in the order they came."""
@@ -59,4 +85,5 @@ class Inbox:
             if uavs is not None:
                 return [letter for uav in uavs for letter in self._letters.pop(uav, ())]
             letters, self._letters = self._letters, {}
+            self._kept.clear()
         return [letter for held in letters.values() for letter in held]

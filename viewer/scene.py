@@ -115,11 +115,9 @@ def _bare(flock: Flock, points: np.ndarray, selected: int | None) -> np.ndarray:
 
 def predicted(flock: Flock) -> list[Vehicle]:
     """Choose whose predicted paths are drawn: all, in a crowd those who need an eye."""
-    told = [v for v in flock.fleet if v.forecast is not None and flock.index(v.uav) is not None]
     if not flock.crowd:
-        return told
-    needy = {flock.uavs[i] for i in np.flatnonzero(flock.exceptions)}
-    return [v for v in told if v.uav in needy]
+        return [v for v in flock.fleet if v.forecast is not None and flock.index(v.uav) is not None]
+    return [v for v, _ in flock.needy if v.forecast is not None]
 
 
 def cut_at_horizon(ahead: np.ndarray, path: np.ndarray, start: float, until: float, dashes: int = 28) -> np.ndarray:

@@ -62,6 +62,7 @@ class Vehicle:
     row: FleetRow | None = None
     time: DataTime = field(default_factory=DataTime)
     player: float = -np.inf  # when the gateway that plays it as a recording last spoke, monotonic [s]; -inf: live
+    judged: tuple[float, State] | None = None  # of a copy: when its state was last judged, and what it was
     ended: bool = False  # the recording is over: what is shown is its last instant
     known: Known = field(default_factory=Known)
     events: tuple[Event, ...] = ()  # oldest first; replaced as a whole, never changed
@@ -80,6 +81,13 @@ class Vehicle:
 
     def state(self, now: float) -> State:
         """Judge where its twin stands; the worst news wins. `now` is monotonic [s]."""
+        if self.judged is None:
+            return self._judge(now)
+        if self.judged[0] != now:
+            self.judged = now, self._judge(now)
+        return self.judged[1]
+
+    def _judge(self, now: float) -> State:
         silent = now - self.heard > SILENT_S / min(self.time.pace, 1.0)  # a slow recording may breathe
         if silent or (self.status is not None and self.status.link is Link.LOST):
             return State.LINK_LOST
@@ -100,6 +108,7 @@ class Vehicle:
         """
         copy = object.__new__(Vehicle)
         copy.__dict__.update(self.__dict__)
+        copy.judged = np.nan, State.WAITING
         if self.recorded and now - self.player > ENDED_S and now - self.heard > ENDED_S:
             copy.ended, copy.events = True, closed(self.events, self.time.t)
             copy.alerts = {

@@ -48,7 +48,7 @@ def main() -> int:
         if args.plain:
             found["plain"] = plain(router, args.plain)
     finally:
-        tell(feeder)
+        found["published_hz"] = float(tell(feeder) or "nan")
         feeder.wait(30)
     print(json.dumps(found, indent=1))
     if args.json:

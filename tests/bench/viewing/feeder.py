@@ -10,6 +10,7 @@ import argparse
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -128,8 +129,8 @@ def begin(world: World, bus: Bus) -> None:
             bus.publish(Alert(uav=uav, t=world.begin, kind=AlertKind.SHORT_HORIZON, sentence="short"), STAMP)
 
 
-def publish(world: World, bus: Bus, hz: float, stop: threading.Event) -> None:
-    """Speak until told to stop."""
+def publish(world: World, bus: Bus, hz: float, stop: threading.Event) -> float:
+    """Speak until told to stop; give how many samples of each were published per second."""
     parts = np.array_split(np.arange(world.n), PARTS)
     due, turn = time.time(), 0
     while not stop.is_set():
@@ -146,6 +147,7 @@ def publish(world: World, bus: Bus, hz: float, stop: threading.Event) -> None:
                 bus.publish(FleetState(t=t, rows=rows), STAMP)
         turn, due = turn + 1, due + 1 / (hz * PARTS)
         stop.wait(max(due - time.time(), 0.0))
+    return turn / PARTS / (time.time() - world.begin)
 
 
 def main() -> int:
@@ -162,11 +164,11 @@ def main() -> int:
         world = World(args.uavs, time.time())
         begin(world, bus)
         print(world.begin, flush=True)
-        speaker = threading.Thread(target=publish, args=(world, bus, args.hz, stop))
-        speaker.start()
-        sys.stdin.readline()  # and when it ends
-        stop.set()
-        speaker.join()
+        with ThreadPoolExecutor(1) as pool:
+            speaker = pool.submit(publish, world, bus, args.hz, stop)
+            sys.stdin.readline()  # and when it ends
+            stop.set()
+            print(speaker.result(), flush=True)
     router.close()
     return 0
 

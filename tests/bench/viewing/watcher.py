@@ -1,10 +1,12 @@
 """Websocket clients that receive as a browser does, and count."""
 
+import contextlib
 import threading
 import time
 
 import msgspec
 import viser
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 CAMERA = {
@@ -35,6 +37,10 @@ class Watcher:
         self._thread.start()
 
     def _receive(self) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            self._count()
+
+    def _count(self) -> None:
         for frame in self._socket:
             if not self.frames:
                 self.first_s = time.monotonic() - self._began
