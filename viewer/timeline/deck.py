@@ -33,6 +33,7 @@ class Timeline:
         self._lock = threading.Lock()
         self._span, self._shift = Span(0.0, 0.0), dict[int, float]()
         self._lead: int | None = None
+        self._measured = -np.inf  # as of which second of the fleet the span was found
         self._then, self._drawn_at = Flock(), (-np.inf, -np.inf)  # the fleet as it was; wall and data time of it
         self._panel = Panel(client.gui, palette, self.asked)
         self._after = After(client.scene, palette)
@@ -43,7 +44,9 @@ class Timeline:
         """Give the fleet to draw: the one given, which is now, or, at another time, as it was."""
         passed = now - self._drawn_at[0]
         with self._lock:
-            self._measure(flock.fleet, selected)
+            if flock.now != self._measured or not self.player.live:
+                self._measured = flock.now
+                self._measure(flock.fleet, selected)
             self.player.advance(passed if isfinite(passed) else 0.0, self._span)
             t = self.player.t
         before, self._drawn_at = self._drawn_at, (now, t or -np.inf)
