@@ -632,7 +632,7 @@ class Account(msgspec.Struct, frozen=True, kw_only=True):
     unsure: Annotated[int, Meta(description="published in the second before a router was missed")] = 0
     removed: Annotated[int, Meta(description="recordings removed to stay within the budget")] = 0
     history_bytes: Annotated[int, Meta(description="kept for late joiners")] = 0
-    now: Annotated[float, Meta(description="when it was counted, by the gateway's own clock [s since 1970]")] = 0.0
+    now: Annotated[float, Meta(description="when it was said, by the gateway's own clock [s since 1970]")] = 0.0
     machine: Annotated[str, Meta(description="name of the machine it runs on")] = ""
     code: Annotated[str, Meta(description="hash of the sources it runs")] = ""
 

@@ -104,4 +104,4 @@ class Publisher:
 
     def _account_answer(self, uav: int | None, settings: dict[str, str], payload: bytes) -> Answers:
         del uav, settings, payload
-        return [] if self.told is None else [(self.told, None)]
+        return [] if self.told is None else [(msgspec.structs.replace(self.told, now=time.time()), None)]

@@ -1,11 +1,15 @@
 """What is in deploy/ is well-formed, and every command line in it is one that the commands take."""
 
 import ast
+import base64
 import contextlib
+import json
+import os
 import re
 import shlex
 import shutil
 import subprocess
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,10 +18,14 @@ import pytest
 import yaml
 import zenoh
 from conftest import ROOT, unused_port
+from examples import EXAMPLES
 from test_readme import MAINS, commands, understood
 
 from fleet.access.roles import ROLES, ROUTER_ROLE
-from tests.bench.security.site import make_papers, zenohd
+from fleet.bus import connect
+from fleet.codec import decode, encode
+from fleet.contract import Prediction
+from tests.bench.security.site import REAL, Site, make_papers, routed, zenohd
 from tests.bench.security.trying import until
 
 DEPLOY = ROOT / "deploy"
@@ -216,3 +224,47 @@ def test_zenoh_takes_the_configuration_and_zenohd_starts_with_it(name: str, tmp_
             with contextlib.suppress(ProcessLookupError):
                 child.terminate()
         assert b"can be reached at" in log.read_bytes() and b"ERROR" not in log.read_bytes()
+
+
+def fetched(where: str, method: str = "GET", body: bytes | None = None) -> str:
+    """Ask over HTTP; empty where nobody answers yet."""
+    request = urllib.request.Request(where, data=body, method=method)
+    with contextlib.suppress(OSError), urllib.request.urlopen(request, timeout=5.0) as reply:
+        return reply.read().decode()
+    return ""
+
+
+def test_predictions_answer_over_http_and_what_it_is_asked_to_write_is_dropped(tmp_path: Path) -> None:
+    folder = os.environ.get("PARAUAV_ZENOH_PLUGINS")
+    if folder is None or (program := zenohd()) is None:
+        pytest.skip("no zenohd, or no folder of its REST plug-in in PARAUAV_ZENOH_PLUGINS; deploy/README.md makes it")
+    papers, port, http = make_papers(tmp_path / "certificates", "127.0.0.1"), unused_port(), unused_port()
+    text = (DEPLOY / "rest.json5").read_text().replace("127.0.0.1:7447", f"127.0.0.1:{port}")
+    (tmp_path / "rest.json5").write_text(text.replace("/etc/parauav/certificates", str(papers)))
+    command = [program, "-c", str(tmp_path / "rest.json5"), "--plugin-search-dir", folder]
+    command += ["--rest-http-port", f"127.0.0.1:{http}"]
+    where = f"http://127.0.0.1:{http}/parauav"
+    heard: list[bytes] = []
+    with contextlib.ExitStack() as held:
+        site = held.enter_context(routed(REAL, Site(f"tls/127.0.0.1:{port}", papers)))
+        quiet = subprocess.DEVNULL
+        child = held.enter_context(subprocess.Popen(command, stdout=quiet, stderr=quiet))
+        held.callback(child.terminate)
+        worker, tools = (held.enter_context(connect(site.entry(role))) for role in ("worker", "tools"))
+        worker.answer(Prediction, lambda *_: [(EXAMPLES[Prediction], None)])
+        tools.overhear(Prediction, lambda payload, *_: heard.append(payload))
+        found: list[dict[str, str]] = []
+
+        def asked() -> bool:
+            found.extend(json.loads(fetched(f"{where}/*/prediction?horizon=30;step=30") or "[]"))
+            return bool(found)
+
+        assert until(asked) and found[0]["key"] == "parauav/7/prediction"
+        assert decode(Prediction, base64.b64decode(found[0]["value"])) == EXAMPLES[Prediction]
+
+        def told() -> bool:
+            fetched(f"{where}/7/prediction", "PUT", b"forged")
+            worker.publish(EXAMPLES[Prediction])
+            return len(heard) > 3
+
+        assert until(told) and set(heard) == {encode(EXAMPLES[Prediction])}

@@ -96,6 +96,10 @@ def test_what_is_wrong_is_found_with_its_cure(make: Callable[[], MemoryBus], gra
     assert any(re.search(sentence, line) for line in lines), lines
 
 
+def test_the_clock_of_a_gateways_machine_counts_too() -> None:
+    assert any("gs: 30.0 s behind" in line for line in found(of(claim(ONE, FOUR), now=time.time() - 30.0), BAD))
+
+
 def test_two_gateways_of_one_aircraft_and_none_at_all() -> None:
     bus = of(claim(ONE, FOUR))
     bus.answer(Account, lambda *_: [(Account(t=1.0, uavs=(3, 9), machine="gs2", code=SOURCES), None)])

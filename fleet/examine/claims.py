@@ -34,6 +34,8 @@ class Seen:
         self.late = {claim.machine or worker: middle - claim.t for worker, claim in self.claims.items()}
         begun = time.time()
         self.accounts = [account for account, _ in bus.ask(Account)]
+        middle = (begun + time.time()) / 2
+        self.late |= {account.machine: middle - account.now for account in self.accounts if account.now}
         self.known = {status.uav for status, _ in bus.ask(Status)}
         self.live = dict(live)
 
