@@ -49,13 +49,14 @@ def test_machines_read_one_line_of_json() -> None:
 @pytest.mark.parametrize("module", ["gateway", "twin_worker", "viewer"])
 def test_with_log_json_even_a_refusal_is_a_line_of_json(module: str) -> None:
     command = [sys.executable, "-m", module, "--log-json", "--router", f"tcp/127.0.0.1:{unused_port()}"]
-    command += ["--link", "nonsense"] if module == "gateway" else []
+    command += {"gateway": ["--link=nonsense"], "viewer": ["--port=99999"]}.get(module, [])
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2 and done.stdout == ""
     (line,) = done.stderr.splitlines()
     told = json.loads(line)
     assert told["level"] == "error" and told["process"] == module
-    assert ("found 'nonsense'" if module == "gateway" else "nobody answers; start") in told["message"]
+    expected = {"gateway": "found 'nonsense'", "viewer": "--port: found 99999", "twin_worker": "nobody answers; start"}
+    assert expected[module] in told["message"]
 
 
 ROWS = (
