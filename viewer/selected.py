@@ -17,7 +17,7 @@ from viewer.routes import NOTHING, Route
 from viewer.strokes import Sheaf, Strokes, chain, closed, dashed, disc
 from viewer.tube import curtain, marks, rings, samples, skin
 from viewer.vehicle import Vehicle
-from viewer.words import CLAIMS_S
+from viewer.words import CLAIMS_S, fit
 
 BANDS, BAND_STEPS = 5, 12  # the tube fades in bands, each of so many slices
 BEYOND_S = 20.0  # how far past the horizon the grey dashes go
@@ -172,4 +172,5 @@ def caption(vehicle: Vehicle, now: float) -> str:
     if vehicle.ended:
         return f"{vehicle.name}  end of the recording"
     lost = f"  link lost {vehicle.age(now):.0f} s" if vehicle.state(now) is State.LINK_LOST else ""
-    return vehicle.name + (lost or horizon)
+    mean = fit(vehicle)
+    return vehicle.name + (lost or (f"  fit {mean:.0f} %" if mean is not None else "") + horizon)
