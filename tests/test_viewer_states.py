@@ -1,10 +1,17 @@
 """What is wrong with the picture as a whole, said in words: no router, too many UAVs, damaged recordings, no fleet."""
 
+import threading
+from pathlib import Path
+
 import pytest
 from pretend_feed import HOSTILE, STAMP, Clock, PretendUav, T, feed_of
+from test_gateway import flight
 
 from fleet.bus import MemoryBus
 from fleet.contract import Account, LinkAccount, Status
+from gateway.pump import Pump
+from gateway.recorded import Replay
+from gateway.spec import read_spec
 from viewer import feed as feeds
 from viewer.detail import about
 from viewer.feed import Feed
@@ -54,6 +61,19 @@ def test_what_could_not_be_read_of_a_recording_is_said_and_escaped(clock: Clock)
     assert "<img" not in said and len(said) < 3 * LETTERS
     bus.publish(damaged(""))
     assert notices(feed, "", "", DARK) == ""
+
+
+def test_a_damaged_recording_reaches_the_page(clock: Clock, tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    good = bytearray(flight(10.0))
+    good[len(good) // 3 : len(good) // 3 + 900] = b"\x07" * 900
+    path.write_bytes(good)
+    feed = Feed(bus := MemoryBus(), clock)
+    Pump([Replay(read_spec(f"replay:{path}?speed=max"))], bus).run(threading.Event())
+    said = notices(feed, "", "", DARK)
+    assert (
+        "Recording damaged</b>: flight.tlog: " in said and "damaged bytes skipped" in said and len(feed.vehicles) == 1
+    )
 
 
 def test_links_without_end_are_bounded(clock: Clock) -> None:

@@ -1,10 +1,12 @@
 """Pictures of the page for the README, from live data: aircraft that fly, twins that judge, a browser that draws.
 
-python -m tests.bench.pictures                          all five, about half an hour on two cores
+python -m tests.bench.pictures                          all five, about a quarter of an hour on two cores
 python -m tests.bench.pictures --only selected replay   some of them
 python -m tests.bench.pictures --only selected --router tcp/127.0.0.1:7447   of a fleet that is up already
 
-The crowd is a synthetic fleet that speaks on the bus; all others are flown, or recorded, and judged by real twins.
+Eight aircraft fly a recording, which twins judge that need not hurry; all of it is then said on the bus again, the last
+minutes in real time. The flight played again is one recorded of ArduPlane, judged likewise. The mismatch is found live.
+The crowd is a synthetic fleet that speaks on the bus.
 """
 
 import argparse
@@ -13,6 +15,7 @@ import io
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -21,16 +24,19 @@ from typing import Any
 
 from PIL import Image
 
-from fleet.bus import connect
-from fleet.contract import Alert, AlertKind, Cause, Found, Mismatch
+from fleet.bus import connect, open_router
+from fleet.codec import Stamp
+from fleet.contract import Account, Alert, AlertKind, Cause, Found, Mismatch, Status
+from fleet.telemetry.recordings import Recording
 from tests.bench.viewing.page import ARGS
 from tests.bench.viewing.process import free_port, start, tell
+from twin_worker.offline import run
 
 ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "viewer"
 SIZE = {"width": 1440, "height": 810}
 MOST_BYTES = 300_000
-FLIGHT = "real/alfa_20180718_155331_1_engine_failure.tlog"
+FLIGHT = "sitl/s02_nominal_light_wind.tlog.xz"
 ROWS = """() => [...document.querySelectorAll('tr.pick')].map(e => ({uav: +e.dataset.uav, said: e.innerText,
   horizon: parseFloat((e.querySelector('td:last-child') || e).innerText) || 0}))"""
 
@@ -52,6 +58,62 @@ def fleet(*options: str) -> Iterator[str]:
     router = f"tcp/127.0.0.1:{free_port()}"
     with running("fleet.cli", "up", "--no-viewer", "--router", router, *options):
         yield router
+
+
+def judged(path: Path) -> list[tuple[float, Any, Stamp | None]]:
+    """Let twins judge a recording: everything said, theirs included, in the order of its time [s since 1970]."""
+    said: list[tuple[float, Any, Stamp | None]] = []
+    clock = [0.0]
+
+    def heard() -> Iterator[Any]:
+        for now, news in Recording(str(path), 0).steps():
+            clock[0] = now
+            for message in news:
+                said.append((now, message, None))
+                yield message
+
+    for result in run(heard(), {}):
+        said.append((clock[0], result, Stamp(1, 0xABCD)))  # noqa: PERF401  # `heard` appends in between
+    return said
+
+
+@contextlib.contextmanager
+def told(said: list[tuple[float, Any, Stamp | None]], slow_s: float, links: tuple[str, ...] = ()) -> Iterator[str]:
+    """Say it all on a bus, twelve times as fast as it was, the last `slow_s` [s] in real time; give its router."""
+    router, stop = f"tcp/127.0.0.1:{free_port()}", threading.Event()
+    session, end = open_router(router), said[-1][0]
+
+    def speak() -> None:
+        with connect(router) as bus:
+            stop.wait(12.0)  # until the page is there
+            due, before = time.monotonic(), said[0][0]
+            for t, message, stamp in said:
+                due += (t - before) / (1.0 if t > end - slow_s else 12.0)
+                before = t
+                if stop.wait(max(due - time.monotonic(), 0.0)):
+                    return
+                bus.publish(message, stamp)
+                if links and isinstance(message, Status):
+                    bus.publish(Account(t=t, links=links, uavs=(message.uav,)))
+            stop.wait()
+
+    speaker = threading.Thread(target=speak)
+    speaker.start()
+    try:
+        yield router
+    finally:
+        stop.set()
+        speaker.join()
+        session.close()
+
+
+def flown(uavs: int, seconds: int) -> Path:
+    """Fly simulated aircraft into a recording, kept for the next time."""
+    path = Path(tempfile.gettempdir()) / f"parauav-pictures-{uavs}-{seconds}.tlog"
+    if not path.is_file():
+        options = ["--uavs", f"0-{uavs - 1}", "--for", str(seconds), "--seed", "1", "--tlog", str(path)]
+        subprocess.run([sys.executable, "-m", "fleet.cli", "fly", *options], cwd=ROOT, check=True)
+    return path
 
 
 @contextlib.contextmanager
@@ -140,17 +202,17 @@ def shoot(one: Any, name: str, frames: int = 25) -> None:
 def selected(browser: Any, router: str) -> None:
     """Show eight aircraft, one of them selected, dark and light."""
     with contextlib.ExitStack() as held:
-        where = router or held.enter_context(fleet("--uavs", "8", "--mavlink", f"127.0.0.1:{free_port()}"))
+        where = router or held.enter_context(told(judged(flown(8, 330)), 120.0))
+        pages = [held.enter_context(page(browser, where, *options)) for options in ((), ("--light",))]
         uav = -1
-        for name, options in (("screenshot.png", ()), ("light.png", ("--light",))):
-            with page(browser, where, *options) as one:
-                await_rows(one, "predicting", 6, 900)
-                enough = f"({ROWS})().filter(r => r.horizon >= 10).length >= 3"
-                one.wait_for_function(enough, timeout=900_000, polling=1_000)
-                uav = uav if uav >= 0 else min(rows(one), key=lambda row: abs(row["horizon"] - 40))["uav"]
-                one.wait_for_function("performance.now() > 45000", timeout=90_000)  # trails grow
-                turn_to(one, uav)
-                shoot(one, name)
+        for one, name in zip(pages, ("screenshot.png", "light.png"), strict=True):
+            one.bring_to_front()
+            await_rows(one, "predicting", 6, 300)
+            enough = f"({ROWS})().filter(r => r.horizon >= 10).length >= 3"
+            one.wait_for_function(enough, timeout=300_000, polling=500)
+            uav = uav if uav >= 0 else min(rows(one), key=lambda row: abs(row["horizon"] - 30))["uav"]
+            turn_to(one, uav)
+            shoot(one, name)
 
 
 def many(browser: Any, router: str) -> None:
@@ -181,20 +243,19 @@ def mismatch(browser: Any, router: str) -> None:
 
 
 def replay(browser: Any, router: str) -> None:
-    """Show a real flight played again: what was predicted then against what happened."""
+    """Show a recorded flight played again: what was predicted then against what happened."""
     flight = Path(os.environ["PARAUAV_RECORDINGS"]) / FLIGHT
     with contextlib.ExitStack() as held:
-        where = router or held.enter_context(fleet("--replay", str(flight), "--speed", "2"))
+        where = router or held.enter_context(told(judged(flight), 0.0, (f"replay:{flight.name}",)))
         one = held.enter_context(page(browser, where))
         await_rows(one, "recording ended", 1, 900)
         bar = one.locator(".strip").bounding_box()
-        for share in (0.62, 0.55, 0.7, 0.48, 0.75, 0.4, 0.8):
+        for share in (0.36, 0.35, 0.37, 0.63, 0.62, 0.64, 0.55, 0.7):
             one.mouse.click(bar["x"] + share * bar["width"], bar["y"] + 0.5 * bar["height"])
             one.get_by_text("Not live").wait_for(timeout=20_000)
-            one.evaluate("new Promise(done => setTimeout(done, 3000))")
-            if one.locator(".miss").count() >= 3:
+            one.wait_for_function("() => new Promise(done => setTimeout(() => done(true), 2500))", timeout=10_000)
+            if one.locator(".miss").count() >= 3 and 10 <= rows(one)[0]["horizon"] <= 70:
                 break
-        turn_to(one, rows(one)[0]["uav"])
         shoot(one, "replay.png")
 
 

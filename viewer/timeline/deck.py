@@ -159,13 +159,14 @@ class Timeline:
         self._panel.draw(bar, self._head(t, span), words, self._banner(t, span))
 
     def _head(self, t: float | None, span: Span) -> str:
-        behind = "live" if t is None else f"{strip.length(span.end - t)} before the newest"
+        behind = "live" if t is None else f"{strip.length(span.end - t)} back"
         pace = "" if t is None else " · paused" if not self.player.rate else f" · playing {self.player.rate:g}×"
-        lasts, apart = strip.length(span.end - span.begin), f"predictions {self._tapes.apart_s:.0f} s apart"
-        kept = f"{lasts} of {len(self._tapes.of)} kept, {apart}, {strip.size(self._tapes.nbytes())}"
+        lasts, n = strip.length(span.end - span.begin), len(self._tapes.of)
+        kept = f"{lasts} of {n} UAV{'s' * (n != 1)} kept, {strip.size(self._tapes.nbytes())}"
+        apart = f"one prediction per UAV every {self._tapes.apart_s:.0f} s"
         return (
             f'<div class="head"><b class="now">{stamp(span.end if t is None else t)}</b>'
-            f'<span class="soft">{behind}{pace} · {kept}</span></div>'
+            f'<span class="soft" title="{apart}">{behind}{pace} · {kept}</span></div>'
         )
 
     def _banner(self, t: float | None, span: Span) -> str:
