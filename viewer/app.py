@@ -82,6 +82,7 @@ class App:
                 if tick % SECOND == view.offset or view.dirty:
                     self._land.show(view.client, self.feed.place, self._palette, self._ground)
                     view.panels.ground_said = self._land.sentence
+                    view.scene.ground.grid.show(not self._land.lies)
                     view.settle(self.flock, now, self._ground)
                     if len(self._cloud):
                         view.frame(self._cloud, self._news(), self._ground)

@@ -25,7 +25,8 @@ class Ground:
         # No fog: with it the client fails to draw the outline of an aircraft under the mouse, and then the whole frame.
         self._node = scene.add_frame("/env", show_axes=False)
         lines, colours = zip(*[_grid(palette, *net) for net in NETS], strict=True)
-        Strokes(scene, "/env/grid", 1.0).draw(np.concatenate(lines), np.concatenate(colours))
+        self.grid = Strokes(scene, "/env/grid", 1.0)
+        self.grid.draw(np.concatenate(lines), np.concatenate(colours))
         rings = [circle(np.array([0, 0, 0.02]), m / UNIT_M, 128) for m in RINGS_M]
         Strokes(scene, "/env/rings", 1.2).draw(np.concatenate([*rings, *map(_distance, RINGS_M)]), rgb(palette.ring))
 

@@ -201,13 +201,13 @@ def shoot(one: Any, name: str, frames: int = 25) -> None:
 
 def selected(browser: Any, router: str) -> None:
     """Show eight aircraft, one of them selected, dark and light."""
-    with contextlib.ExitStack() as held:
-        where = router or held.enter_context(told(judged(flown(8, 330)), 120.0))
-        pages = [held.enter_context(page(browser, where, *options)) for options in ((), ("--light",))]
-        uav = -1
-        for one, name in zip(pages, ("screenshot.png", "light.png"), strict=True):
-            one.bring_to_front()
-            await_rows(one, "predicting", 6, 300)
+    said = [] if router else judged(flown(8, 330))
+    uav = -1
+    for name, options in (("screenshot.png", ()), ("light.png", ("--light",))):
+        with contextlib.ExitStack() as held:
+            where = router or held.enter_context(told(said, 90.0))
+            one = held.enter_context(page(browser, where, *options))
+            one.wait_for_function("performance.now() > 50000", timeout=90_000)  # they fly in real time by now
             enough = f"({ROWS})().filter(r => r.horizon >= 10).length >= 3"
             one.wait_for_function(enough, timeout=300_000, polling=500)
             uav = uav if uav >= 0 else min(rows(one), key=lambda row: abs(row["horizon"] - 30))["uav"]

@@ -18,8 +18,9 @@ CELLS, TEXELS = 160, 1_536  # of the mesh and of its picture, along one side
 STEPS_M = (2, 5, 10, 20, 50, 100, 200, 500)  # between contours; the first that makes at most so many of them
 MOST_CONTOURS = 24
 SUN = np.array([-0.5, 0.6, 0.62])  # where the light comes from that shades the slopes: north-west, as on maps
-CONTOUR = {True: "#4C6B57", False: "#A9C3B2"}  # by whether the page is dark
-DIM = {True: 0.6, False: 1.0}  # how much of the light of a picture is kept
+CONTOUR = {True: "#6B9A7E", False: "#7FA08C"}  # by whether the page is dark
+DIM = {True: 0.65, False: 1.0}  # how much of the light of a picture is kept
+LIT = 0.45  # the lights of the scene make a picture so much brighter: 1 over that [-]
 
 
 class Shape(NamedTuple):
@@ -41,6 +42,11 @@ class Land:
         self._shown: dict[int, Place] = {}  # by client: where it was laid out for
         self.sentence = ""  # why nothing is shown; empty: it is
 
+    @property
+    def lies(self) -> bool:
+        """Tell whether there is ground to see, so that the grid is in the way."""
+        return self._mesh is not None
+
     def show(self, client: Any, place: Place | None, palette: Palette, ground: float) -> None:
         """Show it on a page, once; `ground` is where a picture without heights lies [10 m]."""
         if place is None or (self._terrain is None and self._imagery is None):
@@ -53,7 +59,7 @@ class Land:
         if self._mesh is not None:
             client.scene.add_mesh_trimesh("/terrain/ground", self._mesh, cast_shadow=False, receive_shadow=False)
         lines = Strokes(client.scene, "/terrain/contours", 1.2)
-        lines.draw(self._contours, mix(CONTOUR[palette.dark], palette.ground, 0.8))
+        lines.draw(self._contours, mix(CONTOUR[palette.dark], palette.ground, 0.9))
 
     def _lay(self, place: Place, palette: Palette, ground: float) -> None:
         self._place, self._mesh, self._contours, self.sentence = place, None, np.zeros((0, 2, 3)), ""
@@ -93,9 +99,9 @@ class Land:
         )
         if self._imagery is None:
             tint = 0.45 * rgb(palette.section) + 0.55 * plain
-            return Image.fromarray(np.clip(tint * (0.55 + 0.9 * scaled[..., None]), 0, 255).astype(np.uint8))
-        found = self._imagery.at(*_degrees(place, e, n)) * DIM[palette.dark] * (0.75 + 0.5 * scaled[..., None])
-        return Image.fromarray(np.clip(np.where(np.isfinite(found), found, plain), 0, 255).astype(np.uint8))
+            return Image.fromarray(np.clip(LIT * tint * (0.55 + 0.9 * scaled[..., None]), 0, 255).astype(np.uint8))
+        found = self._imagery.at(*_degrees(place, e, n)) * LIT * DIM[palette.dark] * (0.75 + 0.5 * scaled[..., None])
+        return Image.fromarray(np.clip(np.where(np.isfinite(found), found, LIT * plain), 0, 255).astype(np.uint8))
 
 
 def _degrees(place: Place, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
