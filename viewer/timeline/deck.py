@@ -162,7 +162,7 @@ class Timeline:
         behind = "live" if t is None else f"{strip.length(span.end - t)} back"
         pace = "" if t is None else " · paused" if not self.player.rate else f" · playing {self.player.rate:g}×"
         lasts, n = strip.length(span.end - span.begin), len(self._tapes.of)
-        kept = f"{lasts} of {n} UAV{'s' * (n != 1)} kept, {strip.size(self._tapes.nbytes())}"
+        kept = f"{lasts} of {n} kept, {strip.size(self._tapes.nbytes())}"
         apart = f"one prediction per UAV every {self._tapes.apart_s:.0f} s"
         return (
             f'<div class="head"><b class="now">{stamp(span.end if t is None else t)}</b>'
