@@ -23,7 +23,6 @@ def callouts(flock: Flock, selected: int | None, unit: float) -> list[Tag]:
             f"uav{v.uav}",
             f"▲ {v.name}" if flock.crowd else caption(v, flock.now),
             flock.at[i] + above,
-            0.78,
             "bottom-center",
         )
         for v, i in rows

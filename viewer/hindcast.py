@@ -33,4 +33,4 @@ def hindcast(past: list[Kept], trail: np.ndarray, clock: float) -> tuple[np.ndar
     lines = np.concatenate(
         [dashed(told.at(np.linspace(0, reach, 2 * int(reach) + 2))), np.stack([told.at(at), happened], axis=1)]
     )
-    return lines, Tag("then", f"predicted {clock - told.t:.0f} s ago", told.at(0.4 * reach), 0.72)
+    return lines, Tag("then", f"predicted {clock - told.t:.0f} s ago", told.at(0.4 * reach))

@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 MOST = 8
-LETTER, LINE = 0.0068, 0.020  # width and height of a letter over the height of the picture, at scale 1 [-]
+SCALE = 0.82  # of the font, of every label: the page draws each letter once for each size, and slowly
+LETTER, LINE = 0.0068 * SCALE, 0.020 * SCALE  # width and height of a letter over the height of the picture [-]
 EDGE = 0.02  # a label keeps this far from the edge of the picture [heights of it]
 _SHIFT = {"bottom-center": (-0.5, 0.0), "bottom-left": (0.0, 0.0), "top-center": (-0.5, -1.0), "top-left": (0.0, -1.0)}
 
@@ -16,7 +17,6 @@ class Tag(NamedTuple):
     key: str  # what it is, so that it keeps its node while it is shown
     text: str
     at: np.ndarray  # (3,) [10 m]
-    scale: float = 0.8
     anchor: str = "top-center"
 
 
@@ -25,7 +25,7 @@ class Labels:
 
     def __init__(self, scene: Any) -> None:
         self._nodes = [
-            scene.add_label(f"/labels/{k}", "", font_screen_scale=0.8, depth_test=False, visible=False)
+            scene.add_label(f"/labels/{k}", "", font_screen_scale=SCALE, depth_test=False, visible=False)
             for k in range(MOST)
         ]
         self._held: dict[str, Any] = {}  # key -> node
@@ -41,7 +41,7 @@ class Labels:
             if tag.key not in self._held:
                 self._held[tag.key] = next(free)
             node = self._held[tag.key]
-            node.text, node.font_screen_scale, node.anchor = tag.text, tag.scale, tag.anchor
+            node.text, node.anchor = tag.text, tag.anchor
             node.position, node.visible = tuple(float(x) for x in tag.at), True
 
 
@@ -90,7 +90,7 @@ def fitting(tags: list[Tag], sight: Sight) -> list[Tag]:
 
 def _box(tag: Tag, spot: np.ndarray) -> np.ndarray:
     """Give the corners of a label in the picture, (2, 2) [heights of it]."""
-    size = np.array([LETTER * len(tag.text), LINE]) * tag.scale
+    size = np.array([LETTER * len(tag.text), LINE])
     low = spot + np.array(_SHIFT[tag.anchor]) * size
     return np.stack([low, low + size])
 

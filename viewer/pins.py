@@ -60,7 +60,7 @@ class Pins:
         self._batch.batched_colors = mesh_colour(colours)
         above = np.array([0.0, 0.0, 0.9 * RADIUS * size])
         return [
-            Tag(f"event{event.t}{event.kind}", caption(event), spot + above, 0.75, "bottom-center")
+            Tag(f"event{event.t}{event.kind}", caption(event), spot + above, "bottom-center")
             for event, spot in apart(found, at, CLEAR * size)
         ]
 

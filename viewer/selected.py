@@ -73,7 +73,7 @@ class Selection:
         if at is None:
             return self.clear()
         thin, bold, clock = Sheaf(), Sheaf(), vehicle.clock(now)
-        self.tags = [Tag("name", caption(vehicle, now), at + np.array([0, 0, 0.85 * unit]), 0.95, "bottom-center")]
+        self.tags = [Tag("name", caption(vehicle, now), at + np.array([0, 0, 0.85 * unit]), "bottom-center")]
         foot = at * [1, 1, 0] + [0, 0, ground + 0.06]
         bold.add(closed(disc(foot, 1.1 * unit)), rgb(p.ink))
         bold.add(closed(disc(at, 0.85 * unit)), rgb(p.ink))
@@ -123,9 +123,9 @@ class Selection:
         self._horizon.draw(closed(hoop[-1]), rgb(p.horizon))
         said = "below 10 % to the end" if told.message.horizon_open else "error reaches 10 %"
         top = hoop[-1][np.argmax(hoop[-1][:, 2])]
-        self.tags.append(Tag("horizon", f"horizon {until:.0f} s: {said}", top, 0.8, "bottom-left"))
+        self.tags.append(Tag("horizon", f"horizon {until:.0f} s: {said}", top, "bottom-left"))
         lows = [ring[np.argmin(ring[:, 2])] for ring in hoop[:-1]]
-        self.tags += [Tag(f"+{s:g}", f"+{s:g} s", low, 0.72) for s, low in zip(steps, lows, strict=True)]
+        self.tags += [Tag(f"+{s:g}", f"+{s:g} s", low) for s, low in zip(steps, lows, strict=True)]
 
     def _hide_tube(self) -> None:
         for node in (*self._bands, self._curtain):
@@ -147,7 +147,7 @@ class Selection:
         begun = mismatch.place(found, rows)
         self.marks = self._pins.draw(vehicle.events, rows, vehicle.where(now), unit)
         if found is not None and begun is not None:
-            self.marks.insert(0, Tag("mismatch", f"▲ {mismatch.short(found)} from here", begun, 0.85))
+            self.marks.insert(0, Tag("mismatch", f"▲ {mismatch.short(found)} from here", begun))
 
     def draw_route(self, vehicle: Vehicle, route: Route, sight: Sight, unit: float) -> None:
         """Draw its mission; numbers face the camera."""
