@@ -2,7 +2,7 @@
 
     python -m tests.bench.viewing --uavs 1000 --json viewing.json
     python -m tests.bench.viewing --uavs 200 --seconds 60 --picture fleet.png
-    python -m tests.bench.viewing --uavs 1000 --seconds 600 --plain 0      is its memory flat?
+    python -m tests.bench.viewing --uavs 1000 --seconds 1200 --plain 0     is its memory flat, once ten minutes are kept?
 
 A router, the feeder, the viewer as an operator starts it, one browser with software rendering and three websocket
 clients, all on this machine: the browser takes the most of it. `server_cpu` is of one core, all threads of the viewer.
@@ -120,9 +120,14 @@ def watched(pid: int, watchers: list[Watcher], seconds: float) -> dict[str, Any]
         "server_cpu": share(pid, cpu, begin),
         "clients_kB_s": [round((w.bytes - b) / spent / 1e3, 1) for w, b in zip(watchers, before, strict=True)],
         "clients_first_s": [round(watcher.first_s, 2) for watcher in watchers],
-        "memory_MB": [round(held[0], 1), round(held[-1], 1)],
-        "memory_MB_min": round(float(np.polyfit(minutes, held, 1)[0]), 2) if len(held) > 5 else None,
+        "memory_MB": [round(mb, 1) for mb in held[:: max(len(held) // 20, 1)]],
+        "memory_MB_min_late": _slope(minutes[-len(held) // 3 :], held[-len(held) // 3 :]),
     }
+
+
+def _slope(minutes: np.ndarray, held: np.ndarray) -> float | None:
+    """Give how fast memory grows in the last third, when what is kept of everyone is full [MB/min]."""
+    return round(float(np.polyfit(minutes, held, 1)[0]), 2) if len(held) > 5 else None
 
 
 def plain(router: str, seconds: float) -> dict[str, Any]:
