@@ -2,7 +2,7 @@
 
     python -m tests.bench.viewing --uavs 1000 --json viewing.json
     python -m tests.bench.viewing --uavs 200 --seconds 60 --picture fleet.png
-    python -m tests.bench.viewing --uavs 1000 --seconds 1200 --plain 0     is its memory flat, once ten minutes are kept?
+    python -m tests.bench.viewing --uavs 1000 --seconds 1200 --plain 0     is memory flat once ten minutes are kept?
 
 A router, the feeder, the viewer as an operator starts it, one browser with software rendering and three websocket
 clients, all on this machine: the browser takes the most of it. `server_cpu` is of one core, all threads of the viewer.
