@@ -12,7 +12,7 @@ from viewer.strokes import Strokes, chain
 
 RINGS_M = (500, 1000, 2000, 5000, 10_000)
 NETS = ((100, 1_200, 0.5), (500, 6_000, 1.0), (5_000, 30_000, 1.0))  # lines so far apart, so far out [m], how strong
-PARTS = 12  # a line of the grid fades in so many steps
+PARTS = 6  # a line of the grid fades in so many steps
 
 
 class Ground:
@@ -27,7 +27,7 @@ class Ground:
         lines, colours = zip(*[_grid(palette, *net) for net in NETS], strict=True)
         self.grid = Strokes(scene, "/env/grid", 1.0)
         self.grid.draw(np.concatenate(lines), np.concatenate(colours))
-        rings = [circle(np.array([0, 0, 0.02]), m / UNIT_M, 128) for m in RINGS_M]
+        rings = [circle(np.array([0, 0, 0.02]), m / UNIT_M, 80) for m in RINGS_M]
         Strokes(scene, "/env/rings", 1.2).draw(np.concatenate([*rings, *map(_distance, RINGS_M)]), rgb(palette.ring))
 
     def raise_to(self, height: float) -> None:
