@@ -9,6 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import numpy as np
+
 import fleet
 from fleet.bus import Bus
 from fleet.codec import Stamp
@@ -18,7 +20,7 @@ from twin_worker.claims.carry import Load, packed, unpacked
 from twin_worker.claims.past import SELDOM, recall
 from twin_worker.claims.revive import go_on, revive
 from twin_worker.conflict.ledger import Ledger
-from twin_worker.memory import Twin
+from twin_worker.memory import Twin, hear
 
 _log = logging.getLogger(__name__)
 INBOX = 4096  # messages waiting per UAV; the oldest go first and are counted
@@ -143,15 +145,24 @@ class Twins:
         if held is None or held.ready:
             return
         twin = self._make(uav)
-        if (made := self._predictions.pop(uav, None)) is not None:
-            go_on(twin, made)
+        if (made := self._predictions.pop(uav, None)) is not None and go_on(twin, made):
+            self._begin(held, twin, [], bare=True)  # it writes at once, and hears what was said before when that comes
         try:
-            recall(self._bus, twin, self._said.pop(uav, {}))
+            past = recall(self._bus, uav, self._said.pop(uav, {}))
         except ConnectionError:  # we are leaving
             return
-        if (model := self._models.pop(uav, None)) is not None:
-            revive(twin, model)
-        if self.held.get(uav) is held:  # it may have been lost meanwhile
+        model = self._models.pop(uav, None)
+        with held.lock:
+            for message in past:
+                hear(twin, message)
+            if model is not None:
+                revive(twin, model)
+            twin.predict_t = -np.inf
+        if self.held.get(uav) is not held:  # it was lost meanwhile
+            return
+        if held.ready:
+            held.bare = False
+        else:
             self._begin(held, twin, [])
 
     def renew(self, uav: int, epoch: int) -> None:
@@ -164,7 +175,7 @@ class Twins:
             return self.held.setdefault(uav, Held(self._make(uav), 0, ready=False))
 
     @staticmethod
-    def _begin(held: Held, twin: Twin, before: list[Message]) -> None:
+    def _begin(held: Held, twin: Twin, before: list[Message], *, bare: bool = False) -> None:
         """Go on with a twin, and with what came since: telemetry it has already taken in is not taken in again."""
         with held.lock:
             known = twin.data_t if twin.data_t > 0 else twin.history.newest
@@ -172,7 +183,7 @@ class Twins:
             held.inbox.clear()
             held.inbox.extend([*before, *since])
             held.twin = twin
-            held.bare, held.ready, held.since = False, True, time.monotonic()
+            held.bare, held.ready, held.since = bare, True, time.monotonic()
             if held.arrived != held.arrived and twin.history.newest > 0:
                 held.arrived = time.monotonic()
 
@@ -195,7 +206,7 @@ class Twins:
         if held is None:
             return None
         with held.lock:
-            if not held.ready:
+            if not held.ready or held.bare:
                 return None
             held.ready = False
             conflicts, mismatch = self._extras.give(uav)

@@ -6,23 +6,24 @@ from typing import Any
 import numpy as np
 
 from fleet.bus import Bus
-from fleet.contract import COLUMNS, Array, History, Message, Mission, Params, Rows, Sample, Status
-from twin_worker.memory import Twin, hear
+from fleet.contract import COLUMNS, DTYPES, Array, History, Message, Mission, Params, Rows, Sample, Status
 
 PATIENCE_S = 0.5  # with a gateway that does not answer [s]
 SELDOM: tuple[type[Message], ...] = (Status, Params, Mission)
 """What is said so seldom that the last of each is worth keeping."""
 
 
-def recall(bus: Bus, twin: Twin, known: Mapping[type, Message]) -> None:
-    """Let a fresh twin hear what was said of its aircraft before; what is `known` already is not asked for."""
+def recall(bus: Bus, uav: int, known: Mapping[type, Message]) -> list[Message]:
+    """Ask what was said of an aircraft before, for a fresh twin to hear; what is `known` already is not asked for.
+
+    Raises:
+        ConnectionError: when the session is closed.
+    """
+    found: list[Message] = []
     for kind in SELDOM:
-        found = [known[kind]] if kind in known else [said for said, _ in bus.ask(kind, twin.uav, PATIENCE_S)]
-        for message in found:
-            hear(twin, message)
-    for said in bus.gather(History, twin.uav, b"", PATIENCE_S):
-        if said.uav == twin.uav and said.samples:
-            hear(twin, joined(said))
+        found += [known[kind]] if kind in known else [said for said, _ in bus.ask(kind, uav, PATIENCE_S)]
+    samples = [said for said in bus.gather(History, uav, b"", PATIENCE_S) if said.uav == uav and said.samples]
+    return [*found, *map(joined, samples)]
 
 
 def joined(said: History) -> Sample:
@@ -36,20 +37,20 @@ def joined(said: History) -> Sample:
 
 
 def _rows(rows: list[Rows], width: int) -> Rows | None:
+    """Put those together that are of the newest one's kind of number, and have the shape and bytes they say."""
     dtype = rows[-1].x.dtype
-    fit = [row for row in rows if row.t.dtype == "<f8" and row.x.dtype == dtype and _whole(row, width)]
-    n = sum(row.t.shape[0] for row in fit)
+    if dtype not in DTYPES:
+        return None
+    size = width * np.dtype(dtype).itemsize
+    times, values, n = [], [], 0
+    for row in rows:
+        t, x = row.t, row.x
+        k = len(t.data) >> 3
+        whole = t.shape == (k,) and x.shape == (k, width) and len(x.data) == k * size and len(t.data) == 8 * k
+        if whole and t.dtype == "<f8" and x.dtype == dtype:
+            times.append(t.data)
+            values.append(x.data)
+            n += k
     if not n:
         return None
-    t = Array("<f8", (n,), b"".join(row.t.data for row in fit))
-    return Rows(t=t, x=Array(dtype, (n, width), b"".join(row.x.data for row in fit)))
-
-
-def _whole(row: Rows, width: int) -> bool:
-    """Tell whether rows have the shape and the bytes that their kind has."""
-    n = row.t.shape[0] if len(row.t.shape) == 1 else -1
-    try:
-        size = np.dtype(row.x.dtype).itemsize
-    except TypeError:
-        return False
-    return row.x.shape == (n, width) and len(row.t.data) == 8 * n and len(row.x.data) == size * n * width
+    return Rows(t=Array("<f8", (n,), b"".join(times)), x=Array(dtype, (n, width), b"".join(values)))

@@ -31,19 +31,20 @@ def revive(twin: Twin, model: Model) -> bool:
     return True
 
 
-def go_on(twin: Twin, made: Prediction) -> None:
+def go_on(twin: Twin, made: Prediction) -> bool:
     """Let a fresh twin renew the last prediction another worker published, until it has flown one of its own.
 
-    It keeps the origin of the local frame, too.
+    It keeps the origin of the local frame, too, and flies no other before it has heard what was said before.
     """
     try:
         n = len(made.ahead.numpy())
         shapes = [(each.dtype, each.numpy().shape) for each in (made.ahead, made.path, made.tube)]
     except (ValueError, TypeError):
-        return
+        return False
     if n < 2 or shapes != [("<f4", (n,)), *[("<f4", (n, 3))] * 2]:
-        return
-    twin.origin, twin.prediction, twin.base = made.ned_origin(), made, made
+        return False
+    twin.origin, twin.prediction, twin.base, twin.predict_t = made.ned_origin(), made, made, made.t
+    return True
 
 
 def _coupled(twin: Twin, model: Model) -> Coupled | None:

@@ -28,7 +28,7 @@ _PACE = "predict=1,identify=5,ensemble=10"
 
 
 def ask(session: Any) -> dict[int, tuple[int, int, dict[str, Any]]]:
-    """Ask for every prediction as a foreign tool does; gives epoch, writer, prediction of the highest claim by id."""
+    """Ask for every prediction as a foreign tool does; give epoch, writer and prediction by UAV id."""
     import zenoh
 
     found: dict[int, tuple[int, int, dict[str, Any]]] = {}
