@@ -134,19 +134,28 @@ class Twins:
 
     def recall(self, uavs: list[int]) -> None:
         """Begin some without their twins: with the gateway's last minutes, and the model published last."""
-        if len(uavs) == 1:
-            self._recall(uavs[0])
-        elif uavs:
+        begun = [(uav, twin) for uav in uavs if (twin := self._go_on(uav)) is not None]  # all of them, before the rest
+        if len(begun) == 1:
+            self._recall(*begun[0])
+        elif begun:
             with ThreadPoolExecutor(_AT_ONCE, "recall") as pool:
-                list(pool.map(self._recall, uavs))
+                list(pool.map(self._recall, *zip(*begun, strict=True)))
 
-    def _recall(self, uav: int) -> None:
+    def _go_on(self, uav: int) -> Twin | None:
+        """Make a twin that writes at once where another worker published a prediction; None where there is a twin."""
         held = self.held.get(uav)
         if held is None or held.ready:
-            return
+            return None
         twin = self._make(uav)
         if (made := self._predictions.pop(uav, None)) is not None and go_on(twin, made):
-            self._begin(held, twin, [], bare=True)  # it writes at once, and hears what was said before when that comes
+            self._begin(held, twin, [], bare=True)
+        return twin
+
+    def _recall(self, uav: int, twin: Twin) -> None:
+        """Let a twin hear what was said before, and believe what was published."""
+        held = self.held.get(uav)
+        if held is None:
+            return
         try:
             past = recall(self._bus, uav, self._said.pop(uav, {}))
         except ConnectionError:  # we are leaving
