@@ -203,6 +203,14 @@ def test_live_shows_the_fleet_itself_and_another_time_another_flock(flown) -> No
     assert one.flock(live, 0, clock.now) is live
 
 
+def test_the_head_says_how_much_is_kept_and_what_it_takes(flown) -> None:
+    one, feed, clock = flown
+    shown(one, feed, clock, 70.0)
+    said = one._head(one.player.t, one._span)
+    assert "0:30 back · paused · 1:40 of 5 kept, " in said and " MB<" in said and "every 5 s" in said
+    assert " UAVs" not in said  # the fleet's own words, which are looked for on the page
+
+
 def test_two_pages_show_two_times(flown) -> None:
     one, feed, clock = flown
     other = Timeline(MagicMock(), feed, one._tapes, DARK, lambda: None)
