@@ -95,10 +95,10 @@ def with_page(args: argparse.Namespace, router: str, feeder: Any) -> dict[str, A
             page.picture(args.picture)
         viewer.kill()
         viewer.wait(30)
-        page.seen()
         spawned = time.time()
         viewer = start(*command)
         listening = time.time()
+        page.seen()  # what the one before had still sent is forgotten
         page.await_pose()
         found["restart"] = {"start_s": round(listening - spawned, 2), "usable_s": round(time.time() - listening, 2)}
     viewer.terminate()
