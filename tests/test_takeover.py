@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import ClassVar
 
 import flights as f
 import msgspec
@@ -18,6 +19,7 @@ from fleet.bus import Bus, MemoryBus, connect
 from fleet.codec import Stamp
 from fleet.contract import Claim, Handover, History, Message, Mission, Model, Prediction, Sample, Status, Wanted
 from gateway.publish import Publisher
+from tests.bench.asking.answerer import prediction
 from twin_worker.claims.protocol import Claiming
 from twin_worker.claims.tree import pack
 from twin_worker.worker import Worker
@@ -189,6 +191,24 @@ def test_two_share_a_third_joins_one_leaves_and_nothing_is_forgotten(
         one.leave()  # type: ignore[attr-defined]
         wait(lambda: held(two) | held(three) == set(range(6)))
         assert not held(one)
+
+
+def test_all_that_are_taken_over_write_before_the_past_of_any_has_come() -> None:
+    class Asked(MemoryBus):
+        seen: ClassVar[list[set[tuple[bool, bool]]]] = []
+
+        def gather(self, kind: type, *_: object) -> Iterator:
+            self.seen.append({(held.ready, held.bare) for held in worker._held.values()})
+            return iter(())
+
+    worker = Worker(Asked(), range(5), omega=0.0)
+    for uav in (1, 2, 3):
+        assert worker._twins.overhear(prediction(uav), Stamp(5, 7))
+        worker._twins.adopt(uav, 9, None)
+    assert worker._twins.bare == (1, 2, 3) and not worker.holding()
+    worker._twins.recall([1, 2, 3])
+    assert Asked.seen[0] == {(True, True)} and worker._twins.bare == ()
+    assert all(held.twin.base is not None for held in worker.holding())
 
 
 def test_the_protocol_ignores_strangers(bus: MemoryBus) -> None:
