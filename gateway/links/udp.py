@@ -10,7 +10,7 @@ from typing import Any, cast
 
 from gateway.link import POLL_S, Batch, Outlet
 from gateway.links.backoff import BackOff
-from gateway.links.receive import receiver
+from gateway.links.receive import MOST, receiver
 from gateway.spec import Spec
 
 BUFFER = 1 << 24  # asked of the system: half a second of 250 aircraft [bytes]
@@ -69,7 +69,8 @@ class Udp:
                     heard = source.take()
                     if heard is not None:
                         outlet.put(heard)
-                    stop.wait(nap)
+                    if heard is None or len(heard.start) < MOST:  # else there is more
+                        stop.wait(nap)
 
     def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
         """Send one datagram; a full buffer or a far end that is not there loses it, and that is counted."""
