@@ -11,27 +11,11 @@ from typing import Any, TypeVar
 import zenoh
 
 from fleet.access.entry import ROUTER, Entry, endpoint
-from fleet.access.knock import answers, reachable
+from fleet.access.knock import answers
 from fleet.access.roles import ROOT
 from fleet.codec import Stamp, Wire, decode, encode, encoding, pack_stamp, unpack_stamp
 from fleet.contract import PER_UAV, Claim
-from fleet.memory_bus import MemoryBus
-from fleet.talk import (
-    Answer,
-    Answers,
-    Bus,
-    Heard,
-    Overheard,
-    Token,
-    Wants,
-    asked_for,
-    key,
-    newest,
-    uav_in,
-)
-
-__all__ = ["ROOT", "ROUTER", "Answers", "Bus", "MemoryBus", "ZenohBus", "asked_for", "connect", "endpoint", "key"]
-__all__ += ["newest", "open_router", "reachable", "uav_in"]
+from fleet.talk import Answer, Heard, Overheard, Token, Wants, asked_for, key, newest, uav_in
 
 M = TypeVar("M")
 _WAITED_FOR = (Claim,)  # seldom and needed: the sender waits where the way is full, everything else is dropped there

@@ -9,9 +9,9 @@ from typing import Any
 
 import msgspec
 
-from fleet.bus import Answers
 from fleet.codec import Wire
 from fleet.contract import History, Sample, Status
+from fleet.talk import Answers
 
 SECONDS = 160.0  # as long as a twin remembers
 MOST = 512 << 20  # bytes over all aircraft; beyond, everybody's past becomes shorter

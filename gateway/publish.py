@@ -8,9 +8,9 @@ from typing import Any
 
 import msgspec
 
-from fleet.bus import Answers, Bus
 from fleet.codec import Stamp, Wire, encode
 from fleet.contract import PER_UAV, Account, Alert, AlertKind, FleetState, History, Mission, Params, Status
+from fleet.talk import Answers, Bus
 from fleet.telemetry.fleet_news import RESULTS
 from gateway.history import Keeper
 from gateway.router import Way

@@ -7,9 +7,9 @@ from collections.abc import Hashable, Sequence
 
 import msgspec
 
-from fleet.bus import Bus
 from fleet.codec import Wire
 from fleet.contract import Message
+from fleet.talk import Bus
 from fleet.telemetry.craft import Craft
 from fleet.telemetry.heard import Heard
 from fleet.telemetry.intake import MOST_UAVS, Intake

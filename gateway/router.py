@@ -5,8 +5,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from fleet.bus import Bus
 from fleet.codec import Stamp, Wire
+from fleet.talk import Bus
 
 LEASE_S = 1.0  # a router that stops answering is missed after this long [s]
 

@@ -20,8 +20,9 @@ import hover
 import numpy as np
 import pytest
 
-from fleet.bus import MemoryBus, open_router
+from fleet.bus import open_router
 from fleet.contract import Message
+from fleet.memory_bus import MemoryBus
 from twin_worker.contest import Contest
 from twin_worker.horizon import Record
 from twin_worker.offline import run

@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from fleet.bus import ROUTER, Bus, MemoryBus, connect, open_router, reachable
+from fleet.access.entry import ROUTER
+from fleet.access.knock import reachable
+from fleet.bus import connect, open_router
 from fleet.cli import stop_on_signal
 from fleet.codec import Stamp
 from fleet.contract import (
@@ -38,6 +40,8 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin, to_geodetic
+from fleet.memory_bus import MemoryBus
+from fleet.talk import Bus
 from viewer.feed import Feed
 
 HOME = Origin(473977420, 85455940, 488_000)

@@ -13,12 +13,12 @@ import pytest
 from conftest import ROOT, unused_port
 
 from fleet import commands
-from fleet.access.entry import Entry
+from fleet.access.entry import ROUTER, Entry
 from fleet.access.knock import answers
 from fleet.access.papers import ending, papers_of, password_of
 from fleet.access.roles import ROLES, ROUTER_ROLE
 from fleet.access.rules import PASSWORD, access_control
-from fleet.bus import ROUTER, connect, open_router
+from fleet.bus import connect, open_router
 from fleet.config import entry, passed_on, router_arguments
 from gateway import __main__ as gateway
 from tests.bench.security.site import SCRIPT, expired, make_papers, make_passwords

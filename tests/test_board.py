@@ -14,8 +14,8 @@ from rich.console import Console
 from talker import T0, Talker
 from test_gateway import PATIENCE_S, Ear
 
-from fleet.bus import MemoryBus
 from fleet.contract import Account, Status
+from fleet.memory_bus import MemoryBus
 from fleet.metrics import served
 from gateway import board
 from gateway.account import overruns

@@ -12,9 +12,13 @@ import zenoh
 from conftest import ROOT, unused_port
 from examples import EXAMPLES
 
-from fleet.bus import Bus, MemoryBus, connect, endpoint, key, newest, open_router, reachable, uav_in
+from fleet.access.entry import endpoint
+from fleet.access.knock import reachable
+from fleet.bus import connect, open_router
 from fleet.codec import Stamp, encode, encoding
 from fleet.contract import Account, Alert, AlertKind, FleetState, Prediction, Sample, Status
+from fleet.memory_bus import MemoryBus
+from fleet.talk import Bus, key, newest, uav_in
 
 PATIENCE_S = 10.0
 STAMP = Stamp(epoch=5, writer=99)

@@ -10,11 +10,11 @@ import pytest
 from predicted import T, straight
 from rich.console import Console
 
-from fleet.bus import MemoryBus
 from fleet.codec import Stamp
 from fleet.commands.status import fleet_rows, table
 from fleet.contract import Alert, AlertKind, FleetRow, FleetState, Message, Prediction, State
 from fleet.frames import to_geodetic
+from fleet.memory_bus import MemoryBus
 from twin_worker import offline
 from twin_worker import worker as live
 from twin_worker.__main__ import main

@@ -17,10 +17,10 @@ from examples import EXAMPLES
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Talker, of
 
-from fleet.bus import MemoryBus
 from fleet.codec import decode, encode
 from fleet.contract import COLUMNS, Account, Array, Item, Mission, Params, Rows, Sample, Status
 from fleet.frames import Origin, to_geodetic, to_ned
+from fleet.memory_bus import MemoryBus
 from fleet.telemetry.airing import Airing, address
 from fleet.telemetry.aside import SPACING_M, Aside
 from fleet.telemetry.copies import GROUPS, Copies, Group, Prepared

@@ -9,8 +9,8 @@ from oracle import framed, ours
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import ITEMS, Aircraft, Ears, Talker
 
-from fleet.bus import MemoryBus
 from fleet.contract import Alert, Mission, Params
+from fleet.memory_bus import MemoryBus
 from fleet.telemetry.decode import IDS
 from fleet.telemetry.heard import Heard
 from gateway.forward import ASTRAY, DATAGRAM, DOUBLE

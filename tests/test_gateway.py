@@ -13,8 +13,9 @@ from conftest import ROOT, unused_port
 from fake_link import FakeLink
 from talker import ITEMS, T0, Aircraft, Talker
 
-from fleet.bus import MemoryBus, connect
+from fleet.bus import connect
 from fleet.contract import Account, Mission, Params, Sample, Status
+from fleet.memory_bus import MemoryBus
 from fleet.telemetry.heard import Heard
 from fleet.telemetry.recordings import replay_messages
 from gateway.__main__ import COLD, compiled

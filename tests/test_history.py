@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from talker import T0
 
-from fleet.bus import MemoryBus, connect, key
+from fleet.bus import connect
 from fleet.codec import Wire, encode
 from fleet.contract import Array, History, Rows, Sample, Status
+from fleet.memory_bus import MemoryBus
+from fleet.talk import key
 from gateway.history import Keeper
 from gateway.publish import Publisher
 

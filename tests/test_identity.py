@@ -16,8 +16,8 @@ from oracle import framed, ours, raw
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import ARDU, PLANE, T0, Talker, of
 
-from fleet.bus import MemoryBus
 from fleet.contract import Account, Alert, AlertKind, Status
+from fleet.memory_bus import MemoryBus
 from fleet.telemetry.collision import QUIET_S
 from fleet.telemetry.ids import Ids
 from fleet.telemetry.intake import Intake

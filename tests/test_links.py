@@ -15,8 +15,8 @@ from conftest import unused_port
 from fake_link import PATIENCE_S, pieces, until
 from talker import Talker
 
-from fleet.bus import MemoryBus
 from fleet.contract import Account
+from fleet.memory_bus import MemoryBus
 from fleet.telemetry.heard import Heard
 from fleet.telemetry.ids import Ids
 from gateway.link import Batch, wall

@@ -7,8 +7,8 @@ import hover
 import numpy as np
 import pytest
 
-from fleet.bus import MemoryBus
 from fleet.contract import Alert, Event, Message, Model, Prediction, Sample
+from fleet.memory_bus import MemoryBus
 from fleet.telemetry.recordings import replay_messages
 from twin_worker import worker as live
 from twin_worker.offline import run

@@ -10,9 +10,9 @@ import pytest
 from conftest import ROOT, unused_port
 from prometheus_client.parser import text_string_to_metric_families
 
-from fleet.bus import MemoryBus
 from fleet.contract import FleetRow, FleetState, State
 from fleet.logs import Lines, Words
+from fleet.memory_bus import MemoryBus
 from fleet.metrics import served
 from tests.bench.security.bombs import ESCAPES
 from twin_worker.metrics import counters

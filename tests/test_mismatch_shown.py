@@ -5,8 +5,8 @@ import copy
 import numpy as np
 import pytest
 
-from fleet.bus import MemoryBus
 from fleet.contract import Found, Message, Mismatch, Prediction, Sample
+from fleet.memory_bus import MemoryBus
 from tests.bench.mismatch.flown import Inline, errors
 from tests.bench.mismatch.world import FAULT, ONSET_S, baseline, messages
 from twin_worker.mismatch.live import ALL, Live

@@ -14,9 +14,12 @@ import pytest
 from conftest import ROOT, unused_port
 
 from fleet import cli
-from fleet.bus import ROUTER, Answer, MemoryBus, connect, open_router
+from fleet.access.entry import ROUTER
+from fleet.bus import connect, open_router
 from fleet.codec import Stamp
 from fleet.contract import Array, Prediction, State
+from fleet.memory_bus import MemoryBus
+from fleet.talk import Answer
 from gateway import __main__ as gateway
 from twin_worker import __main__ as twin_worker
 from twin_worker.worker import Worker

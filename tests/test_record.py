@@ -14,11 +14,12 @@ from conftest import ROOT
 from examples import EXAMPLES, MESSAGES
 from pretend_feed import STAMP, PretendFleet, T
 
-from fleet.bus import MemoryBus, connect
+from fleet.bus import connect
 from fleet.codec import Stamp, encode, encoding
 from fleet.commands import record
 from fleet.commands.record import Recorder
 from fleet.contract import TOPICS, Alert, FleetState, Message, Mission, Model, Prediction, Sample, Status
+from fleet.memory_bus import MemoryBus
 from fleet.telemetry.fleet_log import HOPELESS, Record
 from fleet.telemetry.fleet_news import NEWS, RESULTS
 from fleet.telemetry.recordings import Recording, replay_messages

@@ -13,9 +13,10 @@ from pymavlink import mavutil
 from talker import T0, Talker
 from test_gateway import PATIENCE_S, Ear, udp_port
 
-from fleet.bus import MemoryBus, connect, open_router
+from fleet.bus import connect, open_router
 from fleet.codec import Wire, encode
 from fleet.contract import Account, Mission, Status
+from fleet.memory_bus import MemoryBus
 from gateway.publish import Publisher
 from gateway.router import LEASE_S, Way
 

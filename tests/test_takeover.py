@@ -15,9 +15,11 @@ import msgspec
 import pytest
 from conftest import ROOT
 
-from fleet.bus import Bus, MemoryBus, connect
+from fleet.bus import connect
 from fleet.codec import Stamp
 from fleet.contract import Claim, Handover, History, Message, Mission, Model, Prediction, Sample, Status, Wanted
+from fleet.memory_bus import MemoryBus
+from fleet.talk import Bus
 from gateway.publish import Publisher
 from tests.bench.asking.answerer import prediction
 from twin_worker.claims.protocol import Claiming

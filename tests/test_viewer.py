@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from pretend_feed import HOME, HOSTILE, STAMP, Clock, PretendUav, T, feed_of, fields
 
-from fleet.bus import MemoryBus
 from fleet.contract import (
     Alert,
     AlertKind,
@@ -23,6 +22,7 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin, body_to_ned, to_geodetic
+from fleet.memory_bus import MemoryBus
 from viewer.camera import FOV, frame, near
 from viewer.charts import band, scale
 from viewer.chronicle import listing

@@ -13,7 +13,7 @@ from viser import _messages
 from websockets.datastructures import Headers
 from websockets.http11 import Request
 
-from fleet.bus import MemoryBus
+from fleet.memory_bus import MemoryBus
 from viewer.app import App
 from viewer.door import POLICY, doorman, quiet, serve
 

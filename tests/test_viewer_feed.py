@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from pretend_feed import HOME, STAMP, Clock, PretendFleet, PretendUav, T, feed_of, fields
 
-from fleet.bus import MemoryBus
 from fleet.codec import Stamp
 from fleet.contract import Alert, AlertKind, Array, FleetRow, FleetState, Mission, Prediction, Rows, Sample, State
 from fleet.frames import Origin
+from fleet.memory_bus import MemoryBus
 from viewer.detail import why
 from viewer.events import MAX_RAISED
 from viewer.feed import GIVE_UP_S, Feed

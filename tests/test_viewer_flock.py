@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from pretend_feed import STAMP, Clock, PretendUav, T, feed_of
 
-from fleet.bus import MemoryBus
 from fleet.codec import encode
 from fleet.contract import Array, Mission, Rows, Sample, Status
 from fleet.frames import Origin
+from fleet.memory_bus import MemoryBus
 from viewer.errors import AHEADS_S, by_ahead, errors
 from viewer.feed import Feed
 from viewer.flock import CROWD, LOST, MINUTE, MISMATCH, Flock, look

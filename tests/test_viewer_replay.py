@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pretend_feed import STAMP, Clock, PretendUav, T, feed_of
 
-from fleet.bus import MemoryBus
 from fleet.contract import Account, Alert, AlertKind, State, Status
+from fleet.memory_bus import MemoryBus
 from fleet.telemetry.onboard_news import UNDATED_S
 from fleet.telemetry.recordings import Recording
 from viewer import datatime

@@ -7,8 +7,8 @@ import pytest
 from pretend_feed import HOSTILE, STAMP, Clock, PretendUav, T, feed_of
 from test_gateway import flight
 
-from fleet.bus import MemoryBus
 from fleet.contract import Account, LinkAccount, Status
+from fleet.memory_bus import MemoryBus
 from gateway.pump import Pump
 from gateway.recorded import Replay
 from gateway.spec import read_spec

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pretend_feed import HOSTILE, Clock, PretendFleet, PretendUav, T, feed_of
 
-from fleet.bus import MemoryBus
 from fleet.contract import Account, Alert, AlertKind, State, Status
+from fleet.memory_bus import MemoryBus
 from viewer.detail import about, facts
 from viewer.events import Event, Kind
 from viewer.feed import Feed

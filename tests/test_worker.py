@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from flights import item
 
-from fleet.bus import MemoryBus
 from fleet.codec import Stamp, decode
 from fleet.contract import (
     Array,
@@ -21,6 +20,7 @@ from fleet.contract import (
     State,
     Status,
 )
+from fleet.memory_bus import MemoryBus
 from twin_worker import worker as live
 from twin_worker.claims.keeper import INBOX
 from twin_worker.whatif.grid import resample, wanted

@@ -11,7 +11,6 @@ import msgspec
 from msgspec import Raw
 
 from fleet.airframes import GENERIC, Airframe, load
-from fleet.bus import Bus
 from fleet.codec import Stamp, encode
 from fleet.contract import (
     Alert,
@@ -25,6 +24,7 @@ from fleet.contract import (
     Status,
     WhatIf,
 )
+from fleet.talk import Bus
 from twin_worker.claims.carry import Load
 from twin_worker.claims.keeper import Held, Twins
 from twin_worker.claims.past import SELDOM

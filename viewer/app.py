@@ -7,7 +7,7 @@ import time
 import numpy as np
 import viser
 
-from fleet.bus import Bus
+from fleet.talk import Bus
 from viewer.camera import IN_VIEW_M, near, start_at
 from viewer.feed import Feed
 from viewer.flock import MINUTE, Flock

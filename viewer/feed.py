@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from fleet.bus import Bus, key
 from fleet.codec import Stamp, decode, encoding
 from fleet.contract import (
     Account,
@@ -25,6 +24,7 @@ from fleet.contract import (
     Status,
 )
 from fleet.fence import GIVE_UP_S, Fence
+from fleet.talk import Bus, key
 from viewer.events import MAX_RAISED
 from viewer.forecast import Kept, forecast
 from viewer.inbox import CROWD, Inbox

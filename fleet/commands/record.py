@@ -14,11 +14,12 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from fleet.bus import Bus, connect
+from fleet.bus import connect
 from fleet.cli import stop_on_signal
 from fleet.codec import Stamp, encode, encoding
 from fleet.config import entry, router_arguments
 from fleet.contract import TOPICS, Sample
+from fleet.talk import Bus
 from fleet.telemetry.fleet_log import Record
 
 EXAMPLES = """

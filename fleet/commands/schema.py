@@ -11,9 +11,9 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
-from fleet.bus import key
 from fleet.codec import encoding
 from fleet.contract import COLUMNS, PER_UAV, QUERIES, TOPICS, Sample
+from fleet.talk import key
 
 EXAMPLES = """
   fleet schema                        every key in one table

@@ -10,10 +10,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from fleet.bus import Bus, connect
+from fleet.bus import connect
 from fleet.config import entry, router_arguments
 from fleet.contract import Account, Claim, FleetRow, FleetState, State, Status
 from fleet.plain import plain
+from fleet.talk import Bus
 
 EXAMPLES = """
   fleet status

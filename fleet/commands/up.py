@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.text import Text
 
 from fleet.access.knock import answers
-from fleet.bus import Bus, connect, open_router
+from fleet.bus import connect, open_router
 from fleet.children import Children
 from fleet.cli import stop_on_signal
 from fleet.commands.fly import AIRCRAFT, AUTOPILOTS, fault_arguments, faults_of
@@ -23,6 +23,7 @@ from fleet.commands.status import as_objects, fleet_rows, table
 from fleet.config import entry, passed_on, router_arguments
 from fleet.contract import FleetRow, FleetState, State
 from fleet.plain import plain
+from fleet.talk import Bus
 
 EXAMPLES = """
   fleet up --uavs 8

@@ -9,11 +9,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from fleet.bus import Bus, connect
+from fleet.bus import connect
 from fleet.config import entry, router_arguments
 from fleet.contract import Prediction, WhatIf, WhatIfStart
 from fleet.frames import to_geodetic, to_ned
 from fleet.plain import plain
+from fleet.talk import Bus
 from fleet.telemetry.waypoints import read_waypoints
 
 EXAMPLES = """

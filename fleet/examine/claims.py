@@ -6,10 +6,10 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 
 from fleet import SOURCES
-from fleet.bus import Bus
 from fleet.commands.status import spans
 from fleet.contract import Account, Claim, Status
 from fleet.examine.finding import BAD, NOTE, OK, Finding
+from fleet.talk import Bus
 
 APART_S = 0.2  # clocks of machines further apart are said [s]
 FAR_S = 1.0  # clocks further apart confuse epochs and ages [s]

@@ -19,8 +19,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fleet.bus import MemoryBus
 from fleet.contract import Message
+from fleet.memory_bus import MemoryBus
 from fleet.telemetry.recordings import replay_messages
 from twin_worker import twin as loop
 from twin_worker.learn import learn

@@ -18,9 +18,10 @@ import threading
 import time
 from pathlib import Path
 
-from fleet.bus import Bus, connect, open_router
+from fleet.bus import connect, open_router
 from fleet.children import Children
 from fleet.contract import Account, Item, Mission, Params
+from fleet.talk import Bus
 
 PATIENCE_S = 600.0  # for each step [s]
 

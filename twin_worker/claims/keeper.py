@@ -12,10 +12,10 @@ from typing import Protocol
 import numpy as np
 
 import fleet
-from fleet.bus import Bus
 from fleet.codec import Stamp
 from fleet.contract import Handover, Message, Mismatch, Model, Prediction, Sample
 from fleet.fence import Fence
+from fleet.talk import Bus
 from twin_worker.claims.carry import Load, packed, unpacked
 from twin_worker.claims.past import SELDOM, recall
 from twin_worker.claims.revive import go_on, revive

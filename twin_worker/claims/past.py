@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet.bus import Bus
 from fleet.contract import COLUMNS, DTYPES, Array, History, Message, Mission, Params, Rows, Sample, Status
+from fleet.talk import Bus
 
 PATIENCE_S = 0.5  # with a gateway that does not answer [s]
 SELDOM: tuple[type[Message], ...] = (Status, Params, Mission)

@@ -20,9 +20,9 @@ from typing import Protocol
 import msgspec
 
 from fleet import SOURCES
-from fleet.bus import Bus
 from fleet.codec import Stamp
 from fleet.contract import Claim, Handover, Wanted
+from fleet.talk import Bus
 from twin_worker.claims.decide import Claims, Rank
 
 _log = logging.getLogger(__name__)

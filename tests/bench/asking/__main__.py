@@ -25,9 +25,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from fleet.bus import Bus, connect
+from fleet.bus import connect
 from fleet.cli import guarded, parser_for
 from fleet.contract import Prediction, Predictions
+from fleet.talk import Bus
 from tests.bench.referee.site import Site
 
 KINDS = {"wildcard": Prediction, "batch": Predictions}

@@ -13,7 +13,8 @@ import threading
 import time
 from pathlib import Path
 
-from fleet.bus import connect, reachable
+from fleet.access.knock import reachable
+from fleet.bus import connect
 from fleet.contract import Found, Mismatch, Sample
 
 from .world import FAULT, model

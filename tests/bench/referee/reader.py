@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.bus import Bus
 from fleet.codec import Stamp
 from fleet.contract import Claim, FleetState, Model, Prediction
 from fleet.fence import Fence
+from fleet.talk import Bus
 
 
 class Came(NamedTuple):

@@ -12,7 +12,9 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 
-from fleet.bus import ROUTER, connect, endpoint, reachable
+from fleet.access.entry import ROUTER, endpoint
+from fleet.access.knock import reachable
+from fleet.bus import connect
 from fleet.pretend.drive import to_tlog
 from fleet.pretend.uav import PretendUav
 

@@ -8,12 +8,13 @@ from typing import Any
 import msgspec
 from rich.console import Console
 
-from fleet.bus import Bus, connect
+from fleet.bus import connect
 from fleet.codec import encode
 from fleet.commands.record import Recorder
 from fleet.commands.status import as_objects, fleet_rows, table
 from fleet.commands.whatif import as_object, ask, text
 from fleet.contract import Account, FleetState, Mission, Prediction, Sample, Status, WhatIf
+from fleet.talk import Bus
 from gateway.publish import Publisher
 from tests.examples import EXAMPLES
 from twin_worker.worker import Worker

@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from fleet.bus import Bus, connect, open_router
+from fleet.bus import connect, open_router
 from fleet.codec import Stamp
 from fleet.contract import (
     Alert,
@@ -35,6 +35,7 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin, to_geodetic
+from fleet.talk import Bus
 
 HOME = Origin(473977420, 85455940, 488_000)
 PROBE_M_S = 20.0
