@@ -16,6 +16,7 @@ from gateway.history import Keeper
 from gateway.router import Way
 
 KEPT = (Status, Mission, Params, Alert)
+AGAIN = (Mission, Params)
 REPEAT_S = 10.0  # mission and parameters are said again, for those who missed them [s]
 
 
@@ -37,6 +38,7 @@ class Publisher:
         kept = tuple(dict.fromkeys(KEPT + RESULTS)) if results else KEPT
         self._latest: dict[type, dict[Hashable, tuple[Any, Stamp | None]]] = {kind: {} for kind in kept}
         self.told: Account | None = None  # the newest counters
+        self._again: dict[tuple[type, int], Wire] = {}  # the latest, packed
         self._repeated = 0.0
         for kind in kept:
             bus.answer(kind, partial(self._answers, kind))
@@ -53,16 +55,14 @@ class Publisher:
             if kind in self._latest:
                 self._keep(kind, (getattr(message, "uav", 0), str(getattr(message, "kind", ""))), message, stamp)
             wire = Wire(kind, message.uav if kind in PER_UAV else -1, encode(message), message.t)
-            self.history.keep([wire])
-            self.way.send([wire], stamp)
+            self._send([wire], stamp)
 
     def put(self, wires: Sequence[Wire]) -> None:
         """Put messages on the bus that are packed already; results of workers are never among them."""
         for wire in wires:
             if wire.kind in self._latest:
                 self._keep(wire.kind, (wire.uav, ""), wire, None)
-        self.history.keep(wires)
-        self.way.send(wires)
+        self._send(wires)
 
     def account(self, account: Account) -> None:
         """Put the counters on the bus."""
@@ -79,9 +79,12 @@ class Publisher:
         if mono - self._repeated < REPEAT_S and not came:
             return
         self._repeated = mono
-        for kind in (Mission, Params):
-            for message, _ in list(self._latest[kind].values()):
-                (self.put if isinstance(message, Wire) else self.publish)([message])
+        self._send(list(self._again.values()))
+
+    def _send(self, wires: Sequence[Wire], stamp: Stamp | None = None) -> None:
+        self._again.update({(wire.kind, wire.uav): wire for wire in wires if wire.kind in AGAIN})
+        self.history.keep(wires)
+        self.way.send(wires, stamp)
 
     def _keep(self, kind: type, who: Hashable, message: Any, stamp: Stamp | None) -> None:
         with self._lock:

@@ -5,10 +5,16 @@ from collections import defaultdict
 
 from talker import Ears
 
+from gateway.__main__ import COLD
 from gateway.link import Batch
 from gateway.spec import read_spec
 
 PATIENCE_S = 60.0  # an upper bound; every wait ends with its condition
+
+
+def beside_compiling(errors: str) -> str:
+    """Give what a gateway said on standard error, but for what it says of compiling on a cold or busy machine."""
+    return errors.replace(f"gateway: {COLD}\n", "")
 
 
 class FakeLink:

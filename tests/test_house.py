@@ -17,7 +17,7 @@ ROOMS = (  # inside fleet a room imports only from rooms above it, and from itse
     ("access",),
     ("codec",),
     ("talk",),
-    ("fence", "memory_bus"),
+    ("fence", "memory_bus", "presence"),
     ("bus",),
     ("window",),
     ("airframe", "airframes"),

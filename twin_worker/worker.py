@@ -166,7 +166,7 @@ class Worker:
         new = [held for held in found if held.twin.prediction is None and time.monotonic() - held.since < _NEW_S]
         self._watch_time()
         self.quota.sweep(hurry=bool(new))
-        return [*new, *(held for held in found if all(held is not one for one in new))] if new else found
+        return [*new, *(held for held in found if held not in new)]
 
     def _watch_time(self) -> None:
         """Let heavy work wait where telemetry does: after a sweep that was late one flight ahead is begun, no more."""

@@ -80,14 +80,18 @@ class App:
         for view in self.views.values():
             with view.client.atomic():
                 if tick % SECOND == view.offset or view.dirty:
-                    self._land.show(view.client, self.feed.place, self._palette, self._ground)
-                    view.panels.ground_said = self._land.sentence
-                    view.scene.ground.grid.show(not self._land.lies)
-                    view.settle(self.flock, now, self._ground)
-                    if len(self._cloud):
-                        view.frame(self._cloud, self._news(), self._ground)
+                    self._settle(view, now)
                 if self.flock.uavs:
                     view.move(self.flock, now, tick)
+
+    def _settle(self, view: View, now: float) -> None:
+        """Draw what changes slowly on one page."""
+        self._land.show(view.client, self.feed.place, self._palette, self._ground)
+        view.panels.ground_said = self._land.sentence
+        view.scene.ground.grid.show(not self._land.lies)
+        view.settle(self.flock, now, self._ground)
+        if len(self._cloud):
+            view.frame(self._cloud, self._news(), self._ground)
 
     def answer(self) -> None:
         """Draw at once what was just selected."""

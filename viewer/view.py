@@ -21,6 +21,7 @@ from viewer.scene import Scene
 from viewer.selected import Selection
 from viewer.timeline.deck import Timeline
 from viewer.timeline.tapes import Tapes
+from viewer.vehicle import Vehicle
 
 NEAR_M = 800.0  # items of the route within this are shown with an aircraft one turns to [m]
 ROOM = 1.35  # how much more than what was flown is framed, while it grows [-]
@@ -76,6 +77,10 @@ class View:
         """Follow the selected UAV, or stop."""
         self.panels.follow.value = not self.panels.follow.value
 
+    def chosen(self) -> Vehicle | None:
+        """Give the selected UAV as it is shown; None where none is, or it is not there."""
+        return self.timeline.one(self.selected) if self.selected is not None else None
+
     def choose(self, uav: int) -> None:
         """Select a UAV; it is drawn at once."""
         if self.timeline.one(uav) is not None:
@@ -114,7 +119,7 @@ class View:
         scene.glyphs.draw(flock)  # at another time others may be there
         size = self.panels.glyph.value
         scene.glyphs.look(flock, sight, selected=self.selected, size=size)
-        chosen = self.timeline.one(self.selected) if self.selected is not None else None
+        chosen = self.chosen()
         if chosen is None:
             self.selection.clear()
         else:
@@ -147,7 +152,7 @@ class View:
 
     def _draw_chosen(self, now: float, place: Place, ground: float) -> None:
         """Draw the selected UAV's flown path and mission."""
-        chosen = self.timeline.one(self.selected) if self.selected is not None else None
+        chosen = self.chosen()
         if chosen is None:
             return
         self.selection.draw_flight(chosen, self._feed.track(chosen), now, self.scene.glyphs.unit)
@@ -164,7 +169,7 @@ class View:
         """
         if not self.timeline.player.live:
             return
-        chosen, place = self.timeline.one(self.selected) if self.selected is not None else None, self._feed.place
+        chosen, place = self.chosen(), self._feed.place
         own = route(chosen.mission, place, ground) if chosen is not None and place is not None else NOTHING
         flown = self._feed.track(chosen)[:, 1:] if chosen is not None else NOTHING.points
         cloud = near(np.vstack([cloud, own.points, own.circles.reshape(-1, 3), flown]), IN_VIEW_M / UNIT_M)
@@ -179,7 +184,7 @@ class View:
         self._again = False
 
     def _follow(self, now: float) -> None:
-        vehicle = self.timeline.one(self.selected) if self.panels.follow.value and self.selected is not None else None
+        vehicle = self.chosen() if self.panels.follow.value else None
         at = vehicle.where(now) if vehicle is not None else None
         if vehicle is None or at is None:
             self._followed = None

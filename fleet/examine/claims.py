@@ -9,6 +9,7 @@ from fleet import SOURCES
 from fleet.commands.status import spans
 from fleet.contract import Account, Claim, Status
 from fleet.examine.finding import BAD, NOTE, OK, Finding
+from fleet.presence import read
 from fleet.talk import Bus
 
 APART_S = 0.2  # clocks of machines further apart are said [s]
@@ -58,12 +59,9 @@ def look(bus: Bus) -> Iterator[Finding]:
     lock = threading.Lock()
 
     def token(name: str, lives: bool) -> None:
-        kind, _, rest = name.partition("/")
-        worker, _, ids = rest.partition("/")
-        low, _, high = ids.partition("/")[0].partition("-")
-        if kind == "worker" and low.isdecimal() and high.isdecimal() and len(low + high) < 20:
+        if (told := read(name)) is not None:
             with lock:
-                live.pop(worker, None) if not lives else live.update({worker: range(int(low), int(high) + 1)})
+                live.pop(told.worker, None) if not lives else live.update({told.worker: told.ids})
 
     bus.attend(token)
     before = Seen(bus, live)

@@ -27,7 +27,7 @@ INBOX = 4096  # messages waiting per UAV; the oldest go first and are counted
 _AT_ONCE = 8  # aircraft whose last minutes are asked for at once
 
 
-@dataclass
+@dataclass(eq=False)
 class Held:
     """One UAV this worker holds: its twin, its inbox and its claim."""
 

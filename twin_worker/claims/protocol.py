@@ -22,6 +22,7 @@ import msgspec
 from fleet import SOURCES
 from fleet.codec import Stamp
 from fleet.contract import Claim, Handover, Wanted
+from fleet.presence import Present, read
 from fleet.talk import Bus
 from twin_worker.claims.decide import Claims, Rank
 
@@ -87,8 +88,7 @@ class Claiming:
         self._bus.subscribe(Claim, lambda claim, stamp: self._claim(claim))
         self._bus.answer(Claim, lambda *_: [(self.claim(asked=True), None)])
         self._bus.answer(Handover, lambda uav, asked, payload: self._asked(payload))
-        ids = self.claims.ids
-        self._bus.present(f"worker/{self.me}/{ids.start}-{ids.stop - 1}/{time.time_ns() // 1_000_000}")
+        self._bus.present(Present(self.me, self.claims.ids, _wall_ms()).token)
         self.turn()
 
     def hear_of(self, uav: int) -> None:
@@ -127,20 +127,14 @@ class Claiming:
             )
 
     def _token(self, name: str, lives: bool) -> None:
-        kind, _, rest = name.partition("/")
-        try:
-            worker, ids, incarnation = rest.split("/")
-            low, high = map(int, ids.split("-"))
-            born = int(incarnation)
-        except ValueError:
-            return
-        if kind != "worker" or len(worker) != len(self.me):
+        told = read(name)
+        if told is None:
             return
         with self._lock:
             if lives:
-                self.claims.appeared(worker, range(low, high + 1), born)
+                self.claims.appeared(*told)
             else:
-                self.claims.vanished(worker, born)
+                self.claims.vanished(told.worker, told.born)
         self._news.set()
 
     def _claim(self, claim: Claim) -> None:

@@ -122,25 +122,22 @@ def restart_router(site: Site, _: Worker, seconds: float = 1.0) -> dict[str, Any
 
 def cut(site: Site, worker: Worker, seconds: float = 3.0) -> dict[str, Any]:
     """Cut a worker off from the router, and mend the way."""
-    uavs, was = _held(site, worker), worker.name
-    begun = time.monotonic()
-    assert worker.way is not None
-    worker.way.cut = True
-    found = _taken_over(site, uavs, was, begun)
-    wait(max(begun + seconds - time.monotonic(), 0.0))
-    worker.way.cut = False
-    return found | {"back": _back(site, worker)}
+    return _barred(site, worker, "cut", seconds)
 
 
 def stall(site: Site, worker: Worker, seconds: float = 3.0) -> dict[str, Any]:
     """Let nothing through between a worker and the router, without a word to either."""
+    return _barred(site, worker, "stalled", seconds)
+
+
+def _barred(site: Site, worker: Worker, how: str, seconds: float) -> dict[str, Any]:
+    """Bar a worker's way to the router for some time [s]."""
     uavs, was = _held(site, worker), worker.name
     begun = time.monotonic()
-    assert worker.way is not None
-    worker.way.stalled = True
+    setattr(worker.way, how, True)
     found = _taken_over(site, uavs, was, begun)
     wait(max(begun + seconds - time.monotonic(), 0.0))
-    worker.way.stalled = False
+    setattr(worker.way, how, False)
     return found | {"back": _back(site, worker)}
 
 
