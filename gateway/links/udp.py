@@ -13,7 +13,7 @@ from gateway.links.backoff import BackOff
 from gateway.links.receive import MOST, receiver
 from gateway.spec import Spec
 
-BUFFER = 1 << 24  # asked of the system: half a second of 250 aircraft [bytes]
+BUFFER = 1 << 26  # asked of the system: two seconds of 250 aircraft; taken only while it is full [bytes]
 _FORCE = 33  # SO_RCVBUFFORCE: beyond the system's limit, where that is allowed
 _LONGEST_NAP_S = 0.02
 _FILL = 4e8  # bytes of buffer a flood of 300,000 datagrams a second takes [bytes/s]
