@@ -20,7 +20,7 @@ from fleet.telemetry.opening import Source
 
 from . import decoding, load
 
-PLAIN = 60  # aircraft for the plain loop, which bears no more
+PLAIN = 250  # aircraft for the plain loop, as many as on a link of ours; it does not bear a thousand
 
 
 def main() -> int:

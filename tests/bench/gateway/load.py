@@ -141,7 +141,7 @@ def _quiet(ear: Ear, account: Account) -> Account:
 
 
 def plain(path: Path, uavs: int, seconds: float, from_s: float) -> dict[str, Any]:
-    """Measure the plain loop with few aircraft, for it bears no more, over as long a stretch of the same recording."""
+    """Measure the plain loop with a part of the aircraft, over as long a stretch of the same recording."""
     port, where = free(socket.SOCK_DGRAM), f"tcp/127.0.0.1:{free(socket.SOCK_STREAM)}"
     router = open_router(where)
     loop = start("tests.bench.gateway.plain", str(port), where)
