@@ -134,4 +134,5 @@ def _common(mode: str, *, connect: list[str], listen: list[str]) -> dict[str, An
         "transport/link/tx/lease": 1000,
         "transport/link/tx/keep_alive": 4,
         "transport/link/rx/max_message_size": MESSAGE_MOST,
+        "transport/shared_memory/enabled": False,  # who is killed leaves its share behind, mapped by all others
     }
