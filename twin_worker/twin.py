@@ -21,7 +21,7 @@ from twin_worker.mismatch.marks import EVERY_S, mark
 from twin_worker.renew import renew
 
 LOST_S = 3.0  # without a sample: link lost [s]
-_TICK_S = 1.0  # between turns while data are silent, and between scorings [s]
+_TICK_S = 1.0  # between turns while data are silent, between scorings, and of tries to foresee [s]
 _BEFORE_S = 3.0  # positions from before those that were scored last, so that none falls between [s]
 _SILENT_TURNS = 150  # most of them [-]
 _LATE_S = 10.0  # velocities older than this come too late for the wind [s]
@@ -88,8 +88,11 @@ def _turn(twin: Twin, now: float) -> list[Message]:
     if _due(now, twin.predict_t, pace.predict) and twin.may(Work.PREDICT):
         twin.predict_t = twin.renew_t = now
         made = foresee(twin, now)
-        twin.base = twin.prediction if made else None
-        results += [*made, *watch(twin, now, twin.base)]
+        new = twin.prediction if made else None
+        if new is None:  # telemetry has a gap just now, or too little of it has come: it is tried again before long
+            twin.predict_t = now - max(pace.predict - _TICK_S, 0.0)
+        twin.base = new or twin.base  # which is not renewed for ever
+        results += [*made, *watch(twin, now, new)]
     elif _due(now, twin.renew_t, SOON * pace.renew) and twin.may(Work.RENEW):
         twin.renew_t = now
         results += renew(twin)
