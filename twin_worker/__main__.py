@@ -3,7 +3,10 @@
 import argparse
 import contextlib
 import gc
+import logging
+import os
 import sys
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
     from twin_worker.diagnose.baseline import Baseline
 
 SWITCH_S = 5e-4  # how long a thread of the bus waits for the interpreter while another holds it [s]
+END_S = 10.0  # after which a worker that was told to end does so in any case [s]
 GARBAGE = 50_000  # objects made before cycles are looked for
 EXAMPLES = """
   twin_worker --uavs 0-49
@@ -67,9 +71,18 @@ def _share() -> None:
     gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
 
 
+def _end_in_any_case(stop: threading.Event) -> None:
+    """End the process some time after it was told to: a machine that is overloaded must not keep what should go."""
+    stop.wait()
+    threading.Event().wait(END_S)
+    logging.getLogger(__name__).error("found no end within %.0f s of being told to; ended by force", END_S)
+    os._exit(1)
+
+
 def _run(args: argparse.Namespace) -> int:
     airframe, bases = load(args.airframe), _bases(args.baseline)
     stop = stop_on_signal()
+    threading.Thread(target=_end_in_any_case, args=(stop,), daemon=True).start()
     with connect(entry(args, WORKER)) as bus:
         bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
         from twin_worker.conflict.separation import Separation

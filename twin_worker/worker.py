@@ -49,6 +49,7 @@ _SILENT_S = 1.0  # wall time without news after which data time runs on by the w
 _STATE_S = 1.0  # between fleet tables [s]
 _SWEEP_S = 0.015  # of telemetry is taken in at once [s]
 _LATE_S = 0.2  # between sweeps, from which telemetry counts as late [s]
+_END_S = 1.0  # for a thread to end what it has begun: one that learns yields to all others, and is left behind [s]
 _NEW_S = 2.0  # an aircraft that came so lately is predicted before any other work begins [s]
 
 
@@ -219,15 +220,15 @@ class Worker:
         """Join, turn until told to stop, publishing the fleet table once a second; then hand everything over."""
         self.claiming.threaded, self.quota.aside = True, frozenset({Work.IDENTIFY})
         self.listen()
-        hands = [threading.Thread(target=each.run, args=(stop,)) for each in (self.claiming, self.learner)]
+        hands = [threading.Thread(target=each.run, args=(stop,), daemon=True) for each in (self.claiming, self.learner)]
         for hand in hands:
             hand.start()
         self._turn_while(lambda: not stop.is_set())
-        heirs = threading.Thread(target=self.claiming.leave)
+        heirs = threading.Thread(target=self.claiming.leave, daemon=True)
         heirs.start()
         self._turn_while(heirs.is_alive)  # each is written for until its own turn to go comes
         for hand in (*hands, heirs):
-            hand.join()
+            hand.join(_END_S)
 
     def _turn_while(self, condition: Callable[[], bool]) -> None:
         due, pause = 0.0, threading.Event()

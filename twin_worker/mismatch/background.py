@@ -12,7 +12,7 @@ from twin_worker.mismatch.job import Answer, Job, work
 
 SHARE = 0.2  # of one core, on average [-]
 _NICE = 15  # how far it yields
-_PATIENCE_S = 5.0  # with its end [s]
+_PATIENCE_S = 1.0  # with its end: what it still works out nobody will hear of [s]
 
 
 class Background:
