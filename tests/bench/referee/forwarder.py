@@ -52,7 +52,7 @@ class Forwarder(AbstractContextManager):
             except OSError:
                 here.close()
                 continue
-            self._open += [here, there]
+            self._open = [end for end in self._open if end.fileno() >= 0] + [here, there]
             with suppress(OSError):  # closed again at once, as by who only looks whether somebody is there
                 for end in (here, there):
                     end.settimeout(_POLL_S)

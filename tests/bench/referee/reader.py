@@ -30,7 +30,7 @@ class Reader:
         self.fits: dict[int, float] = {}  # mean fit of the model in force, as published last
         self.windows: dict[int, float] = {}
         self.whole: dict[str, dict[int, float]] = {}  # by worker: since when it holds which, not bare
-        self.regressions = self.fenced = self.back = 0
+        self.regressions = self.fenced = self.back = self.changes = 0
         bus.subscribe(Prediction, self._prediction)
         bus.subscribe(Model, self._model)
         bus.subscribe(Claim, self._claim)
@@ -44,6 +44,7 @@ class Reader:
                 return
             self.regressions += bool(came) and stamp < came[-1].stamp
             self.back += bool(came) and made.t < came[-1].t - 0.5
+            self.changes += bool(came) and stamp.writer != came[-1].stamp.writer
             came.append(Came(time.monotonic(), stamp, made.t))
 
     def _model(self, model: Model, stamp: Stamp | None) -> None:
