@@ -11,6 +11,7 @@ from .site import Site
 _SHARE, _LEAST_MB = 0.05, 5.0  # growth over the second half that may be chance [-, MB]
 _SURE = 3.0  # standard errors from which a slope is one
 _LEAST = 8  # rows from which anything is said
+_FULL_MIN = 6.0  # after which windows, records and the gateway's history are full [min]
 
 
 class Row(NamedTuple):
@@ -65,8 +66,10 @@ class Memory:
 
 
 def _over(rows: list[Row], *, by_age: bool = False) -> dict[str, Any]:
-    """Fit  mb = a + b minutes + c aircraft (+ d age)  to the second half, and say whether b is growth."""
-    half = [row for row in rows if row.minutes >= 0.5 * max(each.minutes for each in rows)] if rows else []
+    """Fit  mb = a + b minutes + c aircraft (+ d age)  to the second half, and say whether b is growth;
+    `grows` is None where the run is too short to tell."""
+    since = max(0.5 * max((row.minutes for row in rows), default=0.0), _FULL_MIN)
+    half = [row for row in rows if row.minutes >= since]
     if len(half) < _LEAST:
         return {"rows": len(rows), "grows": None}
     minutes, mb = np.array([row.minutes for row in half]), np.array([row.mb for row in half])
