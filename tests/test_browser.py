@@ -30,6 +30,7 @@ ARGS = [*PLAIN, "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 IN_SCENE = "window.__viserMutable && window.__viserMutable.nodeRefFromName['/fleet/vehicles']"
 NODES = "Object.keys(window.__viserMutable.nodeRefFromName).length"
 SHOWN = "name => [...document.querySelectorAll('.uav .head h1')].some(e => e.textContent === name)"
+SCHEME = "name => document.documentElement.dataset.mantineColorScheme === name"
 PROJECT = """n => {
   const m = window.__viserMutable; let batch = null;
   m.nodeRefFromName['/fleet/vehicles'].traverse(o => { if (!batch && o.getPositionAt) batch = o; });
@@ -261,6 +262,26 @@ def test_another_time_is_shown_and_now_again(page, errors: list[str]) -> None:
     page.get_by_role("button", name="● Live").click()
     page.wait_for_function("!document.querySelector('.then')", timeout=8_000)
     assert page.evaluate(NODES) <= 48 and errors == []
+
+
+def test_colours_are_the_page_s_own_and_a_reload_brings_all_back(page, errors: list[str]) -> None:
+    page.locator('tr[data-uav="12"]').dispatch_event("pointerdown")
+    selected(page, "UAV-012")
+    nodes = page.evaluate(NODES)
+    for light in (True, False):
+        page.get_by_role("tab", name="Display").click()
+        page.get_by_label("Light colours").click()
+        page.wait_for_function(SCHEME, arg="light" if light else "dark", timeout=8_000)
+        page.wait_for_function(f"{NODES} == {nodes}", timeout=8_000)
+        selected(page, "UAV-012")
+        if light:
+            page.reload()
+            page.wait_for_function(IN_SCENE, timeout=30_000)
+            page.wait_for_function(SCHEME, arg="light", timeout=8_000)
+            selected(page, "UAV-012")
+            page.get_by_text(f"{UAVS} UAVs").wait_for(timeout=10_000)
+    page.get_by_role("tab", name="Fleet").click()
+    assert errors == []
 
 
 def test_what_it_costs(page, viewer: Viewer, cable: Cable, record_property) -> None:

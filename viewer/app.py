@@ -1,13 +1,17 @@
 """The server of the page: one feed, one render thread, a view for each who looks."""
 
 import contextlib
+import logging
 import threading
 import time
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import viser
 
 from fleet.talk import Bus
+from viewer.browser import Browser
 from viewer.camera import IN_VIEW_M, near, start_at
 from viewer.feed import Feed
 from viewer.flock import MINUTE, Flock
@@ -21,6 +25,7 @@ from viewer.track import placed
 from viewer.vehicle import Vehicle
 from viewer.view import View
 
+_log = logging.getLogger(__name__)
 TICK_S = 0.1
 SECOND = 10  # ticks of a second
 MOST_CLOSE = 50  # UAVs of a crowd that need an eye and are read every time
@@ -35,6 +40,7 @@ class App:
         self.feed, self.flock, self._server = Feed(bus), Flock(), server
         self.tapes, self._land = Tapes(), land or Land(None, None)
         self.views: dict[int, View] = {}  # by client
+        self._unfit: set[int] = set()  # clients whose page could not be opened
         self._wake = threading.Event()
         self._ground, self._cloud = 0.0, np.zeros((0, 3))
         start_at(server)
@@ -77,16 +83,19 @@ class App:
         if self.flock.crowd and tick % 2:
             return
         self.flock.pose(self.feed, now)
-        for view in self.views.values():
-            with view.client.atomic():
-                if tick % SECOND == view.offset or view.dirty:
-                    self._settle(view, now)
-                if self.flock.uavs:
-                    view.move(self.flock, now, tick)
+        for view in list(self.views.values()):
+            guarded(view, partial(self._draw, view, now, tick))
+
+    def _draw(self, view: View, now: float, tick: int) -> None:
+        """Draw what is due on one page."""
+        if tick % SECOND == view.offset or view.dirty:
+            self._settle(view, now)
+        if self.flock.uavs:
+            view.move(self.flock, now, tick)
 
     def _settle(self, view: View, now: float) -> None:
         """Draw what changes slowly on one page."""
-        self._land.show(view.client, self.feed.place, self._palette, self._ground)
+        self._land.show(view.client, self.feed.place, view.palette, self._ground)
         view.panels.ground_said = self._land.sentence
         view.scene.ground.grid.show(not self._land.lies)
         view.settle(self.flock, now, self._ground)
@@ -96,22 +105,44 @@ class App:
     def answer(self) -> None:
         """Draw at once what was just selected."""
         now = time.monotonic()
-        for view in self.views.values():
+        for view in list(self.views.values()):
             if view.dirty:
-                with view.client.atomic():
-                    view.settle(self.flock, now, self._ground)
-                    view.point(self.flock, now)
+                guarded(view, partial(self._answer, view, now))
+
+    def _answer(self, view: View, now: float) -> None:
+        view.settle(self.flock, now, self._ground)
+        view.point(self.flock, now)
 
     def _welcome(self) -> None:
-        """Open a view for who has come, and forget who has gone."""
+        """Open a view for who has come, forget who has gone, draw anew who wants other colours."""
         clients = self._server.get_clients()
         for gone in self.views.keys() - clients.keys():
             del self.views[gone]
-        for number in clients.keys() - self.views.keys():
-            client = clients[number]
-            with client.atomic():
-                self.views[number] = View(client, self.feed, self.tapes, self._palette, self._wake.set)
-            self.views[number].offset = number * 4 % SECOND
+        self._unfit &= clients.keys()
+        for number in clients.keys() - self.views.keys() - self._unfit:
+            self._open(number, Browser(clients[number], self._palette, self._wake.set))
+        for number, view in list(self.views.items()):
+            if view.browser.palette is not view.palette:
+                self._open(number, view.browser, view)
+
+    def _open(self, number: int, browser: Browser, before: View | None = None) -> None:
+        """Open a view, in place of the one before; a page for which that fails is left alone until it comes anew."""
+        try:
+            with browser.client.atomic():
+                if before is not None:
+                    browser.client.scene.reset()
+                    browser.client.gui.reset()
+                    self._land.forget(number)
+                view = View(browser, self.feed, self.tapes, browser.palette, self._wake.set)
+        except Exception:  # a defect met by one page must not end the others
+            self._unfit.add(number)
+            self.views.pop(number, None)
+            _log.exception("page %d could not be opened; the others go on; reload it", number)
+            return
+        view.offset = number * 4 % SECOND
+        if before is not None:
+            view.carry(before)
+        self.views[number] = view
 
     def _second(self, now: float) -> None:
         """Take stock of who is there and how they stand; remember where they are."""
@@ -141,6 +172,16 @@ class App:
         fleet, place = self.flock.fleet, self.feed.place
         told = sum(v.forecast is not None for v in fleet)
         return place.origin if place else None, len(self.flock.uavs), told, sum(v.ended for v in fleet)
+
+
+def guarded(view: View, draw: Callable[[], None]) -> None:
+    """Draw something on one page; a defect met there is said there and in the log, and ends no other page."""
+    try:
+        with view.client.atomic():
+            draw()
+    except Exception as error:
+        if view.stumble(f"{type(error).__name__}: {error}"):
+            _log.exception("page %d could not be drawn; the others go on", view.client.client_id)
 
 
 def guess_ground(fleet: list[Vehicle], origin_m: float, before: float) -> float:

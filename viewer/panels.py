@@ -1,18 +1,21 @@
 """The panels: left the fleet, its alerts and what to show; right the selected UAV."""
 
 from collections.abc import Callable
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import viser
 
+from viewer.browser import Browser
 from viewer.charts import Charts
 from viewer.chronicle import listing
+from viewer.clicks import clicked
 from viewer.commands import Commands
 from viewer.detail import about, facts
 from viewer.feed import Feed
 from viewer.palette import WORD, Palette, triple
-from viewer.since import Presence, since
+from viewer.since import since
 from viewer.states import Router, notices
 from viewer.vehicle import Vehicle
 from viewer.words import MAX_ROWS, alerts, empty, legend, severity, summary, table
@@ -26,14 +29,14 @@ class Panels:
 
     def __init__(
         self,
-        client: viser.ClientHandle,
+        browser: Browser,
         palette: Palette,
-        choose: Callable[[int], None],
+        choose: Callable[..., None],
         actions: dict[str, Callable[[], None]],
     ) -> None:
-        self._gui, self._palette, self._choose = client.gui, palette, choose
-        self._presence = Presence(client)
-        self._commands = Commands(client.gui, choose, actions)
+        self._gui, self._palette, self._choose = browser.client.gui, palette, choose
+        self._presence, self._browser = browser.presence, browser
+        self._commands = Commands(self._gui, choose, actions)
         self._beat = False
         self._router = Router()
         self.ground_said = ""  # what is wrong with the files of the ground
@@ -46,7 +49,7 @@ class Panels:
         self._gui.main_panel.set_width(340)
         css = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
         self._gui.add_html(f"<style>:root{{--muted:{palette.muted}}}{css}</style>")
-        self._banner, self._legend = self._gui.add_html(""), self._gui.add_html("")
+        self._banner, self._broken, self._legend = (self._gui.add_html("") for _ in range(3))
         self._build_left()
         self._build_right()
 
@@ -72,10 +75,12 @@ class Panels:
             self.tube = gui.add_checkbox("Tube of selected", True)
             self.routes = gui.add_checkbox("Routes of all", False)
             self.follow: Any = gui.add_checkbox("Follow selected", False)
+            light = gui.add_checkbox("Light colours", not self._palette.dark)
             self.glyph = gui.add_slider("Aircraft size", min=0.5, max=4.0, step=0.1, initial_value=1.0)
         self._read.on_click(lambda _: self._presence.seen())
         self._menu.on_update(lambda _: self._pick(self._menu.value.removeprefix("UAV-")))
         self._picked.on_update(lambda _: self._pick(self._picked.value))
+        light.on_update(lambda _: self._browser.paint(light=light.value))
         self._show.on_click(lambda _: setattr(self, "_filter", self._show.value))
 
     def _build_right(self) -> None:
@@ -89,9 +94,18 @@ class Panels:
         panel.set_width(350)
 
     def _pick(self, text: str) -> None:
-        """Take the id a row click wrote into the hidden input; anything but a number is somebody else's mischief."""
-        if text.isdecimal() and len(text) <= 6:
-            self._choose(int(text))
+        """Take what a click wrote into the hidden input."""
+        if (found := clicked(text)) is not None:
+            self._choose(*found)
+
+    def say_broken(self, sentence: str) -> None:
+        """Say that this page could not be drawn, and why; an empty sentence takes it back."""
+        said = (
+            f'<div class="uav"><div class="say" style="border-color:{self._palette.mismatch}">{escape(sentence)}</div>'
+        )
+        said = f"{said}</div>" if sentence else ""
+        if self._broken.content != said:
+            self._broken.content = said
 
     def draw(self, fleet: list[Vehicle], feed: Feed, now: float, selected: int | None) -> None:
         """Write everything anew; call it about once a second, and when the selection changes."""

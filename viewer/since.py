@@ -6,6 +6,7 @@ import time
 from html import escape
 from typing import Any, NamedTuple
 
+from viewer.clicks import click
 from viewer.datatime import moment
 from viewer.events import Event, Kind
 from viewer.palette import MARK, Palette
@@ -58,13 +59,14 @@ def missed(fleet: list[Vehicle], away: Away) -> list[tuple[Vehicle, Event]]:
 
 
 def since(fleet: list[Vehicle], away: Away | None, palette: Palette, pick: str) -> str:
-    """List what was missed, as HTML; nothing where nobody was away. `pick` is the handler of a row, `{}` its UAV."""
+    """List what was missed, as HTML; nothing where nobody was away. `pick` shows whose and when it was: `{}`."""
     if away is None:
         return ""
     found = missed(fleet, away)
     head = f"<b>Since you left</b> <span class=soft>{moment(away.left)} to {moment(away.came)}</span>"
     rows = "".join(
-        f'<div class="event pick" onpointerdown="{pick.format(v.uav)}"><span class="num soft">{moment(event.t)}</span>'
+        f'<div class="event pick" onpointerdown="{pick.format(click(v.uav, event.t))}">'
+        f'<span class="num soft">{moment(event.t)}</span>'
         f'<b style="color:{palette.event(event.kind)}">{MARK[event.kind]}</b>'
         f"<span>{v.name} {escape(event.text)}</span></div>"
         for v, event in found[:ROWS]

@@ -1,14 +1,16 @@
 """One page: what one operator has selected, shows and looks at."""
 
+import contextlib
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import viser
 
+from viewer.browser import Browser
 from viewer.callouts import callouts
 from viewer.camera import IN_VIEW_M, Camera, near
+from viewer.detail import clip
 from viewer.export.panel import Export
 from viewer.feed import Feed
 from viewer.flock import LOST, MISMATCH, Flock, look
@@ -24,17 +26,19 @@ from viewer.timeline.tapes import Tapes
 from viewer.vehicle import Vehicle
 
 NEAR_M = 800.0  # items of the route within this are shown with an aircraft one turns to [m]
+WHOLE_S = 3.0  # what could not be drawn counts as mended after so long without a defect [s]
 ROOM = 1.35  # how much more than what was flown is framed, while it grows [-]
 
 
 class View:
     """The page of one client: its scene, its panels, its camera, its selection."""
 
-    def __init__(self, client: Any, feed: Feed, tapes: Tapes, palette: Palette, wake: Callable[[], None]) -> None:
-        self.client, self._feed, self.palette, self._wake = client, feed, palette, wake
+    def __init__(self, browser: Browser, feed: Feed, tapes: Tapes, palette: Palette, wake: Callable[[], None]) -> None:
+        client = browser.client
+        self.client, self.browser, self._feed, self.palette, self._wake = client, browser, feed, palette, wake
         self.scene = Scene(client.scene, palette, self.choose)
         self.selection, self._labels = Selection(client.scene, palette), Labels(client.scene)
-        self.panels = Panels(client, palette, self.visit, self._actions())
+        self.panels = Panels(browser, palette, self.visit, self._actions())
         self.timeline = Timeline(client, feed, tapes, palette, self._stir)
         self.panels.seek = self.timeline.sender()
         with self.timeline.tab("Export", viser.Icon.DOWNLOAD):
@@ -47,6 +51,32 @@ class View:
         self._again = False  # frame once more, wherever the camera is
         self._framed = np.zeros((2, 3))  # corners of what the camera was last framed on [10 m]
         self._followed: tuple[int, np.ndarray] | None = None
+        self._defect, self._stumbled = "", 0.0  # why it could not be drawn, and when last, monotonic [s]
+
+    def carry(self, before: "View") -> None:
+        """Go on where this page was in its other colours: who is selected, at which time, from where."""
+        self.selected, self.camera, self.offset = before.selected, before.camera, before.offset
+        self.timeline.player = before.timeline.player
+        self._seen, self._framed, self._followed = before._seen, before._framed, before._followed
+
+    def stumble(self, defect: str) -> bool:
+        """Say on the page that it could not be drawn; tell whether that is news."""
+        self._stumbled = time.monotonic()
+        if defect == self._defect:
+            return False
+        self._defect = defect
+        with contextlib.suppress(RuntimeError, AssertionError):  # it may be closing
+            self.panels.say_broken(
+                f"This page could not be drawn ({clip(defect)}): what is shown may be old. Other pages go on. "
+                "Reload this one; if it is said again, the viewer's log tells what happened."
+            )
+        return True
+
+    def _recover(self) -> None:
+        """Take back what was said of a defect once everything can be drawn again."""
+        if self._defect and time.monotonic() - self._stumbled > WHOLE_S:
+            self._defect = ""
+            self.panels.say_broken("")
 
     def _stir(self) -> None:
         """Have everything drawn at once: another time is shown."""
@@ -82,13 +112,16 @@ class View:
         return self.timeline.one(self.selected) if self.selected is not None else None
 
     def choose(self, uav: int) -> None:
-        """Select a UAV; it is drawn at once."""
-        if self.timeline.one(uav) is not None:
+        """Select a UAV that was ever heard of; it is drawn at once."""
+        if self._feed.one(uav) is not None:
             self.selected, self.dirty = uav, True
+            self.browser.remembered.uav = None
             self._wake()
 
-    def visit(self, uav: int) -> None:
-        """Select a UAV that may be out of sight, and turn the camera to it."""
+    def visit(self, uav: int, t: float | None = None) -> None:
+        """Select a UAV that may be out of sight, turn the camera to it, and show a time of its own [s since 1970]."""
+        if t is not None:
+            self.timeline.show(self._feed.all(), uav, t)
         self.choose(uav)
         vehicle, place = self.timeline.one(uav), self._feed.place
         if vehicle is None or place is None or (at := vehicle.where(time.monotonic())) is None:
@@ -131,8 +164,7 @@ class View:
         """Draw what changes slowly: trails, predicted paths, routes, panels; once a second and on a new selection."""
         flock = self.timeline.flock(flock, self.selected, now)
         self.dirty = False
-        if self.selected is None and (known := [v for v in flock.fleet if flock.index(v.uav) is not None]):
-            self.selected = max(known, key=lambda v: (v.forecast is not None, -v.uav)).uav
+        self._recall(flock)
         self.timeline.draw(self.selected)
         self.panels.draw(flock.fleet, self._feed, flock.now, self.selected)
         place, options, scene = self._feed.place, self.panels, self.scene
@@ -149,6 +181,16 @@ class View:
         scene.draw_routes([route(v.mission, place, ground) for v in others])
         self.selection.tube = options.tube.value
         self._draw_chosen(now, place, ground)
+        self._recover()
+
+    def _recall(self, flock: Flock) -> None:
+        """Select whom this browser had selected, once it is there; without anybody selected, the first predicted."""
+        remembered = self.browser.remembered
+        if flock.index(remembered.uav) is not None:
+            self.selected, remembered.uav = remembered.uav, None
+        if self.selected is None and (known := [v for v in flock.fleet if flock.index(v.uav) is not None]):
+            self.selected = max(known, key=lambda v: (v.forecast is not None, -v.uav)).uav
+        remembered.keep(self.selected)
 
     def _draw_chosen(self, now: float, place: Place, ground: float) -> None:
         """Draw the selected UAV's flown path and mission."""

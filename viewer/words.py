@@ -6,6 +6,7 @@ from math import isfinite
 from typing import NamedTuple
 
 from fleet.contract import State
+from viewer.clicks import click
 from viewer.datatime import moment, stamp, times
 from viewer.events import Kind
 from viewer.feed import Feed
@@ -142,12 +143,13 @@ def _finding(vehicle: Vehicle) -> str:
 
 
 def alerts(fleet: list[Vehicle], feed: Feed, palette: Palette, pick: str = "") -> str:
-    """List the mismatches and the alerts in force, newest first, at most 50 of each; `pick` as for `table`."""
+    """List the mismatches and the alerts in force, newest first, at most 50 of each; `pick` shows whose and when."""
     strange = [(v, v.mismatch) for v in fleet if v.mismatch is not None and in_force(v.mismatch)]
     told = [(v, "mismatch", one.t, short(one)) for v, one in sorted(strange, key=lambda one: -one[1].t)[:MAX_ROWS]]
     found = [(v, kind.value.replace("_", " "), a.t, a.sentence) for v, kind, a in feed.alerts()[:MAX_ROWS]]
     cards = "".join(
-        f'<div class="say pick" style="border-color:{palette.mismatch}" onpointerdown="{pick.format(vehicle.uav)}">'
+        f'<div class="say pick" style="border-color:{palette.mismatch}" '
+        f'onpointerdown="{pick.format(click(vehicle.uav, t))}">'
         f'<b>▲ {vehicle.name}</b> <span class="soft">{escape(kind)}</span>'
         f'<span class="soft when">{moment(t)}</span><br>{escape(text[:300])}</div>'
         for vehicle, kind, t, text in [*told, *found]

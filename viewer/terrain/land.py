@@ -37,7 +37,9 @@ class Land:
     def __init__(self, terrain: Raster | None, imagery: Raster | None) -> None:
         self._terrain, self._imagery = terrain, imagery
         self._place: Place | None = None
-        self._mesh: trimesh.Trimesh | None = None
+        self._form: Shape | None = None
+        self._extent = np.zeros((2, 2))
+        self._meshes: dict[bool, trimesh.Trimesh] = {}  # by whether it is dark
         self._contours = np.zeros((0, 2, 3))
         self._shown: dict[int, Place] = {}  # by client: where it was laid out for
         self.sentence = ""  # why nothing is shown; empty: it is
@@ -45,36 +47,43 @@ class Land:
     @property
     def lies(self) -> bool:
         """Tell whether there is ground to see, so that the grid is in the way."""
-        return self._mesh is not None
+        return self._form is not None
+
+    def forget(self, client: int) -> None:
+        """Lay the ground out anew for a client whose scene was emptied."""
+        self._shown.pop(client, None)
 
     def show(self, client: Any, place: Place | None, palette: Palette, ground: float) -> None:
         """Show it on a page, once; `ground` is where a picture without heights lies [10 m]."""
         if place is None or (self._terrain is None and self._imagery is None):
             return
         if place is not self._place:
-            self._lay(place, palette, ground)
+            self._lay(place, ground)
         if self._shown.get(client.client_id) is place:
             return
         self._shown[client.client_id] = place
-        if self._mesh is not None:
-            client.scene.add_mesh_trimesh("/terrain/ground", self._mesh, cast_shadow=False, receive_shadow=False)
+        if self._form is not None:
+            if palette.dark not in self._meshes:
+                self._meshes[palette.dark] = mesh(self._form, self._picture(place, palette, self._form))
+            made = self._meshes[palette.dark]
+            client.scene.add_mesh_trimesh("/terrain/ground", made, cast_shadow=False, receive_shadow=False)
         lines = Strokes(client.scene, "/terrain/contours", 1.2)
         lines.draw(self._contours, mix(CONTOUR[palette.dark], palette.ground, 0.9))
 
-    def _lay(self, place: Place, palette: Palette, ground: float) -> None:
-        self._place, self._mesh, self._contours, self.sentence = place, None, np.zeros((0, 2, 3)), ""
+    def _lay(self, place: Place, ground: float) -> None:
+        self._place, self._form, self._contours, self.sentence = place, None, np.zeros((0, 2, 3)), ""
+        self._meshes.clear()
         names = " and ".join(raster.name for raster in (self._terrain, self._imagery) if raster is not None)
-        extent = self._extent(place)
+        extent = self._covered(place)
         if extent is None:
             self.sentence = (
                 f"{names}: found nothing within {REACH_M / 1000:.0f} km of the fleet; name the files of its place."
             )
             return
-        form = shape(self._terrain, place, extent, ground)
-        self._contours = contours(form) if self._terrain is not None else self._contours
-        self._mesh = mesh(form, self._picture(place, extent, palette, form))
+        self._extent, self._form = np.array(extent), shape(self._terrain, place, extent, ground)
+        self._contours = contours(self._form) if self._terrain is not None else self._contours
 
-    def _extent(self, place: Place) -> tuple[np.ndarray, np.ndarray] | None:
+    def _covered(self, place: Place) -> tuple[np.ndarray, np.ndarray] | None:
         """Find the corners, south-west and north-east, of what the files cover near the origin, (2,) each [10 m]."""
         side = np.linspace(-REACH_M, REACH_M, 201) / UNIT_M
         raster = self._terrain if self._terrain is not None else self._imagery
@@ -86,11 +95,9 @@ class Land:
         rows, columns = side[known.any(axis=1)], side[known.any(axis=0)]
         return np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]])
 
-    def _picture(
-        self, place: Place, extent: tuple[np.ndarray, np.ndarray], palette: Palette, form: Shape
-    ) -> Image.Image:
+    def _picture(self, place: Place, palette: Palette, form: Shape) -> Image.Image:
         """Paint the ground: the picture of the file where there is one, else its slopes in the page's colours."""
-        (west, south), (east, north) = extent
+        (west, south), (east, north) = self._extent
         e, n = np.meshgrid(np.linspace(west, east, TEXELS), np.linspace(north, south, TEXELS))
         plain = rgb(palette.ground)
         light = shade(form)[::-1]

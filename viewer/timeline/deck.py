@@ -108,6 +108,16 @@ class Timeline:
                 self._seek(*what.partition(":")[::2])
         self._changed()
 
+    def show(self, fleet: list[Vehicle], uav: int, t: float) -> None:
+        """Show a time of one UAV, data time [s since 1970]; nothing is done where nothing of it is kept."""
+        with self._lock:
+            if not len(self._tapes.of.get(uav, ())):
+                return
+            self._measure(fleet, uav)
+            self.player.seek(t, self._span)
+            self.player.rate = 0.0
+        self._changed()
+
     def _seek(self, how: str, text: str) -> None:
         try:
             value = float(text[:20])

@@ -1,0 +1,149 @@
+"""Pages beside each other: a defect of one ends no other, each has its colours, a click shows whose and when."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+from conftest import unused_port
+from pretend_feed import PretendFleet
+
+from fleet.memory_bus import MemoryBus
+from tests.bench.viewing.watcher import Watcher
+from viewer.app import App
+from viewer.clicks import click, clicked
+from viewer.door import quiet, serve
+from viewer.palette import DARK, LIGHT
+from viewer.remembered import Remembered
+from viewer.view import View
+
+
+@pytest.fixture
+def site() -> Iterator[SimpleNamespace]:
+    """A viewer with five aircraft that fly, and two pages on it."""
+    port = unused_port()
+    server, bus = serve("127.0.0.1", port), MemoryBus()
+    app, fleet = App(bus, server), PretendFleet(bus, 5)
+    pages = [Watcher(port), Watcher(port)]
+
+    def run(ticks: int = 10) -> None:
+        for tick in range(ticks):
+            fleet.advance(time.time())
+            app.tick(tick)
+
+    while len(app.views) < 2:  # each is there once it has told its camera
+        run()
+    yield SimpleNamespace(app=app, run=run, views=[app.views[n] for n in sorted(app.views)])
+    for page in pages:
+        page.close()
+    with quiet():
+        server.stop()
+
+
+def broken(view: View) -> str:
+    return view.panels._broken.content
+
+
+def test_a_defect_of_one_page_is_said_there_and_in_the_log_and_the_others_go_on(site, caplog) -> None:
+    first, second = site.views
+    first.scene.draw_heads = MagicMock(side_effect=KeyError("<b>seven"))
+    drawn = second.scene.draw_heads = MagicMock(wraps=second.scene.draw_heads)
+    site.run()
+    site.run()
+    assert "KeyError: &#x27;&lt;b&gt;seven" in broken(first) and "Reload" in broken(first)
+    assert broken(second) == "" and drawn.call_count > 5
+    said = [record for record in caplog.records if record.name == "viewer.app"]
+    assert len(said) == 1 and said[0].exc_info and f"page {first.client.client_id}" in said[0].message
+    del first.scene.draw_heads
+    site.run()
+    assert broken(first)  # it may stumble again at once
+    first._stumbled -= 10.0
+    site.run()
+    assert broken(first) == ""
+
+
+def test_a_page_that_cannot_be_opened_is_left_alone(site, caplog, monkeypatch) -> None:
+    number, other = sorted(site.app.views)
+    del site.app.views[number]
+    tried = MagicMock(side_effect=RuntimeError("no room"))
+    monkeypatch.setattr("viewer.app.View", tried)
+    site.run()
+    assert tried.call_count == 1 and list(site.app.views) == [other]
+    assert f"page {number} could not be opened" in caplog.text
+
+
+def test_every_page_has_its_own_colours_and_goes_on_where_it_was(site) -> None:
+    first, second = site.views
+    first.choose(3)
+    first.browser.paint(light=True)
+    site.run()
+    again = site.app.views[first.client.client_id]
+    assert again is not first and again.palette is LIGHT and again.selected == 3 and again.camera is first.camera
+    assert site.app.views[second.client.client_id] is second and second.palette is DARK
+    assert again.client.scene._handle_from_node_name and "/fleet/vehicles" in again.client.scene._handle_from_node_name
+
+
+def test_a_click_on_an_alert_selects_and_shows_its_time(site) -> None:
+    view = site.views[0]
+    tape = site.app.tapes.of[4]
+    while not tape.stood or tape.t[-1] - tape.stood[0].t < 0.2:
+        site.run()
+    then = float(tape.stood[0].t) + 0.1
+    view.panels._pick(click(4, then))
+    assert view.selected == 4 and view.timeline.player.t == pytest.approx(then, abs=2e-3) and view.dirty
+    site.app.answer()
+    assert view.chosen().then == pytest.approx(then, abs=2e-3) and site.views[1].timeline.player.live
+    view.panels._pick(click(2, float("nan")))  # a time that is none: selected, as a row is
+    assert view.selected == 2
+    for mischief in ("", "x", "7@", "9999999", "1@1e400", "1@nan", "1@-3", "²", "3@" + "9" * 100):
+        view.panels._pick(mischief)
+    assert view.timeline.player.t == pytest.approx(then, abs=2e-3)
+
+
+def test_a_click_is_written_as_it_is_read() -> None:
+    for uav, t in ((0, 0.0), (7, 1_700_000_000.125), (999_999, 3.9e9)):
+        assert clicked(click(uav, t)) == (uav, pytest.approx(t, abs=1e-3))
+    assert clicked(click(5, np.inf)) == (5, None) and clicked("5") == (5, None) and clicked("5@x") is None
+
+
+def remembered(text: str | None, *, error: type[Exception] | None = None) -> Remembered:
+    client = MagicMock()
+    client.local_storage.get_item.side_effect = error
+    client.local_storage.get_item.return_value = text
+    told = threading.Event()
+    one = Remembered(client, told.set)
+    assert told.wait(10)
+    return one
+
+
+def test_a_page_that_reloads_has_its_aircraft_and_colours_again(site) -> None:
+    one = remembered('{"uav": 3, "light": true}')
+    assert one.uav == 3 and one.light is True
+    view = site.views[0]
+    view.browser.remembered = one
+    site.run()
+    again = site.app.views[view.client.client_id]
+    assert again.selected == 3 and again.palette is LIGHT and one.uav is None
+    again.choose(1)
+    site.run()
+    assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 1, "light": true}'
+
+
+@pytest.mark.parametrize(
+    "text", [None, "", "[", "[7]", '{"uav": "7"}', '{"uav": true, "light": 3}', "[" * 500, "9" * 500]
+)
+def test_what_else_a_browser_says_is_nothing(text: str | None) -> None:
+    one = remembered(text)
+    assert one.uav is None and one.light is None
+
+
+def test_who_was_selected_is_not_forgotten_before_it_is_there_again() -> None:
+    one = remembered('{"uav": 40}')
+    one.keep(1)  # another is shown meanwhile
+    with contextlib.suppress(IndexError):
+        assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 40, "light": null}'
+    assert one.uav == 40 and remembered(None, error=TimeoutError).uav is None
