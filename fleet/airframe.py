@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 
+import numba as nb
 import numpy as np
 
 _FUNCTION = {4: "delta_a", 19: "delta_e", 21: "delta_r", 70: "delta_t", 77: "delta_e+a", 78: "delta_e-a"}
@@ -39,9 +40,24 @@ class ServoMap:
 
     def inputs(self, pulses: np.ndarray) -> np.ndarray:
         """Turn pulse widths (n, 8) [us] into inputs (n, 4) in the order of `fleet.window.INPUTS` [-]."""
-        off = np.asarray(pulses, float) - self.trim
-        u = np.clip(off, 0, None) @ self.gain_up + np.clip(off, None, 0) @ self.gain_down
-        return np.clip(u, [-1.2, -1.2, -1.2, 0.0], 1.2)
+        out = np.empty((len(pulses), len(_INPUTS)))
+        _inputs_each(np.ascontiguousarray(pulses, float), self.trim, self.gain_up, self.gain_down, out)
+        return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _inputs_each(pulses: np.ndarray, trim: np.ndarray, up: np.ndarray, down: np.ndarray, out: np.ndarray) -> None:
+    """Fill in the inputs of every row, within 1.2 of their throw; throttle never below idle."""
+    for k in range(len(out)):
+        out[k] = 0.0
+        for i in range(_SERVOS):
+            off = pulses[k, i] - trim[i]
+            for j in range(4):
+                out[k, j] += off * (up[i, j] if off > 0.0 else down[i, j])
+        for j in range(4):
+            low = 0.0 if j == 3 else -1.2
+            if out[k, j] > 1.2 or out[k, j] < low:  # nan stays
+                out[k, j] = 1.2 if out[k, j] > 1.2 else low
 
 
 def servo_map(params: Mapping[str, float]) -> ServoMap:

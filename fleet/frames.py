@@ -80,7 +80,22 @@ def body_to_ned(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, body: np.nd
 
 def ned_to_body(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, ned: np.ndarray) -> np.ndarray:
     """Rotate NED vectors to the body. Angles (n,) [rad], NED (n, 3)."""
-    return np.einsum("nji,nj->ni", np.moveaxis(rotation(phi, theta, psi), -1, 0), ned)
+    euler, out = np.column_stack([phi, theta, psi]).astype(float), np.empty((len(phi), 3))
+    _turn_each(euler, np.ascontiguousarray(ned, float), out)
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _turn_each(euler: np.ndarray, ned: np.ndarray, out: np.ndarray) -> None:
+    """Fill in NED vectors turned into the body, (n, 3): a whole window at once is most of what laying it takes."""
+    for k in range(len(euler)):
+        cf, sf, ct, st = cos(euler[k, 0]), sin(euler[k, 0]), cos(euler[k, 1]), sin(euler[k, 1])
+        cp, sp = cos(euler[k, 2]), sin(euler[k, 2])
+        n, e, d = ned[k, 0], ned[k, 1], ned[k, 2]
+        ahead, right = cp * n + sp * e, cp * e - sp * n
+        out[k, 0] = ct * ahead - st * d
+        out[k, 1] = sf * st * ahead + cf * right + sf * ct * d
+        out[k, 2] = cf * st * ahead - sf * right + cf * ct * d
 
 
 def rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:

@@ -44,6 +44,8 @@ _ABSOLUTE, _RELATIVE, _TERRAIN = (0, 5), (3, 6), (10, 11)  # MAV_FRAME
 GLOBAL_FRAMES = _ABSOLUTE + _RELATIVE + _TERRAIN
 _SHORTEST = 1.0  # a line shorter than this has no direction worth flying [m]
 FIRST = {"px4": 0}  # number of the first item to fly, by autopilot; 1 elsewhere
+READ = ("RTL_ALTITUDE", "ALT_HOLD_RTL", "RTL_RADIUS", "WP_LOITER_RAD")
+"""Autopilot parameters that shape a route."""
 _SAID = 3  # sentences told of one mission
 _FAR = 500e3  # a leg that long is a slip, and a flat earth does not know its direction [m]
 _FASTEST = 300.0  # commanded speeds beyond are noise [m/s]
@@ -111,7 +113,7 @@ def route(
         items: mission as downloaded, in any order
         seq: item in force
         origin: where the NED frame of the legs touches the earth
-        params: autopilot parameters, for RTL_ALTITUDE, RTL_RADIUS and WP_LOITER_RAD
+        params: autopilot parameters, of which those in `READ` count
         limit: most legs to unroll
         first: 1 where item 0 is home, 0 where it is the first to fly; home is the origin then. See `FIRST`
     Returns:

@@ -88,7 +88,8 @@ def simulate(
     p, x = state[:3].copy(), state[3:].copy()
     phi_c, theta_c = command[0], command[1]
     delta, acting, share = command[2:].copy(), command[2:].copy(), 1.0 - np.exp(-dt / tau)
-    work = np.empty((3, N_X))
+    change, middle = np.empty(4), np.empty(4)  # a flight makes no array on its way
+    work, v, euler = np.empty((3, N_X)), np.empty(3), np.empty(3)
     Va_last, Va_dot = (sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2) + air[3]) / air[2], 0.0
     fade, left = exp(-dt / GUST_S), 1.0
     fast = 3.0 * max(at[0], 5.0)
@@ -96,23 +97,28 @@ def simulate(
         V = sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
         if not (abs(x[6]) < 1.4 and abs(x[7]) < 1.2 and 3.0 < V < fast):
             return k
-        out[k, :3] = p
-        out[k, 3:] = x
+        for i in range(3):
+            out[k, i] = p[i]
+        for i in range(N_X):
+            out[k, 3 + i] = x[i]
         out[k, 11] = wrap(x[8])
-        v = np.array(_body_to_ned(x[0], x[1], x[2], x[6], x[7], x[8]))
+        v[0], v[1], v[2] = _body_to_ned(x[0], x[1], x[2], x[6], x[7], x[8])
         v[0] += air[0]
         v[1] += air[1]
         Va = (V + left * air[3]) / air[2]
-        euler, rates = np.array([x[6], x[7], out[k, 11]]), x[3:6].copy()
+        euler[0], euler[1], euler[2] = x[6], x[7], out[k, 11]
         if k % GUIDE_EVERY == 0:
             Va_dot += 0.25 * ((Va - Va_last) / (GUIDE_EVERY * dt) - Va_dot)
             Va_last = Va
             phi_c, theta_c, delta[3] = guide(ctl, par, legs, p, v, euler, Va, Va_dot, GUIDE_EVERY * dt)
-        delta[0], delta[1], delta[2] = stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
+        delta[0], delta[1], delta[2] = stabilise(ctl, par, phi_c, theta_c, euler, x[3:6], Va, dt)
         if coupled:
-            change = share * (delta - acting)
-            step(x, acting + 0.5 * change, aero, at, dt, work)
-            acting += change
+            for i in range(4):
+                change[i] = share[i] * (delta[i] - acting[i])
+                middle[i] = acting[i] + 0.5 * change[i]
+            step(x, middle, aero, at, dt, work)
+            for i in range(4):
+                acting[i] += change[i]
         else:
             _linear_step(lon, lon_at, lat, lat_at, x, delta)
         left *= fade

@@ -1,8 +1,11 @@
 """`Window`: an equally sampled stretch of one flight, with a mask of what was really measured."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+
+from fleet.frames import ned_to_body
 
 STATES = ("u", "v", "w", "p", "q", "r", "phi", "theta", "psi")
 INPUTS = ("delta_a", "delta_e", "delta_r", "delta_t")
@@ -29,6 +32,13 @@ class Window:
     v: np.ndarray
     ok: np.ndarray
     filled: np.ndarray
+
+    @cached_property
+    def over_ground(self) -> np.ndarray:
+        """Give the states with u v w over the ground, (n, 9)."""
+        y = self.x.copy()
+        y[:, :3] = ned_to_body(y[:, 6], y[:, 7], y[:, 8], self.v)
+        return y
 
     @property
     def dt(self) -> float:

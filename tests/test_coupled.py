@@ -10,7 +10,7 @@ from flights import DT
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
 from fleet.window import Window
 from twin_worker import coupled
-from twin_worker.coupled import Coupled, identify, states
+from twin_worker.coupled import Coupled, identify
 from twin_worker.unseen import Unseen
 from twin_worker.verify import fits_at, mean
 
@@ -223,6 +223,6 @@ def test_too_little_says_so(ok):
 
 def test_states_are_over_the_ground():
     window = flight(noise=0.0)
-    speed = np.linalg.norm(states(window)[:, :3], axis=1)
+    speed = np.linalg.norm(window.over_ground[:, :3], axis=1)
     assert np.allclose(speed, np.linalg.norm(window.v, axis=1))
-    assert np.array_equal(states(window)[:, 3:], window.x[:, 3:]) and np.abs(speed - AT[0]).max() > 2.0
+    assert np.array_equal(window.over_ground[:, 3:], window.x[:, 3:]) and np.abs(speed - AT[0]).max() > 2.0

@@ -11,7 +11,6 @@ from fleet.physics.actuators import TAU as LAGS
 from fleet.physics.actuators import lagged
 from fleet.physics.wrench import OFFSETS
 from fleet.window import Window
-from twin_worker.coupled import states
 from twin_worker.observer import _ALPHA, _BETA, TAU, Observer
 
 DT = 0.02
@@ -40,7 +39,7 @@ def pushed(axis: int, rows: int, eye: type[Observer], gust: float = GUST) -> np.
 def flight(seconds: float = 30.0, **more: float) -> tuple[Observer, np.ndarray, np.ndarray, Window]:
     """A filter of the true model, states, inputs as they act, and the window."""
     window = fly(aircraft(0), seconds, **more)
-    return Observer(known(aircraft(0)), window.dt), states(window), lagged(window.u, window.dt, LAGS), window
+    return Observer(known(aircraft(0)), window.dt), window.over_ground, lagged(window.u, window.dt, LAGS), window
 
 
 @pytest.mark.parametrize("axis", range(6))
@@ -96,7 +95,7 @@ def test_what_is_foretold_is_where_a_run_from_the_row_before_goes():
 
 def test_it_is_nearer_to_the_flight_than_what_was_measured():
     eye, y, delta, window = flight(60.0)
-    truth = states(fly(aircraft(0), 60.0, noise=0.0))
+    truth = fly(aircraft(0), 60.0, noise=0.0).over_ground
     miss = (eye.track(y, delta)[50:, :9] - truth[50:]).std(axis=0)
     assert (miss < 1.05 * NOISE).all() and (miss[[0, 1, 2]] < 0.97 * NOISE[[0, 1, 2]]).all()
     assert len(window) == len(truth)

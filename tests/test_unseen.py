@@ -10,7 +10,7 @@ from flights import truth
 
 from fleet.contract import Outcome
 from fleet.physics.wrench import NAMES, WIND
-from twin_worker.coupled import Coupled, states
+from twin_worker.coupled import Coupled
 from twin_worker.unseen import Unseen
 from twin_worker.verify import AXES, fits_at, mean, told, verify
 from twin_worker.white import LAGS, whiteness
@@ -33,14 +33,14 @@ def test_without_noise_every_run_of_the_truth_is_the_flight():
     window = fly(aircraft(1), 40.0, noise=0.0)
     unseen = Unseen(known(aircraft(1)), window, START)
     runs = unseen.runs(100)
-    assert np.array_equal(unseen.y, states(window)[START:])
+    assert np.array_equal(unseen.y, window.over_ground[START:])
     assert np.abs(runs - unseen.y).max() < 0.5  # starts are read off what was before
     assert all(value > 97.0 for value in fits_at(unseen, 4.0)[0].values())
 
 
 def test_runs_start_afresh_near_what_was_measured_and_quieter():
     window = fly(aircraft(0), 60.0)
-    quiet = states(fly(aircraft(0), 60.0, noise=0.0))[START:]
+    quiet = fly(aircraft(0), 60.0, noise=0.0).over_ground[START:]
     unseen = Unseen(known(aircraft(0)), window, START)
     begins = np.arange(0, len(unseen.y), 10)
     miss = (unseen.runs(10)[begins] - quiet[begins]).std(axis=0)
@@ -189,7 +189,7 @@ def test_too_short_says_so():
 
 def test_shuffled_inputs_are_no_flight_of_this_aircraft():
     window = fly(aircraft(0), 60.0)
-    mixed = window_of(states(window), np.roll(window.u, 300, axis=0), aircraft(0))
+    mixed = window_of(window.over_ground, np.roll(window.u, 300, axis=0), aircraft(0))
     assert verify(known(aircraft(0)), mixed, START).outcome is not Outcome.VERIFIED
 
 

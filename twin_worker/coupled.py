@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.airframes import Airframe
-from fleet.frames import ned_to_body
 from fleet.physics.actuators import TAU, lagged
 from fleet.physics.dynamics import free_runs
 from fleet.physics.wrench import N_PAR, OFFSETS, WIND
@@ -64,13 +63,6 @@ class Coupled:
         return out
 
 
-def states(window: Window) -> np.ndarray:
-    """Give the states with u v w over the ground, (n, 9)."""
-    y = window.x.copy()
-    y[:, :3] = ned_to_body(y[:, 6], y[:, 7], y[:, 8], window.v)
-    return y
-
-
 def identify(
     window: Window, wind: np.ndarray, airframe: Airframe, last: Coupled | None = None, near: Coupled | None = None
 ) -> Coupled:
@@ -88,7 +80,7 @@ def identify(
     segments = segments_of(window.ok, window.dt)
     if not len(segments):
         raise ValueError("identify: found no 2 s of unbroken data, needs them; wait")
-    y, delta = states(window), lagged(window.u, window.dt, TAU)
+    y, delta = window.over_ground, lagged(window.u, window.dt, TAU)
     mean, precision, at, nominal = _held(window, wind, airframe, last)
     problem = Problem(y, delta, segments, at, window.dt, DISCOUNT)
     if near is not None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fleet.physics.dynamics import LOST, N_X, step
+from fleet.physics.dynamics import N_X, lost, step
 from fleet.physics.kernel import kernel
 from fleet.physics.wrench import OFFSETS
 from twin_worker.coupled import Coupled
@@ -73,17 +73,19 @@ def _track(
 ) -> None:
     x, d, blown, work = y[0].copy(), np.zeros(6), par.copy(), np.empty((3, N_X))
     for k in range(len(y)):
-        foretold[k] = x
         for i in range(N_X):
+            foretold[k, i] = x[i]
             e = y[k, i] - x[i]
             x[i] += _ALPHA[i] * e
             if i < 6:
                 d[i] += _BETA[i] * e / dt
-        if not np.abs(x).max() < LOST:
+        if lost(x):
             x[:] = y[k]
             d[:] = 0.0
-        out[k, :N_X] = x
-        out[k, N_X:] = d
+        for i in range(N_X):
+            out[k, i] = x[i]
+        for i in range(6):
+            out[k, N_X + i] = d[i]
         _blow(x, d, delta[k], par, at, dt, left, blown, work)
 
 
@@ -122,7 +124,8 @@ def _fly(
     for m in range(len(begins)):
         x[:], d[:] = tracked[m, :N_X], tracked[m, N_X:]
         for k in range(min(out.shape[1], len(delta) - begins[m])):
-            if not np.abs(x).max() < LOST:
+            if lost(x):
                 break
-            out[m, k] = x
+            for i in range(N_X):
+                out[m, k, i] = x[i]
             _blow(x, d, delta[begins[m] + k], par, at, dt, left, blown, work)

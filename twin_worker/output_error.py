@@ -9,6 +9,7 @@ Source: Jategaonkar 2015, chapter 4 (output error, multiple shots); Ljung 1999, 
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -79,7 +80,12 @@ def segments_of(ok: np.ndarray, dt: float) -> np.ndarray:
 def line_start(y: np.ndarray) -> np.ndarray:
     """Read the first state off a straight line through the first samples, (9,)."""
     n = min(LINE, len(y))
-    return np.linalg.pinv(np.column_stack([np.ones(n), np.arange(n)]))[0] @ y[:n]
+    return _line(n) @ y[:n]
+
+
+@lru_cache(maxsize=LINE)
+def _line(n: int) -> np.ndarray:
+    return np.linalg.pinv(np.column_stack([np.ones(n), np.arange(n)]))[0]
 
 
 class _Search:
@@ -118,19 +124,25 @@ class _Search:
             off @ self.Lambda @ off + (self.K * away**2).sum()
         )
 
-    def normal(self, par: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[tuple]]:
-        """Give information and slope of the parameters, start states eliminated, and what gives those back."""
+    def normal(self, par: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Give information and slope of the parameters, start states eliminated, and what gives those back.
+
+        That is of each segment the move of its start, less what a move of the parameters takes, (m, 9, 37 + 1).
+        """
         d = self.problem.discount
-        H, g, back = np.zeros((N_PAR, N_PAR)), -self.Lambda @ (par - self.par0), []
-        for s, (a, b) in enumerate(zip(self.bounds, self.bounds[1:], strict=False)):
-            J, e = self.J[a:b].reshape(-1, N_COLUMN), self.e[a:b].ravel()
-            HH, gg = d * (J.T @ J), d * (J.T @ e)
-            inverse = np.linalg.inv(HH[N_PAR:, N_PAR:] + np.diag(self.K))
-            cross, rest = HH[N_PAR:, :N_PAR], gg[N_PAR:] - self.K * (starts[s] - self.prior[s])
-            H += HH[:N_PAR, :N_PAR] - cross.T @ inverse @ cross
-            g = g + gg[:N_PAR] - cross.T @ (inverse @ rest)
-            back.append((inverse, rest, cross))
-        return H, g, back
+        m = len(starts)
+        HH, gg = np.empty((m, N_COLUMN, N_COLUMN)), np.empty((m, N_COLUMN))
+        for s in range(m):
+            J, e = (rows[self.bounds[s] : self.bounds[s + 1]].reshape(-1, *rows.shape[2:]) for rows in (self.J, self.e))
+            HH[s], gg[s] = J.T @ J, J.T @ e.ravel()
+        HH *= d
+        gg *= d
+        inverse = np.linalg.inv(HH[:, N_PAR:, N_PAR:] + np.diag(self.K))
+        cross, rest = HH[:, N_PAR:, :N_PAR], gg[:, N_PAR:] - self.K * (starts - self.prior)
+        back = inverse @ np.concatenate([cross, rest[..., None]], axis=2)
+        H = HH[:, :N_PAR, :N_PAR].sum(axis=0) - np.tensordot(cross, back[..., :-1], ((0, 1), (0, 1)))
+        g = gg[:, :N_PAR].sum(axis=0) - np.tensordot(cross, back[..., -1], ((0, 1), (0, 1)))
+        return H, g - self.Lambda @ (par - self.par0), back
 
 
 def search(
@@ -168,7 +180,7 @@ def _descend(look: _Search, par: np.ndarray, steps: int, weight: np.ndarray | No
         lhs = H + look.Lambda
         for _ in range(_TRIES):
             move = np.linalg.solve(lhs + np.diag(mu * np.diag(lhs)), g)
-            to = par + move, starts + np.array([inv @ (rest - cross @ move) for inv, rest, cross in back])
+            to = par + move, starts + back[..., -1] - back[..., :-1] @ move
             trial = look.fly(*to, W, False)
             if trial < cost:
                 break

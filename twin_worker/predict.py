@@ -5,6 +5,7 @@ Source: Huang 2021, section 3.4 (identical controller, same route, identified mo
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from fleet.autopilots import arduplane, laws
 from fleet.autopilots.shadow import shadow
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
-from fleet.mission import FIRST, KIND, LAND, P_D, P_N, SPEED, TAKEOFF, route
+from fleet.mission import FIRST, KIND, LAND, P_D, P_N, READ, SPEED, TAKEOFF, Route, route
 from fleet.simulate import N_STATE, simulate
 from fleet.window import Window
 from twin_worker.control import CRUISE_OF, Control, on_wings
@@ -26,6 +27,7 @@ LEAST_AHEAD_S = 60.0  # a flight ahead that ends before is none [s]
 SHADOW_S = 60.0  # telemetry the controller twin is synchronised on [s]
 _WIND_S = 10.0  # the autopilot's own wind is believed for as long [s]
 _SHADOW_STEP = 2  # window rows per shadow step
+_ROUTES = 1024  # routes that are kept unrolled: missions stay, and each costs as much as a flight
 _REFUSED = {TAKEOFF: "take-off", LAND: "landing"}
 
 
@@ -178,13 +180,22 @@ def heard(now: Situation) -> Heard | Flown:
     seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
     board = now.onboard
     first = FIRST.get(board.autopilot, 1)
-    way = route(board.items, seq=int(seq[0]), origin=now.origin, params=board.params, first=first)
+    params = tuple((name, board.params[name]) for name in READ if name in board.params)
+    way = _unrolled(board.items, int(seq[0]), now.origin, params, first)
     said = way.said
     if not len(way.legs):
         return Flown(None, int(seq[-1]), said or "the mission has no legs to fly")
     start = way.start if np.isfinite(way.start).all() else good.p[0]
     altitude = now.origin.alt_mm * 1e-3 - float(good.p[-1, 2])
     return Heard(good, way.legs, start, _telemetry(good, at, now.history), seq, altitude, said)
+
+
+@lru_cache(maxsize=_ROUTES)
+def _unrolled(
+    items: tuple[Item, ...], seq: int, origin: Origin, params: tuple[tuple[str, float], ...], first: int
+) -> Route:
+    """Give the legs from item `seq` on, that nobody changes; as `route`."""
+    return route(items, seq=seq, origin=origin, params=dict(params), first=first)
 
 
 def known_wind(now: Situation, good: Window) -> tuple[float, float]:

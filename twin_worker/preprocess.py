@@ -5,11 +5,12 @@ Source: Huang 2021, section 3.2 (time-stamp calibration, eq. 18; Lagrange interp
 
 from math import ceil, floor
 
+import numba as nb
 import numpy as np
 
 from fleet.airframe import ServoMap
 from fleet.frames import Origin, ned_to_body, to_ned
-from fleet.window import Window
+from fleet.window import STATES, Window
 from twin_worker.history import History
 
 DT = 0.04  # grid of every window [s]
@@ -18,6 +19,8 @@ _SETTLED_S = 1.5  # rows older than the newest grid time by more come no longer 
 _BEFORE_S = 4.0  # rows before a piece that its interpolation looks at [s]
 _LEAST_ROWS = 4, 8  # of every kind, to go on and to begin
 _FEWEST = 50  # grid times of a window
+_BENT = 8.0  # usual gaps that the four points of a cubic may span [-]
+_LOST = 1.6  # usual gaps from which a gap means lost samples [-]
 _SPLIT = (6, 9, 12)  # where velocity, position and pulses begin in what is laid
 _WIDTH = 20
 
@@ -25,51 +28,77 @@ _WIDTH = 20
 def lagrange(t: np.ndarray, y: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Interpolate by the cubic Lagrange polynomial through the four samples around each grid time.
 
-    L(a) = sum_i b_i prod_(j != i) (a - a_j) / (a_i - a_j).  Source: Huang 2021 eq. 19.
-
     Args:
         t: sample times, rising, (m,) [s]
         y: samples, (m, k)
-        grid: wanted times within the samples, (n,) [s]
+        grid: wanted times within the samples, rising, (n,) [s]
     Returns:
         values on the grid, (n, k)
     """
-    if len(t) < 4:
-        return np.stack([np.interp(grid, t, column) for column in y.T], axis=1)
-    left = np.clip(np.searchsorted(t, grid, side="right") - 2, 0, len(t) - 4)
-    index = left[:, None] + np.arange(4)
-    a = t[index]
-    out = np.zeros((len(grid), y.shape[1]))
-    for i in range(4):
-        weight = np.ones(len(grid))
-        for j in range(4):
-            if j != i:
-                weight *= (grid - a[:, j]) / (a[:, i] - a[:, j])
-        out += weight[:, None] * y[index[:, i]]
-    return out
+    return _laid(t, y, grid, (0.0, np.inf, np.inf))[0]
 
 
-def fill(t: np.ndarray, y: np.ndarray, grid: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def fill(
+    t: np.ndarray, y: np.ndarray, grid: np.ndarray, longest: float, bent: float = _BENT
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lay samples on the grid: cubic where they are dense, linear across a short gap, not at all across a long one.
 
+    Args:
+        t, y, grid: as for `lagrange`
+        longest: wider gaps are not filled [s]
+        bent: usual gaps that the four points of a cubic may span; next to a wide gap noise would swing it [-]
     Returns:
         values (n, k), measured or filled (n,) bool, filled across lost samples (n,) bool
     """
-    n = len(grid)
     if len(t) < 4:
-        return np.zeros((n, y.shape[1])), np.zeros(n, bool), np.zeros(n, bool)
-    usual = float(np.median(np.diff(t)))
-    right = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
-    gap = t[right] - t[right - 1]
-    inside = (grid >= t[0] - usual) & (grid <= t[-1] + usual)
-    ok = inside & (gap <= longest)
-    lost = ok & (gap > 1.6 * usual)
-    within = np.clip(grid, t[0], t[-1])
-    smooth = lagrange(t, y, within)
-    straight = np.stack([np.interp(within, t, column) for column in y.T], axis=1)
-    # next to a gap the cubic's four points are far apart and noise would swing it
-    span = t[np.clip(right + 1, 0, len(t) - 1)] - t[np.clip(right - 2, 0, len(t) - 1)]
-    return np.where((span > 8 * usual)[:, None], straight, smooth), ok, lost
+        return np.zeros((len(grid), y.shape[1])), np.zeros(len(grid), bool), np.zeros(len(grid), bool)
+    gaps = np.sort(np.diff(t))
+    usual = 0.5 * float(gaps[(len(gaps) - 1) // 2] + gaps[len(gaps) // 2])
+    return _laid(t, y, grid, (usual, longest, bent * usual))
+
+
+def _laid(
+    t: np.ndarray, y: np.ndarray, grid: np.ndarray, limits: tuple[float, float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    out, ok, lost = np.empty((len(grid), y.shape[1])), np.empty(len(grid), bool), np.empty(len(grid), bool)
+    _lay_each(t, np.ascontiguousarray(y, float), np.ascontiguousarray(grid), limits, out, ok, lost)
+    return out, ok, lost
+
+
+@nb.njit(cache=True, nogil=True)  # no fastmath: a gap just as long as the longest is filled
+def _lay_each(
+    t: np.ndarray,
+    y: np.ndarray,
+    grid: np.ndarray,
+    limits: tuple[float, float, float],
+    out: np.ndarray,
+    ok: np.ndarray,
+    lost: np.ndarray,
+) -> None:
+    """Fill in what `fill` gives; limits: usual gap, longest gap, longest span of a cubic [s].
+
+    L(a) = sum_i b_i prod_(j != i) (a - a_j) / (a_i - a_j).  Source: Huang 2021 eq. 19.
+    """
+    (usual, longest, reach), n, right = limits, len(t), 1
+    weight = np.empty(4)
+    for g in range(len(grid)):
+        while right < n - 1 and t[right] < grid[g]:
+            right += 1
+        gap, at = t[right] - t[right - 1], min(max(grid[g], t[0]), t[n - 1])
+        ok[g] = t[0] - usual <= grid[g] <= t[n - 1] + usual and gap <= longest
+        lost[g] = ok[g] and gap > _LOST * usual
+        first, count = max(min(right - 2, n - 4), 0), 4
+        if n < 4 or t[min(right + 1, n - 1)] - t[max(right - 2, 0)] > reach:
+            first, count = right - 1, 2
+        for i in range(count):
+            weight[i] = 1.0
+            for j in range(count):
+                if j != i:
+                    weight[i] *= (at - t[first + j]) / (t[first + i] - t[first + j])
+        for k in range(y.shape[1]):
+            out[g, k] = 0.0
+            for i in range(count):
+                out[g, k] += weight[i] * y[first + i, k]
 
 
 class Grid:
@@ -113,8 +142,9 @@ class Grid:
             return None
         attitude, v, p, pulses = np.split(self._laid[rows], _SPLIT, axis=1)
         ok, filled = self._ok[rows].T
-        body = ned_to_body(attitude[:, 0], attitude[:, 1], attitude[:, 2], v - wind)
-        x = np.hstack([body, attitude[:, 3:], attitude[:, :3]])
+        x = np.empty((len(v), len(STATES)))
+        x[:, :3] = ned_to_body(attitude[:, 0], attitude[:, 1], attitude[:, 2], v - wind)
+        x[:, 3:6], x[:, 6:] = attitude[:, 3:], attitude[:, :3]
         return Window(self._k[rows] * DT, x, servos.inputs(pulses), p, v, ok, filled)
 
     def _extend(self, history: History, until: float) -> bool:
@@ -153,7 +183,7 @@ def _lay(
         fill(t, unwrapped, grid, LONGEST_GAP["attitude"]),
         fill(*rows["velocity"], grid, LONGEST_GAP["velocity"]),
         fill(t_p, to_ned(origin, *place.T), grid, LONGEST_GAP["position"]),
-        _held(*rows["servo"], grid),
+        fill(*rows["servo"], grid, LONGEST_GAP["servo"], 0.0),  # a servo does not overshoot as a cubic would
     ]
     values, ok, filled = zip(*laid, strict=True)
     return np.hstack(values), np.logical_and.reduce(ok), np.logical_or.reduce(filled)
@@ -164,12 +194,3 @@ def preprocess(
 ) -> Window | None:
     """Lay the newest `seconds` before `until` on one grid; arguments as for `Grid.window`."""
     return Grid(seconds).window(history, origin, servos, wind, until=until, seconds=seconds)
-
-
-def _held(t: np.ndarray, pulses: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lay servo pulses on the grid, straight between samples: a servo does not overshoot as a cubic would."""
-    usual = float(np.median(np.diff(t)))
-    right = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
-    gap = t[right] - t[right - 1]
-    values = np.stack([np.interp(grid, t, column) for column in pulses.T], axis=1)
-    return values, gap <= LONGEST_GAP["servo"], gap > 1.6 * usual

@@ -10,7 +10,7 @@ Source: Jategaonkar 2015, section 4.6 (output error, sensitivity equations); exa
 
 import numpy as np
 
-from fleet.physics.dynamics import LOST, N_X, jacobian, step
+from fleet.physics.dynamics import N_X, jacobian, lost, step
 from fleet.physics.kernel import bare, kernel
 from fleet.physics.wrench import N_AERO, N_PAR, ROW, WIND
 
@@ -21,12 +21,12 @@ N_COLUMN = N_PAR + N_X
 
 @bare
 def _times(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+    """Fill in a b, (9, n), of a (9, 9) and b (9, n); a row of `a` by name is kept in registers, indexed it is not."""
     for i in range(N_X):
-        for j in range(N_X):
-            out[i, j] = 0.0
-        for k in range(N_X):
-            for j in range(N_X):
-                out[i, j] += a[i, k] * b[k, j]
+        a0, a1, a2, a3, a4, a5, a6, a7, a8 = a[i]
+        for j in range(b.shape[1]):
+            low = a0 * b[0, j] + a1 * b[1, j] + a2 * b[2, j] + a3 * b[3, j]
+            out[i, j] = low + a4 * b[4, j] + a5 * b[5, j] + a6 * b[6, j] + a7 * b[7, j] + a8 * b[8, j]
 
 
 @kernel
@@ -42,14 +42,13 @@ def _transition(F: np.ndarray, dt: float, Phi: np.ndarray, Gamma: np.ndarray, wo
         for j in range(N_X):
             Gamma[i, j] = dt**2 / 2 * F[i, j] + dt**3 / 6 * square[i, j] + dt**4 / 24 * cube[i, j]
         Gamma[i, i] += dt
-    _times(F, Gamma, Phi)
-    for i in range(N_X):
-        Phi[i, i] += 1.0
-    for _ in range(_DOUBLINGS):
-        _times(Phi, Gamma, keep)
-        Gamma += keep
-        _times(Phi, Phi, keep)
-        Phi[:] = keep
+    for doubling in range(_DOUBLINGS + 1):
+        if doubling:
+            _times(Phi, Gamma, keep)
+            Gamma += keep
+        _times(F, Gamma, Phi)
+        for i in range(N_X):
+            Phi[i, i] += 1.0
 
 
 @bare
@@ -57,12 +56,8 @@ def _carry(
     S: np.ndarray, Phi: np.ndarray, Gamma: np.ndarray, term: np.ndarray, by_wind: np.ndarray, out: np.ndarray
 ) -> None:
     """Fill in the sensitivities a group later."""
+    _times(Phi, S, out)
     for i in range(N_X):
-        for a in range(N_COLUMN):
-            out[i, a] = 0.0
-        for k in range(N_X):
-            for a in range(N_COLUMN):
-                out[i, a] += Phi[i, k] * S[k, a]
         for a in range(N_AERO):
             out[i, a] += Gamma[i, ROW[a]] * term[a]
         for k in range(6):
@@ -122,14 +117,13 @@ def sweep(
                 if 2 * j == GROUP:
                     half[:] = x
                 step(x, delta[k + j], par, at, dt, work)
-            for i in range(N_X):
-                if not abs(x[i]) < LOST:
-                    return np.inf
+            if lost(x):
+                return np.inf
             if len(J):
                 for i in range(4):
                     mean[i] = delta[k : k + GROUP, i].mean()
                 jacobian(half, mean, par, at, F, by_wind, term)
                 _transition(F, dt, Phi, Gamma, matrices)
                 _carry(S, Phi, Gamma, term, by_wind, S_next)
-                S[:] = S_next
+                S, S_next = S_next, S
     return cost

@@ -4,7 +4,7 @@ import numpy as np
 
 from fleet.physics.actuators import TAU, lagged
 from fleet.window import STATES, Window
-from twin_worker.coupled import Coupled, states
+from twin_worker.coupled import Coupled
 from twin_worker.earned import runs_and_flown
 from twin_worker.observer import Observer
 from twin_worker.output_error import LINE
@@ -25,7 +25,7 @@ class Unseen:
 
     def __init__(self, plant: Plant, window: Window, start: int) -> None:
         self._plant, self._window, self._start = plant, window, start
-        self._y = states(window) if isinstance(plant, Coupled) else window.x
+        self._y = window.over_ground if isinstance(plant, Coupled) else window.x
         self._delta = lagged(window.u, window.dt, TAU) if isinstance(plant, Coupled) else window.u
         self._broken = np.concatenate([[0], np.cumsum(~window.ok)])
         self.y, self.ok, self.dt = self._y[start:], window.ok[start:], window.dt

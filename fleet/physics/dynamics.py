@@ -24,6 +24,15 @@ LOST = 1e4  # a state beyond has left every envelope
 
 
 @bare
+def lost(x: np.ndarray) -> bool:
+    """Tell whether a state, (9,), has left every envelope, or is nan."""
+    far = False
+    for i in range(N_X):
+        far |= not abs(x[i]) < LOST
+    return far
+
+
+@bare
 def rates_of_change(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, out: np.ndarray) -> None:
     """Fill in x', (9,)."""
     u, v, w, p, q, r = x[0], x[1], x[2], x[3], x[4], x[5]
@@ -96,9 +105,10 @@ def free_runs(
     for m in range(len(begins)):
         x[:] = starts[m]
         for k in range(begins[m], min(begins[m] + length, len(out))):
-            if not np.abs(x).max() < LOST:
+            if lost(x):
                 break
-            out[k] = x
+            for i in range(N_X):
+                out[k, i] = x[i]
             step(x, delta[k], par, at, dt, work)
 
 

@@ -6,13 +6,13 @@
 Source: Park, Deyst & How, "A New Nonlinear Guidance Logic for Trajectory Tracking" (2004); ArduPlane L1 controller.
 """
 
-from math import asin, atan, atan2, cos, hypot, pi, sin
+from math import asin, atan, atan2, cos, pi, sin
 
 import numpy as np
 
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.arduplane import state as S
-from fleet.autopilots.arduplane.state import kernel
+from fleet.autopilots.arduplane.state import hypot, kernel
 from fleet.frames import G, wrap
 from fleet.mission import P_E, P_N
 
@@ -58,9 +58,9 @@ def angle_to(v_n: float, v_e: float, n: float, e: float) -> float:
 def decided(ctl: np.ndarray, nu: float, n: float, e: float, psi: float) -> float:
     """Keep turning the way chosen before while the target (n, e) lies nearly behind; remembers `nu` [rad]."""
     before = ctl[S.NU]
-    behind = abs(wrap(atan2(e, n) - psi)) > 2 * pi / 3
-    if behind and abs(nu) > 0.9 * pi and abs(before) > 0.9 * pi and nu * before < 0.0:
-        nu = before
+    if abs(nu) > 0.9 * pi and abs(before) > 0.9 * pi and nu * before < 0.0:
+        behind = abs(wrap(atan2(e, n) - psi)) > 2 * pi / 3
+        nu = before if behind else nu
     ctl[S.NU] = nu
     return nu
 

@@ -4,14 +4,14 @@ A line is over within the turn distance of its end or once the finish line throu
 Source: ArduPlane mission logic, waypoint switching and altitude slope.
 """
 
-from math import atan2, hypot, pi
+from math import atan2, pi
 
 import numpy as np
 
 from fleet.autopilots.arduplane import l1
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.arduplane import state as S
-from fleet.autopilots.arduplane.state import kernel
+from fleet.autopilots.arduplane.state import hypot, kernel
 from fleet.frames import wrap
 from fleet.mission import (
     ACCEPT,
