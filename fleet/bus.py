@@ -6,6 +6,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from itertools import islice
 from typing import Any, TypeVar
 
 import zenoh
@@ -15,11 +16,12 @@ from fleet.access.knock import answers
 from fleet.access.roles import ROOT
 from fleet.codec import Stamp, Wire, decode, encode, encoding, pack_stamp, unpack_stamp
 from fleet.contract import PER_UAV, Claim
-from fleet.talk import Answer, Heard, Overheard, Token, Wants, asked_for, key, newest, uav_in
+from fleet.talk import Answer, Collected, Heard, Overheard, Token, Wants, asked_for, key, newest, uav_in
 
 M = TypeVar("M")
 _WAITED_FOR = (Claim,)  # seldom and needed: the sender waits where the way is full, everything else is dropped there
 _LIVE = f"{ROOT}/@live/"
+_PUT_ASIDE = 20_000  # messages of a class that wait until they are handed out
 _ANSWERS = 4096  # that may wait to be read
 _TOKENS = 4096  # asked for at once; with the usual channel more than 256 would block for ever
 
@@ -34,6 +36,8 @@ class ZenohBus(AbstractContextManager):
         self._declared: list[Any] = []
         self._publishers: dict[tuple[type, int], Any] = {}
         self._lock = threading.Lock()
+        self._collected: list[tuple[zenoh.Handler[zenoh.Sample], Collected]] = []
+        self._handing = threading.Lock()
 
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
         """Send one message to whoever listens."""
@@ -75,6 +79,27 @@ class ZenohBus(AbstractContextManager):
             heard(sample.payload.to_bytes(), str(sample.encoding), _stamp(sample))
 
         self._declared.append(self._session.declare_subscriber(key(kind, "*"), on_sample))
+
+    def collect(self, kind: type, heard: Collected) -> None:
+        """Put every message of a class aside until `hand_out`; where nobody takes them out the oldest go first."""
+        subscriber = self._session.declare_subscriber(key(kind, "*"), zenoh.handlers.RingChannel(_PUT_ASIDE))
+        self._declared.append(subscriber)
+        self._collected.append((subscriber.handler, heard))
+
+    def hand_out(self) -> None:
+        """Give out what was put aside, class by class, each in the order it came."""
+        if not self._handing.acquire(blocking=False):
+            return  # somebody does it already
+        try:
+            for handler, heard in self._collected:
+                waiting = islice(iter(handler.try_recv, None), _PUT_ASIDE)
+                if found := [
+                    (uav_in(str(one.key_expr)), one.payload.to_bytes(), str(one.encoding), _stamp(one))
+                    for one in waiting
+                ]:
+                    heard(found)
+        finally:
+            self._handing.release()
 
     def answer(self, kind: type, reply: Answer) -> None:
         """Declare one wildcard queryable for a class; it replies on a thread of the session."""

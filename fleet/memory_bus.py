@@ -6,8 +6,10 @@ from contextlib import AbstractContextManager, suppress
 from functools import partial
 from typing import Any, TypeVar
 
+import msgspec
+
 from fleet.codec import Stamp, Wire, decode, encode, encoding
-from fleet.talk import Answer, Heard, Overheard, Token, Wants, asked_for, newest
+from fleet.talk import Answer, Collected, Heard, Overheard, Token, Wants, asked_for, newest
 
 M = TypeVar("M")
 
@@ -55,6 +57,13 @@ class MemoryBus(AbstractContextManager):
     def overhear(self, kind: type, heard: Overheard) -> None:
         """Call `heard(payload, encoding, stamp)` for every message of a class, as it came."""
         self._overheard.setdefault(kind, []).append(heard)
+
+    def collect(self, kind: type, heard: Collected) -> None:
+        """Call `heard` with every message of a class, at once."""
+        self.overhear(kind, lambda payload, *rest: heard([(_whose(payload), payload, *rest)]))
+
+    def hand_out(self) -> None:
+        """Do nothing: nothing waits here."""
 
     def answer(self, kind: type, reply: Answer) -> None:
         """Declare one wildcard queryable for a class."""
@@ -106,6 +115,20 @@ class MemoryBus(AbstractContextManager):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+class _Whose(msgspec.Struct):
+    """Of a message only whose it is."""
+
+    uav: int | None = None
+
+
+def _whose(payload: bytes) -> int | None:
+    """Read the UAV that on a wire the key would name; None where there is none."""
+    try:
+        return msgspec.msgpack.decode(payload, type=_Whose).uav
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
 
 
 def _wanted(heard: Heard, wants: Wants, message: Any, stamp: Stamp | None) -> None:

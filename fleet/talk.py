@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
+from functools import lru_cache
 from typing import Any, Protocol, TypeVar
 
 from fleet.access.roles import ROOT
@@ -11,6 +12,9 @@ from fleet.contract import PER_UAV
 M = TypeVar("M")
 Heard = Callable[[Any, Stamp | None], None]
 Overheard = Callable[[bytes, str, Stamp | None], None]
+Letter = tuple[int | None, bytes, str, Stamp | None]
+"""The UAV its key names, the payload, its encoding and its claim."""
+Collected = Callable[[list[Letter]], None]
 Answers = Iterable[tuple[Any, Stamp | None]]
 Answer = Callable[[int | None, dict[str, str], bytes], Answers]
 Token = Callable[[str, bool], None]
@@ -23,6 +27,7 @@ def key(kind: type, who: int | str) -> str:
     return f"{ROOT}/{who}/{topic}" if kind in PER_UAV else f"{ROOT}/{topic}/{who}"
 
 
+@lru_cache(maxsize=16_384)
 def uav_in(name: str) -> int | None:
     """Read the UAV id out of a key; None where the chunk is a wildcard or no number."""
     chunk = name.split("/")[1] if name.count("/") >= 2 else ""
@@ -55,6 +60,17 @@ class Bus(AbstractContextManager, Protocol):
 
     def overhear(self, kind: type, heard: Overheard) -> None:
         """Call `heard(payload, encoding, stamp)` for every message of a class, as it came and whatever is in it."""
+
+    def collect(self, kind: type, heard: Collected) -> None:
+        """Put every message of a class aside until `hand_out`: it costs no thread and no turn of one.
+
+        Args:
+            kind: of the contract
+            heard: called with all of them in the order they came, whatever is in them
+        """
+
+    def hand_out(self) -> None:
+        """Give out what was put aside, on this thread; call it often, for only so much is kept: the newest."""
 
     def answer(self, kind: type, reply: Answer) -> None:
         """Declare one wildcard queryable for a class: `reply(uav or None, parameters, payload)`."""

@@ -90,6 +90,22 @@ def test_what_is_published_is_heard_with_its_stamp(pair: Pair, kind: type, stamp
     assert told(heard, lambda: pair.here.publish(EXAMPLES[kind], stamp)) == (EXAMPLES[kind], stamp)
 
 
+def test_what_is_put_aside_is_handed_out_in_order_with_whose_it_is(pair: Pair) -> None:
+    heard: SimpleQueue = SimpleQueue()
+    pair.there.collect(Status, lambda letters: [heard.put(letter) for letter in letters])
+    pair.there.hand_out()  # nothing waits
+
+    def tell(stamp: Stamp | None = STAMP) -> None:
+        pair.here.publish(EXAMPLES[Status], stamp)
+        pair.there.hand_out()
+
+    uav, payload, named = EXAMPLES[Status].uav, encode(EXAMPLES[Status]), encoding(Status)
+    assert told(heard, tell) == (uav, payload, named, STAMP)
+    assert told(heard, lambda: (pair.inject(Status, b"", "odd"), pair.there.hand_out()))[1] in (b"", payload)
+    *_, last = [told(heard, lambda: tell(None)) for _ in range(3)]
+    assert last[3] is None or last[2] == "odd" or last[1] == payload
+
+
 def test_a_subscriber_hears_its_own_class_alone(pair: Pair) -> None:
     heard: SimpleQueue = SimpleQueue()
     pair.there.subscribe(Status, lambda message, _: heard.put(message))

@@ -15,7 +15,6 @@ from fleet.contract import (
     Outcome,
     Prediction,
     Rows,
-    Sample,
     State,
     Status,
     Verdict,
@@ -23,6 +22,7 @@ from fleet.contract import (
 from fleet.contract import Event as Happened
 from viewer.chronicle import ROWS, listing
 from viewer.events import MAX_EVENTS, MAX_RAISED, Event, Kind, closed, merged
+from viewer.inbox import Head
 from viewer.palette import DARK, LIGHT, MARK
 from viewer.tell import MAX_STEPS, MAX_WORDS, Known, hear
 
@@ -49,9 +49,9 @@ def model(t: float, outcome: Outcome, *, in_force: bool) -> Model:
     return Model(uav=7, t=T + t, method="paper", verdict=newest, in_force=newest if in_force else None)
 
 
-def legs(*seqs: float) -> Sample:
+def legs(*seqs: float) -> Head:
     x = np.array(seqs, float)[:, None]
-    return Sample(uav=7, t=T + len(x), leg=Rows(t=Array.of(T + np.arange(len(x)), "<f8"), x=Array.of(x)))
+    return Head(uav=7, t=T + len(x), leg=Rows(t=Array.of(T + np.arange(len(x)), "<f8"), x=Array.of(x)))
 
 
 def told_of(t: float, event: Happened | None, said: str = "", *, event_t: float | None = None) -> Prediction:
@@ -230,7 +230,7 @@ def test_what_is_said_becomes_what_happened(messages: list, expected: list) -> N
 def test_legs_of_no_sound_shape_are_refused(x: np.ndarray) -> None:
     rows = Rows(t=Array.of([T, T, T], "<f8"), x=Array.of(x))
     with pytest.raises(ValueError, match="leg rows have shape"):
-        hear(Known(), Sample(uav=7, t=T, leg=rows))
+        hear(Known(), Head(uav=7, t=T, leg=rows))
 
 
 def test_wild_messages_stay_within_bounds() -> None:

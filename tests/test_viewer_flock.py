@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from pretend_feed import STAMP, Clock, PretendUav, T, feed_of
 
-from fleet.codec import encode
+from fleet.codec import encode, encoding
 from fleet.contract import Array, Mission, Rows, Sample, Status
 from fleet.frames import Origin
 from fleet.memory_bus import MemoryBus
 from viewer.errors import AHEADS_S, by_ahead, errors
-from viewer.feed import Feed
-from viewer.flock import CROWD, LOST, MINUTE, MISMATCH, Flock, look
+from viewer.events import Kind
+from viewer.feed import WAIT_S, Feed
+from viewer.flock import CROWD, LOST, MINUTE, MISMATCH, TURNS, Flock, look
 from viewer.inbox import Inbox
 from viewer.labels import MOST, Sight, Tag, fitting
 from viewer.numerals import written
@@ -74,9 +75,9 @@ def test_trails_are_coarser_and_shorter_the_more_there_are(clock: Clock, n: int,
 
 def test_a_crowd_goes_on_between_two_looks_and_who_is_selected_is_looked_at(clock: Clock) -> None:
     feed, flock, bus = crowd_of(clock, CROWD + 1)
-    feed.inbox.keen = frozenset({7})
-    for step in (1.0, 2.0):
-        clock.now += 1.0
+    feed.inbox.keen = feed.close = frozenset({7})
+    for step in (np.arange(1, 11) / TURNS).tolist():
+        clock.now += 1.0 / TURNS
         for message in fixes(CROWD + 1, T + step, 900 * step):
             bus.publish(message)
         flock.pose(feed, clock.now)
@@ -110,14 +111,59 @@ def test_in_a_crowd_the_newest_sample_and_news_of_the_mission_are_read() -> None
     plain, box = encode(Sample(uav=3, t=T)), Inbox()
     box.crowd = True
     for payload in (plain, leg(1.0), plain, plain, leg(1.0), plain, leg(2.0), plain):
-        box.put(payload, 0.0)
-    assert [payload for payload, _ in box.take()] == [leg(1.0), leg(2.0), plain]
+        box.put([(3, payload)], 0.0)
+    assert [letter.payload for _, letter in box.take()] == [leg(1.0), leg(2.0), plain]
     box.keen = frozenset({3})
     for _ in range(4):
-        box.put(plain, 0.0)
-    assert len(box.take((3,))) == 4 and box.take() == []
-    box.put(b"\xc1", 0.0)
+        box.put([(3, plain)], 0.0)
+    assert len(list(box.take((3,)))) == 4 and list(box.take()) == []
+    box.put([(None, b"\xc1")], 0.0)
     assert box.lost == 1
+
+
+def test_who_has_waited_longest_is_named_first() -> None:
+    box = Inbox()
+    box.crowd = True
+    for now, uav in ((0.0, 1), (0.5, 2), (0.6, 1), (1.0, 3)):
+        box.put([(uav, encode(Sample(uav=uav, t=T)))], now)
+    assert box.waiting(0.5) == [1, 2] and [letter.now for _, letter in box.take((1,))] == [0.6]
+    box.put([(1, b"")], 2.0)
+    assert box.waiting(2.0) == [2, 3, 1]
+
+
+def test_in_a_crowd_what_comes_every_second_is_read_now_and_then_and_of_who_is_looked_at_at_once(clock: Clock) -> None:
+    feed, _, bus = crowd_of(clock, CROWD + 1)
+
+    def mode(uav: int) -> str:
+        return feed.one(uav).status.mode
+
+    for k, uav in enumerate((5, 6, 7)):
+        bus.publish(Status(uav=uav, t=T + 0.1 * k, mode="AUTO"))
+    assert mode(5) == mode(6) == "AUTO"  # the first is read at once
+    feed.close = frozenset({6})
+    for name in ("RTL", "LAND"):
+        clock.now += 0.5
+        for uav in (5, 6):
+            bus.publish(Status(uav=uav, t=T + clock.now, mode=name))
+    feed.listen()
+    assert (mode(5), mode(6)) == ("AUTO", "LAND")
+    clock.now += WAIT_S[Status]
+    feed.listen()
+    assert mode(5) == "LAND" and [e.text for e in feed.one(5).events if e.kind is Kind.MODE] == ["AUTO", "LAND"]
+    bus.publish(Status(uav=5, t=T + clock.now, mode="HOLD"))
+    feed.close = frozenset({5})
+    bus.publish(Status(uav=5, t=T + clock.now + 1, mode="STAB"))  # looked at: what waited is older
+    clock.now += 2 * WAIT_S[Status]
+    feed.listen()
+    assert mode(5) == "STAB"
+
+
+def test_nobody_writes_in_the_name_of_another(clock: Clock) -> None:
+    feed, _, _ = feed_of(clock, 2)
+    at, hear = feed.one(0).at, feed._came
+    for kind, message in ((Status, Status(uav=0, t=T, mode="X")), (Sample, fixes(1, T + 1, 9_000)[0])):
+        hear(kind)([(1, encode(message), encoding(kind), None)])
+    assert feed.one(0).status.mode != "X" and np.array_equal(feed.one(0).at, at) and feed.counts["strange"] == 2
 
 
 def test_a_sample_of_another_kind_changes_nothing(clock: Clock) -> None:

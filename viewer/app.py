@@ -72,6 +72,7 @@ class App:
 
     def tick(self, tick: int) -> None:
         """Draw what is due at this tick."""
+        self.feed.listen()
         self._welcome()
         if tick % SECOND and not self.views:
             return  # nobody looks: once a second keeps the trails
@@ -153,7 +154,7 @@ class App:
             self.flock.pose(self.feed, now)
         needy = [self.flock.uavs[i] for i in np.flatnonzero(self.flock.exceptions)[:MOST_CLOSE]]
         chosen = [view.selected for view in self.views.values() if view.selected is not None]
-        self.feed.inbox.keen = frozenset((*needy, *chosen))
+        self.feed.inbox.keen, self.feed.close = frozenset(chosen), frozenset((*needy, *chosen))
         played = [(v, rows) for v in fleet if v.recorded and len(rows := self.feed.track(v))]
         self.flock.beat({v.uav: placed(rows, v.t - MINUTE, np.inf) for v, rows in played})
         self.flock.meet(fleet, now)

@@ -10,6 +10,7 @@ import numpy as np
 
 from fleet.codec import Stamp, decode, encoding
 from fleet.contract import (
+    PER_UAV,
     Account,
     Alert,
     AlertKind,
@@ -25,15 +26,17 @@ from fleet.contract import (
 )
 from fleet.fence import GIVE_UP_S, Fence
 from fleet.talk import Bus, key
+from fleet.talk import Letter as Said
 from viewer.events import MAX_RAISED
 from viewer.forecast import Kept, forecast
-from viewer.inbox import CROWD, Inbox
+from viewer.inbox import CROWD, Head, Inbox, Letter, Newest, read
 from viewer.place import Place, TooFar, checked, first_fix
 from viewer.vehicle import ENDED_S, JUMP_S, Vehicle
 
 MAX_VEHICLES = 2_000  # ids are written by strangers: more than this many are counted, not kept
 COASTING_S = 1.0  # a prediction so long after the last sample is of no flight that anything can be laid beside [s]
-_SAMPLES = encoding(Sample)
+SOON_S = 1.2  # in a crowd a sample is read at the latest when it has waited for so long [s]
+WAIT_S = {Prediction: 3.0, Status: 2.0}  # in a crowd the newest of these is read so often, of who is well [s]
 MAX_AWAY = 10_000  # UAVs without room that are counted
 MAX_LINKS = 64  # links whose sentences are kept
 MAX_WRITERS = 16  # workers whose sentences are kept: a restarted one is another
@@ -67,10 +70,10 @@ class Feed:
             FleetState: self._fleet,
         }
         self._hears = hears
-        bus.overhear(Sample, self._overhear)
+        self.close: frozenset[int] = frozenset()  # whose letters are read as they come, also in a crowd
+        self._newest: dict[type, Newest] = {kind: Newest(wait_s) for kind, wait_s in WAIT_S.items()}
         for kind in hears:
-            if kind is not Sample:
-                bus.subscribe(kind, self._guarded(kind))
+            bus.collect(kind, self._came(kind))
 
     @property
     def vehicles(self) -> dict[int, Vehicle]:
@@ -94,22 +97,70 @@ class Feed:
             self._read()
             return self._counts
 
-    def _overhear(self, payload: bytes, named: str, _: Stamp | None) -> None:
-        """Put a sample aside: it is read when somebody asks, or when there is other news."""
-        if named == _SAMPLES:
-            self.inbox.put(payload, self._clock())
-        else:
+    def listen(self) -> None:
+        """Take in what came since the last call; call it some ten times a second."""
+        self._bus.hand_out()
+        with self.lock:
+            for kind, newest in self._newest.items():
+                for uav, letter in newest.due(self._clock()):
+                    self._open(kind, uav, letter)
+
+    def _came(self, kind: type) -> Callable[[list[Said]], None]:
+        """Take in one class: samples are put aside, and in a crowd what comes every second; the rest is read."""
+        newest, named_so = self._newest.get(kind), encoding(kind)
+
+        def came(letters: list[Said]) -> None:
+            now = self._clock()
+            sound = [(uav, payload, stamp) for uav, payload, named, stamp in letters if named == named_so]
+            with self.lock:
+                self._counts["strange"] += len(letters) - len(sound)
+                if kind is Sample:
+                    self.inbox.put([(uav, payload) for uav, payload, _ in sound], now)
+                    return
+                for uav, payload, stamp in sound:
+                    letter = Letter(payload, now, stamp)
+                    if newest is None or uav is None or not self._may_wait(kind, uav):
+                        if newest is not None and uav is not None:
+                            newest.drop(uav)
+                        self._open(kind, uav, letter)
+                    else:
+                        newest.put(uav, letter)
+
+        return came
+
+    def _may_wait(self, kind: type, uav: int) -> bool:
+        """Tell whether one of a crowd is not looked at closely, and such a message of it is known already."""
+        if not self.inbox.crowd or uav in self.close:
+            return False
+        vehicle = self._vehicles.get(uav)
+        return vehicle is not None and getattr(vehicle, kind.topic) is not None  # type: ignore[attr-defined]
+
+    def _open(self, kind: type, uav: int | None, letter: Letter) -> None:
+        """Read one letter, after the samples before it; the lock is held."""
+        if not self.inbox.crowd:
+            self._read()
+        try:
+            message: Any = decode(kind, letter.payload)
+        except ValueError:
             self._counts["strange"] += 1
+            return
+        if kind in PER_UAV and message.uav != uav:
+            self._counts["strange"] += 1  # whoever may write about one aircraft must not write about another
+            return
+        self._hear(kind, message, letter.stamp, letter.now)
 
     def _read(self, uavs: Iterable[int] | None = None) -> None:
         """Read what was put aside, or what of it is of some UAVs; the lock is held."""
-        for payload, now in self.inbox.take(uavs):
+        for uav, letter in self.inbox.take(uavs):
             try:
-                sample = decode(Sample, payload)
+                sample = read(letter.payload)
             except ValueError:
                 self._counts["strange"] += 1
                 continue
-            self._hear(Sample, sample, None, now)
+            if sample.uav == uav:
+                self._hear(Sample, sample, None, letter.now)
+            else:
+                self._counts["strange"] += 1
         self.inbox.crowd = len(self._vehicles) > CROWD
 
     @property
@@ -139,22 +190,22 @@ class Feed:
     def all(self) -> list[Vehicle]:
         """Copy the UAVs, in order of their ids: nothing changes in them while they are drawn."""
         with self.lock:
-            self._read()
+            self._read(self.inbox.waiting(self._clock() - SOON_S) if self.inbox.crowd else None)
             return [self._vehicles[uav].still(self._clock()) for uav in sorted(self._vehicles)]
 
-    def poses(self, uavs: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-        """Give where some UAVs are and how they are turned: scene ENU [10 m], phi theta psi [rad], two (n, 3).
+    def poses(self, uavs: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Give where some UAVs are, how they are turned, and when that was heard; of others nothing is read.
 
-        What was put aside of others is left there.
-
-        A place that nobody told is not a number.
+        Returns:
+            scene ENU (n, 3) [10 m], not a number where nobody told; phi theta psi (n, 3) [rad]; monotonic (n,) [s]
         """
         nowhere = np.full(3, np.nan)
         with self.lock:
             self._read(uavs if self.inbox.crowd else None)
             found = [self._vehicles[uav] for uav in uavs]
             places = [one.at if one.at is not None else nowhere for one in found]
-            return np.array(places).reshape(-1, 3), np.array([one.attitude for one in found]).reshape(-1, 3)
+            turns, heard = [one.attitude for one in found], [one.heard for one in found]
+        return np.array(places).reshape(-1, 3), np.array(turns).reshape(-1, 3), np.array(heard)
 
     def one(self, uav: int) -> Vehicle | None:
         """Copy one UAV; None where it was never heard of."""
@@ -220,7 +271,7 @@ class Feed:
             self._vehicles[uav] = Vehicle(uav)
         return self._vehicles[uav]
 
-    def _sample(self, sample: Sample, _: Stamp | None, now: float) -> None:
+    def _sample(self, sample: Head, _: Stamp | None, now: float) -> None:
         if self._place is None and (origin := first_fix(sample)) is not None:
             self._place = Place(origin)
         if self._place is None:

@@ -12,7 +12,8 @@ from viewer.vehicle import Vehicle
 CHUNKS, STEPS = 5, 12  # the trail: chunks of 12 s, and a head of up to 12 s, one point a second
 MINUTE = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # how long ago each point of the trail is, (73,) [s]
 COARSE = ((60, 1), (CROWD, 2))  # of a fleet up to so many, seconds between the drawn points of a trail; else 4
-READ_S = 0.55  # how often the places of a crowd are read [s]
+TURNS = 5  # calls in which the places of a crowd are all read once
+COAST_S, STALE_S = 1.5, 2.5  # so long one goes on unheard; a speed over a longer gap is none [s]
 FASTEST = 30.0  # what went faster has leapt [10 m/s]
 LEAP_M = 1_000.0  # farther within a second is no flight but another one (a recording begun anew): a new trail [m]
 HOVER = ("multirotor", "helicopter")  # kinds of vehicle drawn with rotors
@@ -53,7 +54,10 @@ class Flock:
         self.beats = 0  # seconds of trail
         self.ring = np.zeros((0, len(MINUTE), 3))  # a minute of trail, newest last
         self._ghosts: list[tuple[int, Vehicle]] = []  # whose place is predicted, for they are not heard
-        self._read = (0.0, self.at, self.at)  # when places were last read, monotonic [s], where, and how fast [10 m/s]
+        self._turn = 0  # which part of a crowd was read last
+        self._told = np.zeros((0, 3))  # of a crowd: where each was when it was last read [10 m]
+        self._heard = np.zeros(0)  # when that was heard, monotonic [s]
+        self._speed = np.zeros((0, 3))  # how fast each went by then [10 m/s]
 
     @property
     def crowd(self) -> bool:
@@ -98,6 +102,8 @@ class Flock:
         self._ghosts = [(i, v) for i, (v, _) in enumerate(shown) if v.ended or v.at is None or self.looks[i] == LOST]
         for i, _ in self._ghosts:
             self.at[i] = shown[i][1]
+            if self.crowd:
+                self._told[i] = shown[i][1]
 
     def _enlist(self, uavs: tuple[int, ...], at: np.ndarray) -> None:
         """Begin with another set of UAVs; those who stay keep their trails."""
@@ -108,42 +114,50 @@ class Flock:
         self.ring, self.uavs, self.at, self.changes = ring, uavs, at, self.changes + 1
         self._rows = {uav: i for i, uav in enumerate(uavs)}
         self.quat = np.tile([1.0, 0.0, 0.0, 0.0], (len(uavs), 1))
+        self._told, self._heard, self._speed = at.copy(), np.full(len(uavs), -np.inf), np.zeros_like(at)
 
     def pose(self, feed: Feed, now: float) -> None:
         """Take over where everybody is; call it as often as the picture moves.
 
-        In a crowd places are read every `READ_S`, in between everybody goes on as before; of who needs an eye or is
-        selected they are read every time.
+        Of a crowd a part is read at each call, in between everybody goes on as before; who needs an eye or is selected
+        is read every time.
         """
         if not self.uavs:
             return
-        since = now - self._read[0]
-        if self.crowd and since < READ_S and len(self._read[1]) == len(self.uavs):
-            self.at = self._read[1] + self._read[2] * since
-            if close := [i for uav in sorted(feed.inbox.keen) if (i := self._rows.get(uav)) is not None]:
-                places, turns = feed.poses(tuple(self.uavs[i] for i in close))
-                self.at[close] = np.where(np.isfinite(places), places, self.at[close])
-                self.quat[close] = scene_quat(*turns.T)
-            return
-        places, turns = feed.poses(self.uavs)
-        heard = np.isfinite(places[:, 0])
-        held = [i for i, _ in self._ghosts]
-        heard[held] = False
-        self.at = np.where(heard[:, None], places, self.at)
         if not self.crowd:
-            for i, vehicle in self._ghosts:
-                if (spot := vehicle.where(now)) is not None:
-                    self.at[i] = spot
-        self.quat = scene_quat(*turns.T)
-        self._read = now, self.at.copy(), self._speed(since)
+            self._take_all(feed, now)
+            return
+        self._turn = (self._turn + 1) % TURNS
+        chosen = np.zeros(len(self.uavs), bool)
+        chosen[self._turn :: TURNS] = True
+        close = [row for uav in feed.close if (row := self._rows.get(uav)) is not None]
+        chosen[close] = True
+        self._take(feed, np.flatnonzero(chosen))
+        self._speed[close] = 0.0
+        self._speed[[i for i, _ in self._ghosts]] = 0.0
+        self.at = self._told + self._speed * np.clip(now - self._heard, 0.0, COAST_S)[:, None]
 
-    def _speed(self, since: float) -> np.ndarray:
-        """Give how fast everybody went since places were last read, (n, 3) [10 m/s]; a leap is no speed."""
-        before = self._read[1]
-        if len(before) != len(self.at) or not 0 < since < 2.0:
-            return np.zeros_like(self.at)
-        speed = (self.at - before) / since
-        return np.where(np.linalg.norm(speed, axis=1)[:, None] < FASTEST, speed, 0.0)
+    def _take_all(self, feed: Feed, now: float) -> None:
+        """Read where everybody is; whose place is predicted goes on by that."""
+        places, turns, _ = feed.poses(self.uavs)
+        heard = np.isfinite(places[:, 0])
+        heard[[i for i, _ in self._ghosts]] = False
+        self.at = np.where(heard[:, None], places, self.at)
+        for i, vehicle in self._ghosts:
+            if (spot := vehicle.where(now)) is not None:
+                self.at[i] = spot
+        self.quat = scene_quat(*turns.T)
+
+    def _take(self, feed: Feed, rows: np.ndarray) -> None:
+        """Read where some of a crowd are, rows (k,), and how fast they went since they were last read."""
+        places, turns, heard = feed.poses(tuple(self.uavs[i] for i in rows))
+        new = np.isfinite(places[:, 0]) & (heard > self._heard[rows])
+        self.quat[rows] = scene_quat(*turns.T)
+        rows, places, heard = rows[new], places[new], heard[new]
+        speed = (places - self._told[rows]) / (heard - self._heard[rows])[:, None]
+        sound = (np.linalg.norm(speed, axis=1) < FASTEST) & (heard - self._heard[rows] < STALE_S)
+        self._speed[rows] = np.where(sound[:, None], speed, 0.0)
+        self._told[rows], self._heard[rows] = places, heard
 
     def beat(self, played: dict[int, np.ndarray]) -> None:
         """Remember where everyone is, once a second.

@@ -1,22 +1,21 @@
-"""Samples not yet read: of a small fleet every one, in a crowd the newest of each, and all with news of the mission."""
+"""Letters not yet read: of a small fleet all are read, in a crowd the newest of each, and all with news of the mission.
 
-import threading
-from collections.abc import Iterable
+Reading a letter costs ten times what putting it aside does: of a thousand aircraft only what is drawn is read.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import msgspec
 
-from fleet.contract import Rows
+from fleet.access.roles import SAID
+from fleet.codec import Stamp
+from fleet.contract import Rows, Sample
 
 CROWD = 300  # above this many a sample that a newer one has replaced is not read
 MOST = 40  # letters kept of one UAV while nobody looks; the newest replaces the last
 MOST_UAVS = 4_000  # of whom letters are kept: ids are written by strangers
 _LEG = b"\xa3leg\x82"  # msgpack: the key, and a map after it, which nil is not
-
-
-class Whose(msgspec.Struct):
-    """Of a message only whose it is."""
-
-    uav: int
 
 
 class Leg(msgspec.Struct):
@@ -25,65 +24,132 @@ class Leg(msgspec.Struct):
     leg: Rows
 
 
-Letter = tuple[bytes, float]
-"""What came, and when, monotonic [s]."""
+class Head(msgspec.Struct, frozen=True):
+    """Of a sample what is drawn or told; the rest of it is passed over."""
+
+    uav: int
+    t: float
+    attitude: Rows | None = None
+    position: Rows | None = None
+    air: Rows | None = None
+    leg: Rows | None = None
+
+
+_HEAD, _LEG_ALONE = msgspec.msgpack.Decoder(Head), msgspec.msgpack.Decoder(Leg)
+_UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
+
+
+def read(payload: bytes) -> Head:
+    """Unpack what the viewer needs of a sample.
+
+    Raises:
+        ValueError: when the bytes are too many or do not fit; the sender must repair it.
+    """
+    if len(payload) > SAID[Sample.topic].most:
+        raise ValueError(f"sample: found {len(payload):,} bytes, expected {SAID[Sample.topic].most:,}; send less")
+    try:
+        return _HEAD.decode(payload)
+    except _UNREADABLE as error:
+        raise ValueError(f"sample: found {len(payload)} bytes that do not fit ({str(error)[:80]}); resend") from None
+
+
+class Letter:
+    """What came, when, monotonic [s], and under which claim: ten thousand a second, so it is quickly made."""
+
+    __slots__ = ("now", "payload", "stamp")
+
+    def __init__(self, payload: bytes, now: float, stamp: Stamp | None = None) -> None:
+        self.payload, self.now, self.stamp = payload, now, stamp
+
+
+class Held(NamedTuple):
+    """What waits of one UAV, and since when, monotonic [s]."""
+
+    since: float
+    letters: list[Letter]
 
 
 class Inbox:
-    """Filled by the bus's thread, emptied by whoever reads."""
+    """Samples that wait; who fills it and who empties it hold the same lock."""
 
     def __init__(self) -> None:
         self.crowd = False
         self.keen: frozenset[int] = frozenset()  # of whom every letter is kept, also in a crowd
         self.lost = 0  # letters that name nobody, or came when there was no room
-        self._letters: dict[int, list[Letter]] = {}
+        self._held: dict[int, Held] = {}  # who has waited longest first
         self._kept: set[int] = set()  # whose last letter has news of the mission
         self._item: dict[int, bytes] = {}  # the mission item each named last
-        self._leg = msgspec.msgpack.Decoder(Leg)
-        self._whose = msgspec.msgpack.Decoder(Whose)
-        self._lock = threading.Lock()
 
-    def put(self, payload: bytes, now: float) -> None:
-        """Take in one sample as it came; one that cannot be read at all is counted."""
-        try:
-            uav = self._whose.decode(payload).uav
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-            self.lost += 1
-            return
-        news = self.crowd and _LEG in payload and self._is_news(uav, payload)
-        with self._lock:
-            held = self._letters.get(uav)
+    def put(self, samples: list[tuple[int | None, bytes]], now: float) -> None:
+        """Take in samples as they came, each with the UAV its key names."""
+        crowd, keen, kept = self.crowd, self.keen, self._kept
+        for uav, payload in samples:
+            if uav is None:
+                self.lost += 1
+                continue
+            news = crowd and _LEG in payload and self._is_news(uav, payload)
+            held = self._held.get(uav)
             if held is None:
-                if len(self._letters) < MOST_UAVS:
-                    self._letters[uav] = [(payload, now)]
-                else:
+                if len(self._held) >= MOST_UAVS:
                     self.lost += 1
-            elif len(held) < MOST and (not self.crowd or uav in self.keen or uav in self._kept):
-                held.append((payload, now))
+                    continue
+                self._held[uav] = Held(now, [Letter(payload, now)])
+            elif (not crowd or uav in keen or uav in kept) and len(held.letters) < MOST:
+                held.letters.append(Letter(payload, now))
             else:
-                held[-1] = payload, now
-            self._kept.discard(uav)
+                held.letters[-1] = Letter(payload, now)
+            kept.discard(uav)
             if news:
-                self._kept.add(uav)
+                kept.add(uav)
 
     def _is_news(self, uav: int, payload: bytes) -> bool:
         """Tell whether a sample names another mission item than the one before; one that cannot be read may."""
         try:
-            told = self._leg.decode(payload).leg.x
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            told = _LEG_ALONE.decode(payload).leg.x
+        except _UNREADABLE:
             return True
         before = self._item.get(uav)
         if len(self._item) < MOST_UAVS or before is not None:
             self._item[uav] = told.data
         return before != told.data
 
-    def take(self, uavs: Iterable[int] | None = None) -> list[Letter]:
+    def take(self, uavs: Iterable[int] | None = None) -> Iterator[tuple[int, Letter]]:
         """Empty it, or take out what is of some UAVs: letters of each in the order they came."""
-        if not self._letters:
-            return []
-        with self._lock:
-            if uavs is not None:
-                return [letter for uav in uavs for letter in self._letters.pop(uav, ())]
-            letters, self._letters = self._letters, {}
-            self._kept.clear()
-        return [letter for held in letters.values() for letter in held]
+        for uav in list(self._held) if uavs is None else uavs:
+            if (held := self._held.pop(uav, None)) is not None:
+                self._kept.discard(uav)
+                yield from ((uav, letter) for letter in held.letters)
+
+    def waiting(self, before: float) -> list[int]:
+        """Name those of whom something has waited since before a time, monotonic [s]."""
+        found = []
+        for uav, held in self._held.items():
+            if held.since > before:
+                break
+            found.append(uav)
+        return found
+
+
+class Newest:
+    """Letters of another class in a crowd: the newest of each, read when one has waited for so long."""
+
+    def __init__(self, wait_s: float) -> None:
+        self._wait_s = wait_s
+        self._held: dict[int, tuple[float, Letter]] = {}  # since when, monotonic [s]; who has waited longest first
+
+    def put(self, uav: int, letter: Letter) -> None:
+        """Take in one in place of the one before."""
+        held = self._held.get(uav)
+        if held is not None or len(self._held) < MOST_UAVS:
+            self._held[uav] = (held[0] if held is not None else letter.now), letter
+
+    def drop(self, uav: int) -> None:
+        """Forget what waits of a UAV: a newer one was read."""
+        self._held.pop(uav, None)
+
+    def due(self, now: float) -> list[tuple[int, Letter]]:
+        """Take out what has waited long enough, at `now`, monotonic [s]."""
+        found = []
+        while self._held and (uav := next(iter(self._held))) is not None and self._held[uav][0] + self._wait_s <= now:
+            found.append((uav, self._held.pop(uav)[1]))
+        return found

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from fleet.contract import Sample
 from fleet.frames import Origin, to_geodetic, to_ned
+from viewer.inbox import Head
 
 UNIT_M = 10.0  # metres per scene unit: keeps a fleet of kilometres well inside the renderer's near and far planes
 REACH_M = 100_000.0  # farther from the origin than this the tangent plane lies, and nothing is drawn
@@ -89,7 +89,7 @@ def scene_quat(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarra
     )
 
 
-def first_fix(sample: Sample) -> Origin | None:
+def first_fix(sample: Head) -> Origin | None:
     """Read the frame's origin off the first position of a sample; None before a fix."""
     if sample.position is None:
         return None

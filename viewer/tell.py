@@ -20,12 +20,12 @@ from fleet.contract import (
     Model,
     Outcome,
     Prediction,
-    Sample,
     Status,
     Verdict,
 )
 from fleet.contract import Event as Happened
 from viewer.events import LATEST, MAX_RAISED, Event, Kind
+from viewer.inbox import Head
 from viewer.routes import ITEM_NAMES
 
 MAX_WORDS = 200  # letters kept of a sentence from outside
@@ -133,7 +133,7 @@ def _plan(items: tuple[Item, ...]) -> list[tuple[int, int, int, str]]:
     return [(item.command, item.lat_e7, item.lon_e7, f"{item.alt_m:.1f}") for item in items[1:]]
 
 
-def _sample(known: Known, sample: Sample) -> Told:
+def _sample(known: Known, sample: Head) -> Told:
     if sample.leg is None:
         return known, []
     t, x = sample.leg.t.numpy(), sample.leg.x.numpy()
@@ -216,7 +216,7 @@ _TELLS: dict[type, Callable[[Known, Any], Told]] = {
     Alert: _alert,
     Mismatch: _mismatch,
     Mission: _mission,
-    Sample: _sample,
+    Head: _sample,
     Model: _model,
     Prediction: _prediction,
 }

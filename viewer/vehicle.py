@@ -19,13 +19,13 @@ from fleet.contract import (
     Model,
     Prediction,
     Rows,
-    Sample,
     State,
     Status,
 )
 from viewer.datatime import DataTime
 from viewer.events import Event, closed, merged
 from viewer.forecast import Forecast, Kept
+from viewer.inbox import Head
 from viewer.place import UNIT_M, Place
 from viewer.rows import last, stacked
 from viewer.tell import Known, hear
@@ -142,15 +142,15 @@ class Vehicle:
 
     def note(self, message: Any, now: float) -> None:
         """Take down what a message tells: data time and events."""
-        if isinstance(message, Sample | Status) and abs(message.t - self.t) < AWAY_S:  # also: it is a time at all
+        if isinstance(message, Head | Status) and abs(message.t - self.t) < AWAY_S:  # also: it is a time at all
             self.time = self.time.hear(message.t, now)
-        if isinstance(message, Sample) and self._no_news(message):
+        if isinstance(message, Head) and self._no_news(message):
             return
         self.known, fresh = hear(self.known, message)
         if fresh:
             self.events = merged(self.events, fresh)
 
-    def _no_news(self, sample: Sample) -> bool:
+    def _no_news(self, sample: Head) -> bool:
         """Tell whether a sample names the mission item in force, or none: most do."""
         leg = sample.leg
         return leg is None or (leg.x.shape == (1, 1) and leg.t.shape == (1,) and last(leg.x) == (self.known.seq,))
@@ -163,7 +163,7 @@ class Vehicle:
             return self.forecast.at(self.clock(now) - self.forecast.t)
         return self.at
 
-    def hear_sample(self, sample: Sample, place: Place, now: float) -> None:
+    def hear_sample(self, sample: Head, place: Place, now: float) -> None:
         """Take over the newest rows of a sample."""
         if not isfinite(sample.t):
             raise ValueError(

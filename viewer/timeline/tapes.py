@@ -11,7 +11,7 @@ from viewer.timeline.tape import GAP_S, KEPT_S, TOLD_S, Tape
 from viewer.vehicle import Vehicle
 
 APART_S = 3600.0  # recordings that begin farther apart are of different days, and are laid beside each other [s]
-FEW, CROWD = 50, 300  # UAVs up to which five rows a second are kept; and predictions 5 s apart, of more in proportion
+FEW, CROWD = 50, 300  # UAVs up to which five rows a second are kept; one a second, and predictions 5 s apart
 FEW_S, MANY_S = 0.15, 0.9  # least time between two looks [s]
 NO_TRAIL = np.zeros((0, 5))
 
@@ -23,7 +23,7 @@ class Tapes:
         self.of: dict[int, Tape] = {}
         self.place: Place | None = None
         self.apart_s = TOLD_S  # between two predictions kept of one UAV [s]
-        self._due = -np.inf
+        self._due, self._turn = -np.inf, False
 
     def take(self, feed: Feed, copies: Callable[[], list[Vehicle]], now: float) -> None:
         """Keep how everyone is now, as often as their number allows; `copies` gives them."""
@@ -35,9 +35,10 @@ class Tapes:
         fleet = copies()
         self._due = now + (FEW_S if len(fleet) <= FEW else MANY_S)
         self.apart_s = TOLD_S * max(len(fleet) / CROWD, 1.0)  # of a crowd fewer, in the same memory
-        for vehicle in fleet:
+        self._turn, crowd = not self._turn, len(fleet) > CROWD
+        for vehicle in fleet[self._turn :: 2] if crowd else fleet:
             tape = self.of.setdefault(vehicle.uav, Tape())
-            behind = not len(tape) or vehicle.t - tape.t[-1] > GAP_S
+            behind = not crowd and (not len(tape) or vehicle.t - tape.t[-1] > GAP_S)
             tape.take(vehicle, feed.trail(vehicle) if behind else NO_TRAIL, now, self.apart_s)
 
     def nbytes(self) -> int:

@@ -2,6 +2,7 @@
 
 import io
 import resource
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -34,11 +35,21 @@ class Fallen(Exception):
 def viewer(at: str, attack: Attack) -> str:
     """Bombard the viewer's feed."""
     with connect(at) as bus:
-        feed = Feed(bus)
+        feed, stop = Feed(bus), threading.Event()
+        listener = threading.Thread(target=_listen, args=(feed, stop), daemon=True)
+        listener.start()
         count = attack(at, BOMBARD)
         _last_word(at, lambda: (vehicle := feed.one(UAV)) is not None and vehicle.status == LAST)
         feed.catch_up()
+        stop.set()
+        listener.join(10)
         return f"{count} messages, {bus.bad} did not decode, {feed.counts['strange']} were refused"
+
+
+def _listen(feed: Feed, stop: threading.Event) -> None:
+    """Take in what comes as often as the viewer does."""
+    while not stop.wait(0.1):
+        feed.listen()
 
 
 def worker(at: str, attack: Attack) -> str:

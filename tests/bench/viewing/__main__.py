@@ -8,6 +8,8 @@ A router, the feeder, the viewer as an operator starts it, one browser with soft
 clients, all on this machine: the browser takes the most of it. `server_cpu` is of one core, all threads of the viewer.
 `clients` are bytes received. `pose_to_screen` is from the publishing of a sample to the first frame with its place.
 `plain`: a scene with a node for each aircraft, on the same feed, without a browser in the way.
+`callback_floor`: what a process takes that hears the same and does nothing in a Python callback for each message;
+`collect_floor`: the same where messages are put aside and taken out ten times a second, as the viewer does. Of one core.
 """
 
 import argparse
@@ -35,6 +37,7 @@ def main() -> int:
     parser.add_argument("--hz", type=float, default=10.0, help="samples of each per second")
     parser.add_argument("--seconds", type=float, default=30.0, help="watched with every client")
     parser.add_argument("--plain", type=float, default=15.0, help="seconds of the plain scene; 0: without it")
+    parser.add_argument("--floor", type=float, default=10.0, help="seconds of merely hearing the feed; 0: without it")
     parser.add_argument("--no-page", action="store_true", help="without a browser")
     parser.add_argument("--chromium", default="/usr/bin/chromium")
     parser.add_argument("--picture", type=Path, help="keep the last frame of the page here")
@@ -47,6 +50,8 @@ def main() -> int:
         found |= with_page(args, router, feeder) if not args.no_page else without_page(args, router, feeder)
         if args.plain:
             found["plain"] = plain(router, args.plain)
+        if args.floor:
+            found |= {f"{way}_floor": floor(router, way, args.floor) for way in ("callback", "collect")}
     finally:
         found["published_hz"] = float(tell(feeder) or "nan")
         feeder.wait(30)
@@ -142,6 +147,19 @@ def plain(router: str, seconds: float) -> dict[str, Any]:
     finally:
         server.kill()
         server.wait(30)
+
+
+def floor(router: str, way: str, seconds: float) -> float:
+    """Give how much of one core it takes to hear the feed and do nothing."""
+    hearer = start("tests.bench.viewing.floor", way, "--router", router)
+    try:
+        wait(2.0)
+        before = cpu_s(hearer.pid), time.time()
+        wait(seconds)
+        return share(hearer.pid, *before)
+    finally:
+        hearer.kill()
+        hearer.wait(30)
 
 
 def share(pid: int, cpu: float, since: float) -> float:

@@ -56,6 +56,7 @@ def main() -> int:
         print("ready", file=sys.__stdout__, flush=True)
         tick, due = 0, time.monotonic()
         while True:
+            feed.listen()
             with server.atomic():
                 for vehicle in feed.all():
                     if vehicle.uav not in nodes:
