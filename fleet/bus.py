@@ -4,7 +4,7 @@ import json
 import secrets
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Container, Iterable, Iterator
 from contextlib import AbstractContextManager
 from itertools import islice
 from typing import Any, TypeVar
@@ -16,7 +16,7 @@ from fleet.access.knock import answers
 from fleet.access.roles import ROOT
 from fleet.codec import Stamp, Wire, decode, encode, encoding, pack_stamp, unpack_stamp
 from fleet.contract import PER_UAV, Claim
-from fleet.talk import Answer, Collected, Heard, Overheard, Token, Wants, asked_for, key, newest, uav_in
+from fleet.talk import Answer, Collected, Heard, Letter, Overheard, Token, Wants, asked_for, key, newest, uav_in
 
 M = TypeVar("M")
 _WAITED_FOR = (Claim,)  # seldom and needed: the sender waits where the way is full, everything else is dropped there
@@ -36,7 +36,7 @@ class ZenohBus(AbstractContextManager):
         self._declared: list[Any] = []
         self._publishers: dict[tuple[type, int], Any] = {}
         self._lock = threading.Lock()
-        self._collected: list[tuple[zenoh.Handler[zenoh.Sample], Collected]] = []
+        self._collected: list[tuple[type, zenoh.Handler[zenoh.Sample], Collected]] = []
         self._handing = threading.Lock()
 
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
@@ -84,19 +84,18 @@ class ZenohBus(AbstractContextManager):
         """Put every message of a class aside until `hand_out`; where nobody takes them out the oldest go first."""
         subscriber = self._session.declare_subscriber(key(kind, "*"), zenoh.handlers.RingChannel(_PUT_ASIDE))
         self._declared.append(subscriber)
-        self._collected.append((subscriber.handler, heard))
+        self._collected.append((kind, subscriber.handler, heard))
 
-    def hand_out(self) -> None:
-        """Give out what was put aside, class by class, each in the order it came."""
+    def hand_out(self, newest: Container[type] = ()) -> None:
+        """Give out what was put aside, class by class, each in the order it came; of some the newest of each key."""
         if not self._handing.acquire(blocking=False):
             return  # somebody does it already
         try:
-            for handler, heard in self._collected:
-                waiting = islice(iter(handler.try_recv, None), _PUT_ASIDE)
-                if found := [
-                    (uav_in(str(one.key_expr)), one.payload.to_bytes(), str(one.encoding), _stamp(one))
-                    for one in waiting
-                ]:
+            for kind, handler, heard in self._collected:
+                waiting: Iterable[zenoh.Sample] = islice(iter(handler.try_recv, None), _PUT_ASIDE)
+                if kind in newest:
+                    waiting = {one.key_expr: one for one in waiting}.values()
+                if found := [_letter(one) for one in waiting]:
                     heard(found)
         finally:
             self._handing.release()
@@ -210,6 +209,10 @@ def _care(kind: type) -> dict[str, Any]:
 
 def _stamp(sample: zenoh.Sample) -> Stamp | None:
     return unpack_stamp(sample.attachment.to_bytes() if sample.attachment is not None else None)
+
+
+def _letter(one: zenoh.Sample) -> Letter:
+    return uav_in(str(one.key_expr)), one.payload.to_bytes(), str(one.encoding), _stamp(one)
 
 
 def _parameters(query: zenoh.Query) -> dict[str, str]:

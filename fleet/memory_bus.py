@@ -1,7 +1,7 @@
 """The bus within one process, for tests and for what needs no router."""
 
 import secrets
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import AbstractContextManager, suppress
 from functools import partial
 from typing import Any, TypeVar
@@ -62,7 +62,7 @@ class MemoryBus(AbstractContextManager):
         """Call `heard` with every message of a class, at once."""
         self.overhear(kind, lambda payload, *rest: heard([(_whose(payload), payload, *rest)]))
 
-    def hand_out(self) -> None:
+    def hand_out(self, newest: Container[type] = ()) -> None:
         """Do nothing: nothing waits here."""
 
     def answer(self, kind: type, reply: Answer) -> None:

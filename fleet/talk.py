@@ -1,6 +1,6 @@
 """What a bus is: its keys, what can be done on it, and which of two answers is believed."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import AbstractContextManager
 from functools import lru_cache
 from typing import Any, Protocol, TypeVar
@@ -69,8 +69,12 @@ class Bus(AbstractContextManager, Protocol):
             heard: called with all of them in the order they came, whatever is in them
         """
 
-    def hand_out(self) -> None:
-        """Give out what was put aside, on this thread; call it often, for only so much is kept: the newest."""
+    def hand_out(self, newest: Container[type] = ()) -> None:
+        """Give out what was put aside, on this thread; call it often, for only so much is kept: the newest.
+
+        Args:
+            newest: classes of which the newest message of each sender is enough: those it replaces are not unpacked
+        """
 
     def answer(self, kind: type, reply: Answer) -> None:
         """Declare one wildcard queryable for a class: `reply(uav or None, parameters, payload)`."""

@@ -111,13 +111,13 @@ def test_in_a_crowd_the_newest_sample_and_news_of_the_mission_are_read() -> None
     plain, box = encode(Sample(uav=3, t=T)), Inbox()
     box.crowd = True
     for payload in (plain, leg(1.0), plain, plain, leg(1.0), plain, leg(2.0), plain):
-        box.put([(3, payload)], 0.0)
+        box.put([(3, payload, "", None)], 0.0)
     assert [letter.payload for _, letter in box.take()] == [leg(1.0), leg(2.0), plain]
     box.keen = frozenset({3})
     for _ in range(4):
-        box.put([(3, plain)], 0.0)
+        box.put([(3, plain, "", None)], 0.0)
     assert len(list(box.take((3,)))) == 4 and list(box.take()) == []
-    box.put([(None, b"\xc1")], 0.0)
+    box.put([(None, b"\xc1", "", None)], 0.0)
     assert box.lost == 1
 
 
@@ -125,9 +125,9 @@ def test_who_has_waited_longest_is_named_first() -> None:
     box = Inbox()
     box.crowd = True
     for now, uav in ((0.0, 1), (0.5, 2), (0.6, 1), (1.0, 3)):
-        box.put([(uav, encode(Sample(uav=uav, t=T)))], now)
+        box.put([(uav, encode(Sample(uav=uav, t=T)), "", None)], now)
     assert box.waiting(0.5) == [1, 2] and [letter.now for _, letter in box.take((1,))] == [0.6]
-    box.put([(1, b"")], 2.0)
+    box.put([(1, b"", "", None)], 2.0)
     assert box.waiting(2.0) == [2, 3, 1]
 
 

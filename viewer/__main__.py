@@ -1,6 +1,7 @@
 """The `viewer` command: serve the operator's page."""
 
 import argparse
+import gc
 import sys
 
 from fleet.access.roles import VIEWER
@@ -13,6 +14,7 @@ from viewer.door import quiet, serve
 from viewer.terrain.land import Land
 from viewer.terrain.raster import read
 
+RARELY = 50_000, 10, 10  # of a crowd some ten thousand objects come and go every second, and next to none in circles
 EXAMPLES = """
   viewer
   viewer --port 8081 --light
@@ -56,6 +58,7 @@ def run(args: argparse.Namespace) -> int:
     if not 0 < args.port < 65536:
         raise ValueError(f"--port: found {args.port}, expected 1 to 65535; name another")
     stop = stop_on_signal()
+    gc.set_threshold(*RARELY)
     terrain = read(args.terrain, colours=False) if args.terrain else None
     land = Land(terrain, read(args.imagery, colours=True) if args.imagery else None)
     with connect(entry(args, VIEWER), patient=True) as bus:  # no router yet is said on the page

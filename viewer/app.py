@@ -72,14 +72,15 @@ class App:
 
     def tick(self, tick: int) -> None:
         """Draw what is due at this tick."""
-        self.feed.listen()
+        if not (self.flock.crowd and tick % 2):
+            self.feed.listen()
         self._welcome()
         if tick % SECOND and not self.views:
             return  # nobody looks: once a second keeps the trails
         now = time.monotonic()
         if tick % SECOND == 0 or not self.flock.uavs:
             self._second(now)
-        elif tick % 2 == 0 and self.flock.uavs:
+        elif tick % 2 == 0 and self.flock.uavs and not self.flock.crowd:
             self.tapes.take(self.feed, self.feed.all, now)
         if self.flock.crowd and tick % 2:
             return

@@ -99,7 +99,7 @@ class Feed:
 
     def listen(self) -> None:
         """Take in what came since the last call; call it some ten times a second."""
-        self._bus.hand_out()
+        self._bus.hand_out((Sample,) if self.inbox.crowd else ())
         with self.lock:
             for kind, newest in self._newest.items():
                 for uav, letter in newest.due(self._clock()):
@@ -111,13 +111,12 @@ class Feed:
 
         def came(letters: list[Said]) -> None:
             now = self._clock()
-            sound = [(uav, payload, stamp) for uav, payload, named, stamp in letters if named == named_so]
+            sound = [letter for letter in letters if letter[2] == named_so]
             with self.lock:
                 self._counts["strange"] += len(letters) - len(sound)
                 if kind is Sample:
-                    self.inbox.put([(uav, payload) for uav, payload, _ in sound], now)
-                    return
-                for uav, payload, stamp in sound:
+                    return self.inbox.put(sound, now)
+                for uav, payload, _, stamp in sound:
                     letter = Letter(payload, now, stamp)
                     if newest is None or uav is None or not self._may_wait(kind, uav):
                         if newest is not None and uav is not None:

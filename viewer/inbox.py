@@ -11,6 +11,7 @@ import msgspec
 from fleet.access.roles import SAID
 from fleet.codec import Stamp
 from fleet.contract import Rows, Sample
+from fleet.talk import Letter as Said
 
 CROWD = 300  # above this many a sample that a newer one has replaced is not read
 MOST = 40  # letters kept of one UAV while nobody looks; the newest replaces the last
@@ -80,10 +81,10 @@ class Inbox:
         self._kept: set[int] = set()  # whose last letter has news of the mission
         self._item: dict[int, bytes] = {}  # the mission item each named last
 
-    def put(self, samples: list[tuple[int | None, bytes]], now: float) -> None:
-        """Take in samples as they came, each with the UAV its key names."""
+    def put(self, samples: list[Said], now: float) -> None:
+        """Take in samples as they came."""
         crowd, keen, kept = self.crowd, self.keen, self._kept
-        for uav, payload in samples:
+        for uav, payload, _, _ in samples:
             if uav is None:
                 self.lost += 1
                 continue

@@ -9,7 +9,7 @@ clients, all on this machine: the browser takes the most of it. `server_cpu` is 
 `clients` are bytes received. `pose_to_screen` is from the publishing of a sample to the first frame with its place.
 `plain`: a scene with a node for each aircraft, on the same feed, without a browser in the way.
 `callback_floor`: what a process takes that hears the same and does nothing in a Python callback for each message;
-`collect_floor`: the same where messages are put aside and taken out ten times a second, as the viewer does. Of one core.
+`collect_floor`: the same where messages are put aside and taken out ten times a second, as the viewer does.
 """
 
 import argparse
