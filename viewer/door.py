@@ -5,13 +5,15 @@ import gzip
 import http
 import io
 import warnings
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import viser
 import websockets.asyncio.server as sockets
-from viser import _messages
+from viser import Icon, _icons, _messages
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
@@ -19,6 +21,17 @@ HOME = ("localhost", "127.0.0.1", "::1")  # names of this machine, for itself
 POLICY = (  # nothing is fetched from anywhere else, and nobody may frame the page
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' ws: wss: data: blob:; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+ICONS = (  # of the page's tabs, buttons and commands
+    Icon.ADJUSTMENTS,
+    Icon.ALERT_TRIANGLE,
+    Icon.CAMERA,
+    Icon.CLOCK_PLAY,
+    Icon.DOWNLOAD,
+    Icon.DRONE,
+    Icon.FOCUS_2,
+    Icon.MOVIE,
+    Icon.TABLE,
 )
 Answering = Callable[[Any, Request], Response | None]
 
@@ -35,6 +48,7 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
     """
     # A page may close while it is drawn: what was on its way to it then goes nowhere, which is no news.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
+    _read_icons()
     with quiet(), _guarded({*HOME, host.strip("[]").lower(), *filter(None, [name.lower()])}, anyone=_is_any(host)):
         server = viser.ViserServer(host=host, port=port, verbose=False)
     for share in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
@@ -44,6 +58,18 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
             server.stop()
         raise OSError(f"--port: found {port} taken by another program, expected a free one; stop it or name another")
     return server
+
+
+def _read_icons() -> None:
+    """Read our icons out of the library's archive of thousands at once: it opens it anew for each, 25 ms a time."""
+    with zipfile.ZipFile(_icons.ICONS_DIR / "tabler-icons.zip") as archive:
+        once = SimpleNamespace(ZipFile=lambda _: contextlib.nullcontext(archive))
+        original, _icons.zipfile = _icons.zipfile, once  # type: ignore[assignment]
+        try:
+            for icon in ICONS:
+                _icons.svg_from_icon(icon)
+        finally:
+            _icons.zipfile = original  # type: ignore[assignment]
 
 
 def quiet() -> contextlib.redirect_stdout:

@@ -4,7 +4,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from fleet.contract import Prediction
 from viewer.place import REACH_M, UNIT_M, Place
@@ -114,4 +113,14 @@ def smooth(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> tuple[np.nd
         return ahead, path, tube
     parts = np.minimum(np.ceil(np.diff(ahead) / _CHORD_S), _MOST_PARTS).astype(int)
     at = np.interp(np.arange(parts.sum() + 1), np.concatenate([[0], np.cumsum(parts)]), ahead)
-    return at, CubicSpline(ahead, path)(at), np.stack([np.interp(at, ahead, column) for column in tube.T], axis=-1)
+    return at, _cubic(ahead, path, at), np.stack([np.interp(at, ahead, column) for column in tube.T], axis=-1)
+
+
+def _cubic(ahead: np.ndarray, path: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Interpolate points (n, 3) at look-aheads (k,) by cubics whose slopes are those of neighbours: (k, 3)."""
+    slope = np.gradient(path, ahead, axis=0, edge_order=2)
+    i = np.clip(np.searchsorted(ahead, at, side="right") - 1, 0, len(ahead) - 2)
+    h = (ahead[i + 1] - ahead[i])[:, None]
+    s = (at - ahead[i])[:, None] / h
+    ends = (1 + 2 * s) * (1 - s) ** 2 * path[i] + s**2 * (3 - 2 * s) * path[i + 1]
+    return ends + h * s * (1 - s) * ((1 - s) * slope[i] - s * slope[i + 1])

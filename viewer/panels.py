@@ -127,14 +127,20 @@ class Panels:
         self._since.content = since(fleet, self._presence.away, self._palette, self._handler())
         self._read.visible = bool(self._since.content)
         self._alerts.content = alerts(fleet, feed, self._palette, self._handler())
-        nobody = '<div class="uav soft">Nobody is selected: click a row or an aircraft, or press Ctrl+K.</div>'
-        self._about.content = about(chosen, self._palette, now) if chosen is not None else nobody
+        self.show(chosen, now)
         self._facts.content = facts(chosen, now) if chosen is not None else ""
         told = listing(chosen.events, self._palette, self.seek) if chosen is not None else ""
         if told != self._events.content:  # written anew, a list somebody scrolls would jump to its top
             self._events.content = told
         self._charts.draw(chosen, feed, now)
         self._commands.offer(fleet)
+
+    def show(self, chosen: Vehicle | None, now: float) -> None:
+        """Say who is selected and how it stands."""
+        nobody = '<div class="uav soft">Nobody is selected: click a row or an aircraft, or press Ctrl+K.</div>'
+        said = about(chosen, self._palette, now) if chosen is not None else nobody
+        if said != self._about.content:
+            self._about.content = said
 
     def _passes(self, vehicle: Vehicle, now: float, selected: int | None) -> bool:
         if self._filter == "Alerts" and not vehicle.alerts:

@@ -116,6 +116,8 @@ class View:
         if self._feed.one(uav) is not None:
             self.selected, self.dirty = uav, True
             self.browser.remembered.uav = None
+            self.panels.show(self.chosen(), time.monotonic())  # ahead of all that is drawn with it
+            self.client.flush()
             self._wake()
 
     def visit(self, uav: int, t: float | None = None) -> None:

@@ -1,10 +1,8 @@
 """Heights and pictures of the ground in the scene of a page: one mesh and its contours."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import contourpy
 import numpy as np
-import trimesh
 from PIL import Image
 
 from fleet.frames import to_geodetic
@@ -12,6 +10,9 @@ from viewer.palette import Palette, mix, rgb
 from viewer.place import UNIT_M, Place
 from viewer.strokes import Strokes, chain
 from viewer.terrain.raster import Raster
+
+if TYPE_CHECKING:
+    import trimesh
 
 REACH_M = 15_000.0  # how far from the origin of the scene ground is shown [m]
 CELLS, TEXELS = 160, 1_536  # of the mesh and of its picture, along one side
@@ -137,6 +138,8 @@ def shade(form: Shape) -> np.ndarray:
 
 def contours(form: Shape) -> np.ndarray:
     """Give the contours at whole metres above mean sea level of the scene, (n, 2, 3) [10 m]."""
+    import contourpy  # here: as in `mesh`
+
     low, high = float(np.nanmin(form.up)) * UNIT_M, float(np.nanmax(form.up)) * UNIT_M
     step = next((s for s in STEPS_M if (high - low) / s <= MOST_CONTOURS), STEPS_M[-1])
     maker = contourpy.contour_generator(form.east, form.north, np.ma.masked_invalid(form.up))
@@ -149,8 +152,10 @@ def contours(form: Shape) -> np.ndarray:
     return np.concatenate(found)
 
 
-def mesh(form: Shape, picture: Image.Image) -> trimesh.Trimesh:
+def mesh(form: Shape, picture: Image.Image) -> "trimesh.Trimesh":
     """Make the mesh with its picture; there are holes where the heights are not known."""
+    import trimesh  # here: most pages show no ground, and a restarted viewer is waited for
+
     east, north = np.meshgrid(form.east, form.north)
     known = np.isfinite(form.up).ravel()
     vertices = np.column_stack([east.ravel(), north.ravel(), np.where(known, form.up.ravel(), 0.0)])

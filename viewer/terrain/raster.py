@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
-from scipy.ndimage import map_coordinates
 
 from viewer.terrain.utm import to_utm
 
@@ -27,6 +26,8 @@ class Raster(NamedTuple):
 
     def at(self, lat_deg: np.ndarray, lon_deg: np.ndarray) -> np.ndarray:
         """Interpolate at places of any shape: values, not a number outside; colours have a last axis of 3."""
+        from scipy.ndimage import map_coordinates  # here: a viewer without ground starts without it
+
         lat, lon = np.asarray(lat_deg, float).ravel(), np.asarray(lon_deg, float).ravel()
         x, y = (lon, lat) if self.zone is None else to_utm(lat, lon, self.zone[0], north=self.zone[1])
         column, row = np.linalg.inv(self.affine[:, :2]) @ (np.stack([x, y]) - self.affine[:, 2:])
