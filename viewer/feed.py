@@ -37,6 +37,7 @@ MAX_VEHICLES = 2_000  # ids are written by strangers: more than this many are co
 COASTING_S = 1.0  # a prediction so long after the last sample is of no flight that anything can be laid beside [s]
 SOON_S = 1.2  # in a crowd a sample is read at the latest when it has waited for so long [s]
 WAIT_S = {Prediction: 3.0, Status: 2.0}  # in a crowd the newest of these is read so often, of who is well [s]
+PAST_S = 65.0  # how long what is kept of a forecast is laid beside what happened [s]
 MAX_AWAY = 10_000  # UAVs without room that are counted
 MAX_LINKS = 64  # links whose sentences are kept
 MAX_WRITERS = 16  # workers whose sentences are kept: a restarted one is another
@@ -337,7 +338,9 @@ class Feed:
         coasting = message.coast_s > COASTING_S
         vehicle.sure = vehicle.sure if coasting else found
         if not coasting and (not vehicle.past or found.t - vehicle.past[-1].t >= 0.9):
-            vehicle.past.append(found.kept())
+            vehicle.past.append(found.kept(vehicle.past[-1] if vehicle.past else None))
+            while vehicle.past[0].t < found.t - PAST_S:
+                vehicle.past.popleft()
 
     def _mismatch(self, found: Mismatch, stamp: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(found.uav)

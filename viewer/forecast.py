@@ -58,12 +58,13 @@ class Forecast:
         """Interpolate the half-axes at look-aheads (k,) [s] -> (k, 3) [10 m]."""
         return np.stack([np.interp(ahead, self.ahead, self.tube[:, i]) for i in range(3)], axis=-1)
 
-    def kept(self) -> "Kept":
-        """Give what is kept of it when newer ones have come."""
-        path = self.message.path.numpy()
-        n = int(np.searchsorted(self.message.ahead.numpy(), KEPT_S, side="right"))
-        ahead = self.message.ahead.numpy()[:n].copy()
-        return Kept(self.t, self.until, ahead, path[:n].copy(), self.message.origin, self.place)
+    def kept(self, before: "Kept | None" = None) -> "Kept":
+        """Give what is kept of it when newer ones have come; `before` is what was kept before it."""
+        path, ahead = self.message.path.numpy(), self.message.ahead.numpy()
+        ahead = ahead[: int(np.searchsorted(ahead, KEPT_S, side="right"))]
+        same = before is not None and np.array_equal(before.ahead, ahead)
+        kept = before.ahead if before is not None and same else ahead.copy()
+        return Kept(self.t, self.until, kept, path[: len(ahead)].copy(), self.message.origin, self.place)
 
 
 class Kept(NamedTuple):

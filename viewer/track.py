@@ -17,7 +17,7 @@ class Track:
     """Times and places, thinned to every other one whenever there is no room left."""
 
     def __init__(self) -> None:
-        self._rows = np.empty((POINTS, 4))  # t [s], scene ENU [10 m]
+        self._rows = np.full((POINTS, 4), np.nan)  # t [s], scene ENU [10 m]; all its memory is taken at once
         self._n, self._step, self._last = 0, STEP_S, -np.inf
 
     def add(self, spots: list[tuple[float, float, float, float]]) -> bool:
@@ -53,7 +53,7 @@ class Trail:
     """The newest stretch of the flown path, as it was heard: t [s], scene ENU [10 m], Va [m/s]."""
 
     def __init__(self) -> None:
-        self._rows = np.empty((TRAIL_ROWS, 5))
+        self._rows = np.full((TRAIL_ROWS, 5), np.nan)  # all its memory is taken at once
         self._n = 0  # ever written; the newest `TRAIL_ROWS` are held
 
     def add(self, *row: float) -> None:

@@ -70,9 +70,9 @@ class Vehicle:
     refused: tuple[float, str] = (-np.inf, "")  # when a message was refused, monotonic [s], and why
     trail: Trail = field(default_factory=Trail)  # the newest stretch of it, as it was heard
     track: Track = field(default_factory=Track)  # the whole flight, thinned
-    past: deque[Kept] = field(default_factory=lambda: deque(maxlen=65))  # forecasts, about one a second
+    past: deque[Kept] = field(default_factory=lambda: deque(maxlen=65))  # forecasts of the last minute
     sure: Forecast | None = None  # the newest that did not coast
-    fits: deque = field(default_factory=lambda: deque(maxlen=200))  # t, mean fit [%]
+    fits: deque = field(default_factory=lambda: deque(maxlen=64))  # t, mean fit [%]
 
     @property
     def name(self) -> str:

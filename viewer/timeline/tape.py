@@ -12,7 +12,7 @@ from viewer.vehicle import JUMP_S, Vehicle
 
 KEPT_S = 600.0  # of a live flight; of a recording all [s]
 TOLD_S = 5.0  # between two predictions kept [s]
-THIN_S = 1.0  # least look-ahead between two points kept [s]
+THIN_S, NEAR_S, FAR_S = 1.0, 20.0, 2.5  # look-ahead between points kept, so far ahead, and beyond: drawn as cubics [s]
 AFTER_S = 20.0  # of a prediction, how far past its horizon it is kept [s]
 GAP_S, SPARE_S, MOST_FILLED = 1.6, 0.4, 100  # a longer gap is filled in, to so near its ends, by so many rows [s]
 MAX_ROWS = 8_000  # of one UAV: a longer recording keeps every second of them
@@ -164,7 +164,10 @@ def _slim(told: Forecast, before: Forecast | None) -> Forecast:
     n = max(int(np.searchsorted(ahead, told.until + AFTER_S)) + 1, 2)
     last = before.message if before is not None else None
     same = {name: getattr(last, name) for name in WORDS if getattr(last, name, None) == getattr(message, name)}
-    keep = np.unique(np.searchsorted(ahead[:n], np.append(np.arange(ahead[0], ahead[:n][-1], THIN_S), ahead[:n][-1])))
+    first, last_s = float(ahead[0]), float(ahead[:n][-1])
+    near = min(first + NEAR_S, last_s)
+    wanted = np.concatenate([np.arange(first, near, THIN_S), np.arange(near, last_s, FAR_S), [last_s]])
+    keep = np.unique(np.searchsorted(ahead[:n], wanted))
     cut = {name: Array.of(getattr(message, name).numpy()[keep]) for name in ("ahead", "path", "tube")}
     if last is not None and last.ahead == cut["ahead"]:
         cut["ahead"] = last.ahead
