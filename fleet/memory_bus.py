@@ -95,6 +95,10 @@ class MemoryBus(AbstractContextManager):
                 for message, _ in reply(uav, {}, payload):
                     yield decode(kind, encode(message), encoding(kind))
 
+    def collect(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
+        """Ask and give the bytes of every answer as it comes."""
+        return map(encode, self.gather(kind, who, b"", timeout_s))
+
     def present(self, name: str) -> None:
         """Say that this process lives."""
         self._present.append(name)

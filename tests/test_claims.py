@@ -79,7 +79,7 @@ def test_epochs_rise_above_all_seen_and_with_the_clock() -> None:
     one.heard("a", {7: WALL + 5000})
     assert one.take(7, WALL) == WALL + 5001, "a clock that is late"
     assert one.take(8, WALL) == WALL
-    assert one.give([7, 9]) == {7: WALL + 5001} and 7 not in one.held
+    assert one.heard("a", {7: WALL + 5001}) == [] and one.held[7] == WALL + 5001, "b comes after a"
     assert one.take(7, WALL) == WALL + 5002, "its own last epoch counts, too"
 
 
@@ -100,6 +100,16 @@ def test_a_claim_met_in_results_first_wins_all_the_same_once_it_is_announced() -
     one.note(1, Rank(WALL + 5, "a"))
     assert one.held == {1: WALL}
     assert one.heard("a", {1: WALL + 5}) == [1] and not one.held
+
+
+def test_who_took_what_is_held_here_and_died_before_it_said_so_is_outdone() -> None:
+    one = claims(peers=("a",))
+    one.take(1, WALL)
+    one.note(1, Rank(WALL + 5, "a"))
+    assert one.plan(0.0) == Plan(), "it lives, and will say so"
+    one.vanished("a", 1)
+    assert one.plan(0.0) == Plan(take=[1]) and one.take(1, WALL) == WALL + 6
+    assert one.plan(0.0) == Plan()
 
 
 def test_a_stale_claim_of_who_handed_over_takes_nothing_back() -> None:

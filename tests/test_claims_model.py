@@ -19,7 +19,7 @@ from twin_worker.claims.owner import owners
 
 UAVS = range(5)
 RANGES = (range(5), range(3), range(2, 5))
-LEASE_S, TURN_S, ANNOUNCE_S = 1.0, 0.1, 0.5
+LEASE_S, TURN_S, ANNOUNCE_S, HAND_S = 1.0, 0.1, 0.5, 3.0
 
 
 @dataclass
@@ -237,7 +237,7 @@ class Fleet(RuleBasedStateMachine):
                 if uav in node.asked:  # in vain
                     self._take(node, uav)
                     continue
-                node.asked[uav] = self.now + 1.5
+                node.asked[uav] = self.now + HAND_S
                 holder = self.nodes.get(worker)
                 if holder is not None:
                     self._send(holder, lambda h=holder, u=uav: self._hand_over(h, node, u))
@@ -275,7 +275,7 @@ class Fleet(RuleBasedStateMachine):
         self.ranks[uav].add(rank)
 
     def _hand_over(self, holder: Node, asker: Node, uav: int) -> None:
-        epoch = holder.claims.give([uav]).get(uav)
+        epoch = holder.claims.held.get(uav)
         if epoch is not None:
             self._send(asker, lambda: self._receive(asker, holder, uav, epoch))
 

@@ -12,17 +12,19 @@ from typing import ClassVar
 
 import flights as f
 import msgspec
+import numpy as np
 import pytest
 from conftest import ROOT
 
 from fleet.bus import connect
-from fleet.codec import Stamp
+from fleet.codec import Stamp, encode
 from fleet.contract import Claim, Handover, History, Message, Mission, Model, Prediction, Sample, Status, Wanted
 from fleet.memory_bus import MemoryBus
 from fleet.talk import Bus
 from gateway.publish import Publisher
 from tests.bench.asking.answerer import prediction
 from twin_worker.claims.protocol import Claiming
+from twin_worker.claims.tape import read
 from twin_worker.claims.tree import pack
 from twin_worker.worker import Worker
 
@@ -59,7 +61,9 @@ def handed(bus: MemoryBus, *uavs: int) -> list[Handover]:
     return list(bus.gather(Handover, "x", msgspec.msgpack.encode(Wanted(uavs=uavs)), 1.0))
 
 
-def test_what_is_asked_for_is_handed_over_and_written_for_no_longer(bus: MemoryBus, worker: Worker) -> None:
+def test_a_copy_goes_on_elsewhere_and_is_written_for_here_until_a_higher_claim_is_heard(
+    bus: MemoryBus, worker: Worker
+) -> None:
     for uav in (1, 2, 3):
         for message in f.messages(f.turn(4.0), uav=uav):
             bus.publish(message)
@@ -68,15 +72,17 @@ def test_what_is_asked_for_is_handed_over_and_written_for_no_longer(bus: MemoryB
     epoch = {held.twin.uav: held.epoch for held in worker.holding()}[2]
     (twin,) = handed(bus, 2, 9)
     assert (twin.uav, twin.epoch) == (2, epoch) and len(twin.load) > 10_000
-    assert [held.twin.uav for held in worker.holding()] == [1, 3]
-    assert handed(bus, 2) == [] and list(bus.gather(Handover, "x", b"", 1.0)) == []
+    assert len(worker.holding()) == 3 and handed(bus, 2) and list(bus.gather(Handover, "x", b"", 1.0)) == []
 
     taker = Worker(MemoryBus(), range(1, 5), omega=0.0)
     taker._twins.adopt(2, epoch + 1, twin)
     (held,) = taker.holding()
     assert held.epoch == epoch + 1 and len(held.inbox) == 1 and not taker._twins.bare
+    assert taker._twins.quiet == {2}, "it is not claimed aloud before it is written for"
     assert held.twin.history.newest == pytest.approx(f.T0 + 4.0, abs=0.2)
     assert taker.turn() == 1 and held.twin.history.newest == pytest.approx(f.T0 + 5.0, abs=0.2)
+    bus.publish(Claim(t=0.0, worker=OTHER, held=((2, epoch + 1),)))
+    assert [held.twin.uav for held in worker.holding()] == [1, 3]
 
 
 @pytest.mark.parametrize("odd", [{"code": "another"}, {"load": b""}, {"load": b"\xc1"}, {"load": pack([1], {})}])
@@ -92,10 +98,31 @@ def test_a_twin_that_cannot_be_read_is_taken_over_cold(bus: MemoryBus, worker: W
     assert held.epoch == 5 and held.twin.uav == 2 and held.twin.history.newest == -float("inf")
 
 
-def test_who_is_asked_for_what_it_has_not_got_itself_yet_holds_it_no_longer(bus: MemoryBus, worker: Worker) -> None:
+def test_what_is_not_here_yet_or_just_being_worked_on_is_not_copied(bus: MemoryBus, worker: Worker) -> None:
+    for message in f.messages(f.turn(2.0), uav=2):
+        bus.publish(message)
     worker._twins.expect([4])
     worker.claiming.claims.take(4, 5)
-    assert handed(bus, 4) == [] and 4 not in worker._held and 4 not in worker.claiming.claims.held
+    assert handed(bus, 4) == []
+    (held,) = worker.holding()
+    with held.lock:
+        assert handed(bus, 2) == []
+    assert len(handed(bus, 2)) == 1
+
+
+def test_a_first_prediction_is_what_ends_the_quiet(bus: MemoryBus, worker: Worker) -> None:
+    """Who took a copy is heard of once it writes; until then the other is believed to hold it."""
+    taker = Worker(bus, range(1, 5), omega=0.0)
+    assert taker._twins.overhear(prediction(2), Stamp(5, 7))
+    taker._twins.expect([2])
+    taker.claiming.claims.take(2, 9)
+    assert taker.claiming.claim().held == ()
+    (held,) = taker._twins.held.values()
+    taker._twins._begin(held, taker._make(2), [])
+    taker.claiming.claims.unsure = False
+    assert taker.claiming.claim().held == ()
+    taker._publish(prediction(2), held)
+    assert taker.claiming.claim().held == ((2, 9),)
 
 
 def test_a_higher_claim_is_yielded_to_at_once(bus: MemoryBus, worker: Worker) -> None:
@@ -132,10 +159,11 @@ def test_a_cold_takeover_has_telemetry_mission_and_model(bus: MemoryBus, heard: 
 
 
 def test_many_messages_are_one_and_what_does_not_fit_is_left_out(heard: tuple[Message, ...]) -> None:
-    from twin_worker.claims.past import joined
-
     samples = tuple(m for m in heard if isinstance(m, Sample))[:200]
-    whole = joined(History(uav=1, t=samples[-1].t, samples=samples))
+    statuses = tuple(m for m in heard if isinstance(m, Status))
+    told = encode(History(uav=1, t=samples[-1].t, samples=samples, statuses=statuses))
+    whole = read(told)
+    assert whole is not None and (whole.uav, whole.t) == (1, samples[-1].t)
     one, many = f.remembered([whole]), f.remembered(samples)
     for name in f.HZ:
         assert all((a == b).all() for a, b in zip(one.rows(name), many.rows(name), strict=True)), name
@@ -143,7 +171,30 @@ def test_many_messages_are_one_and_what_does_not_fit_is_left_out(heard: tuple[Me
     odd = [msgspec.structs.replace(rows, x=msgspec.structs.replace(rows.x, **bad))
            for bad in ({"shape": (1, 2)}, {"data": b""}, {"dtype": "|O8"}, {"dtype": "no"})]  # fmt: skip
     broken = [Sample(uav=1, t=0.0, attitude=each) for each in odd]
-    assert joined(History(uav=1, t=whole.t, samples=(*broken, *samples))) == whole
+    assert read(encode(History(uav=1, t=whole.t, samples=(*broken, *samples)))) == whole
+    assert read(encode(History(uav=1, t=whole.t, samples=tuple(broken)))) is None
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x80", b"\xc1", b"\xdf\xff\xff\xff\xff", b"\x81\xa7samples\xdd\xff\xff\xff\xff"]
+)
+def test_what_is_no_past_is_none(data: bytes) -> None:
+    assert read(data) is None
+
+
+def test_a_damaged_past_is_none_or_what_is_left_of_it(heard: tuple[Message, ...]) -> None:
+    samples = tuple(m for m in heard if isinstance(m, Sample))[:20]
+    told = encode(History(uav=1, t=samples[-1].t, samples=samples))
+    whole, rng = read(told), np.random.default_rng(4)
+    assert whole is not None and whole.attitude is not None
+    for _ in range(300):
+        hurt = bytearray(told[: int(rng.integers(1, len(told) + 1))])
+        for at in rng.integers(len(hurt), size=3):
+            hurt[at] = rng.integers(256)
+        found = read(bytes(hurt))
+        for name in f.HZ:
+            rows, most = (getattr(found, name), getattr(whole, name)) if found is not None else (None, None)
+            assert rows is None or most is None or rows.t.shape[0] <= most.t.shape[0]
 
 
 # --- on a router -----------------------------------------------------------------------------------------------------
@@ -199,7 +250,7 @@ def test_all_that_are_taken_over_write_before_the_past_of_any_has_come() -> None
     class Asked(MemoryBus):
         seen: ClassVar[list[set[tuple[bool, bool]]]] = []
 
-        def gather(self, kind: type, *_: object) -> Iterator:
+        def collect(self, kind: type, *_: object) -> Iterator:
             self.seen.append({(held.ready, held.bare) for held in worker._held.values()})
             return iter(())
 

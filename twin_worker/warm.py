@@ -6,11 +6,13 @@ from fleet import hybrid
 from fleet.airframes import GENERIC, load
 from fleet.autopilots import arduplane, copter, greybox
 from fleet.autopilots.shadow import shadow
-from fleet.contract import Array, Item, Prediction, State
+from fleet.codec import encode
+from fleet.contract import Array, History, Item, Prediction, Rows, Sample, State
 from fleet.frames import Origin
 from fleet.mission import route
 from fleet.simulate import N_STATE, coupled_plant, linear_plant, simulate
 from fleet.window import Window
+from twin_worker.claims.tape import read
 from twin_worker.conflict.traffic import Traffic
 from twin_worker.coupled import identify
 from twin_worker.hybrid import lags
@@ -50,6 +52,7 @@ def warm_up() -> None:
     segments, told = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
     _meet(origin)
     _go_on()
+    _recall()
     copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), told, 0.1, ahead)  # type: ignore
 
 
@@ -88,6 +91,12 @@ def _go_on() -> None:
     ahead, path = (Array.of(values).numpy() for values in (np.arange(5.0), np.zeros((5, 3))))
     shifted(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, 0.0)
+
+
+def _recall() -> None:
+    """Read what a gateway tells of the past."""
+    rows = Rows(t=Array.of([1e9], "<f8"), x=Array.of(np.zeros((1, 3))))
+    read(encode(History(uav=0, t=1e9, samples=(Sample(uav=0, t=1e9, velocity=rows),))))
 
 
 def _flight(seconds: float = 20.0, dt: float = 0.04) -> Window:

@@ -128,10 +128,16 @@ class Worker:
         if self.diagnosis is not None and load.mismatch is not None:
             self.diagnosis.watch(uav).told = load.mismatch
 
-    def give(self, uav: int) -> tuple[Ledger, Mismatch | None]:
-        """Give what belongs to a twin that is held here no longer."""
-        watch = self.diagnosis.watches.pop(uav, None) if self.diagnosis is not None else None
-        return self.traffic.give(uav), watch.told if watch is not None else None
+    def show(self, uav: int) -> tuple[Ledger, Mismatch | None]:
+        """Give what goes with a twin to another worker."""
+        watch = self.diagnosis.watches.get(uav) if self.diagnosis is not None else None
+        return self.traffic.show(uav), watch.told if watch is not None else None
+
+    def forget(self, uav: int) -> None:
+        """Give up what belongs to a twin that is held here no longer."""
+        self.traffic.forget(uav)
+        if self.diagnosis is not None:
+            self.diagnosis.watches.pop(uav, None)
 
     def active(self, held: Held) -> list[Alert]:
         """Give the alerts of one aircraft that are in force."""
@@ -184,6 +190,7 @@ class Worker:
         """Publish under the claim in force; what is held no longer, or not surely, is kept back."""
         if held.ready and self.claiming.may_write():
             self.bus.publish(result, Stamp(held.epoch, self.bus.writer))
+            held.written = held.written or isinstance(result, Prediction)
 
     def _diagnose(self) -> None:
         """Let the diagnosis go on in the background, and publish what it found."""

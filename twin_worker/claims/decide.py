@@ -1,8 +1,9 @@
 """What one worker holds and what it does next: the claim protocol without bus, thread or clock.
 
 A worker knows the others by their liveliness tokens and what they hold by their announcements. An aircraft belongs to
-its `owner`. The owner asks a live holder to hand it over, takes what nobody live holds, and gives what it is asked for.
-Every taking raises the aircraft's epoch; of two writers the higher `Rank` is believed, by readers and by both.
+its `owner`. The owner asks a live holder for a copy of its twin, and takes what nobody live holds. Every taking raises
+the aircraft's epoch; of two writers the higher `Rank` is believed, by readers and by both: who held it before goes on
+writing until it hears of the higher claim, so that nobody waits.
 
     unsure    after a pause, and with no router in sight: writes nothing and claims nothing until it has asked the
               others what they hold
@@ -10,7 +11,7 @@ Every taking raises the aircraft's epoch; of two writers the higher `Rank` is be
               by one and whoever is still on the way would pass for dead
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -124,9 +125,10 @@ class Claims:
     def plan(self, now: float) -> Plan:
         """Give what this worker should hold and does not."""
         plan = Plan()
-        missing = self.known - self.held.keys()
-        if not missing or not self._ready(now):
+        if not self._ready(now):
             return plan
+        plan.take += [uav for uav, epoch in self.held.items() if self._outdone(uav, epoch)]
+        missing = self.known - self.held.keys()
         for uav, who in owners(sorted(missing), self._candidates()).items():
             if who != self.me:
                 continue
@@ -139,6 +141,11 @@ class Claims:
 
     def _ready(self, now: float) -> bool:
         return not self.leaving and self.may_write(now) and now >= self._settled
+
+    def _outdone(self, uav: int, epoch: int) -> bool:
+        """Tell whether readers believe one that is no more, which took what is held here before it said so."""
+        rank = self.seen[uav]
+        return rank > Rank(epoch, self.me) and rank.worker not in self.peers
 
     def _candidates(self) -> dict[str, range]:
         return {self.me: self.ids} | {name: peer.ids for name, peer in self.peers.items() if not peer.leaving}
@@ -155,7 +162,3 @@ class Claims:
         epoch = self.held[uav] = max(before + 1, wall_ms)
         self.seen[uav] = Rank(epoch, self.me)
         return epoch
-
-    def give(self, uavs: Iterable[int]) -> dict[int, int]:
-        """Hold these no longer, because their owner asked for them; give those that were held, with their epochs."""
-        return {uav: self.held.pop(uav) for uav in uavs if uav in self.held}

@@ -5,11 +5,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Protocol
-
-import numpy as np
 
 import fleet
 from fleet.codec import Stamp
@@ -18,13 +16,14 @@ from fleet.fence import Fence
 from fleet.talk import Bus
 from twin_worker.claims.carry import Load, packed, unpacked
 from twin_worker.claims.past import SELDOM, recall
-from twin_worker.claims.revive import go_on, revive
+from twin_worker.claims.revive import go_on, revive, wait
 from twin_worker.conflict.ledger import Ledger
 from twin_worker.memory import Twin, hear
 
 _log = logging.getLogger(__name__)
 INBOX = 4096  # messages waiting per UAV; the oldest go first and are counted
-_AT_ONCE = 8  # aircraft whose last minutes are asked for at once
+_QUIET_S = 1.0  # after which one that came is written for, or has nothing to be written of it [s]
+_BUSY_S = 0.3  # for a twin that is just being worked on; it is asked for again [s]
 
 
 @dataclass(eq=False)
@@ -41,6 +40,7 @@ class Held:
     ready: bool = True  # its twin is here
     bare: bool = False  # without the telemetry of before
     since: float = float("-inf")  # when its twin came [s, monotonic]
+    written: bool = False  # a prediction was published, or nobody else publishes any
     told: tuple[Prediction, Prediction] | None = None  # one that was asked for, and the same with law and parameters
 
 
@@ -50,8 +50,11 @@ class Extras(Protocol):
     def take(self, uav: int, load: Load) -> None:
         """Keep what came with a twin."""
 
-    def give(self, uav: int) -> tuple[Ledger, Mismatch | None]:
-        """Give it up: open conflicts, and the mismatch found last."""
+    def show(self, uav: int) -> tuple[Ledger, Mismatch | None]:
+        """Give it: open conflicts, and the mismatch found last."""
+
+    def forget(self, uav: int) -> None:
+        """Give it up."""
 
 
 class Twins:
@@ -116,6 +119,7 @@ class Twins:
         held = self._place(uav)
         held.epoch, held.bare = epoch, twin is None and not held.ready
         if twin is None:
+            held.written = True
             return
         try:
             if twin.code != fleet.SOURCES:
@@ -133,13 +137,13 @@ class Twins:
         self._begin(held, load.twin, load.inbox)
 
     def recall(self, uavs: list[int]) -> None:
-        """Begin some without their twins: with the gateway's last minutes, and the model published last."""
-        begun = [(uav, twin) for uav in uavs if (twin := self._go_on(uav)) is not None]  # all of them, before the rest
-        if len(begun) == 1:
-            self._recall(*begun[0])
-        elif begun:
-            with ThreadPoolExecutor(_AT_ONCE, "recall") as pool:
-                list(pool.map(self._recall, *zip(*begun, strict=True)))
+        """Begin some without their twins: with the gateway's last minutes, and the model published last.
+
+        All of them go on at once, the past comes one by one, and what follows from it is spread over the usual periods.
+        """
+        begun = [(uav, twin) for uav in uavs if (twin := self._go_on(uav)) is not None]
+        for k, (uav, twin) in enumerate(begun):
+            self._recall(uav, twin, k / len(begun))
 
     def _go_on(self, uav: int) -> Twin | None:
         """Make a twin that writes at once where another worker published a prediction; None where there is a twin."""
@@ -151,7 +155,7 @@ class Twins:
             self._begin(held, twin, [], bare=True)
         return twin
 
-    def _recall(self, uav: int, twin: Twin) -> None:
+    def _recall(self, uav: int, twin: Twin, share: float) -> None:
         """Let a twin hear what was said before, and believe what was published."""
         held = self.held.get(uav)
         if held is None:
@@ -164,9 +168,8 @@ class Twins:
         with held.lock:
             for message in past:
                 hear(twin, message)
-            if model is not None:
-                revive(twin, model)
-            twin.predict_t = -np.inf
+            known = model is not None and revive(twin, model)
+            wait(twin, share, fly=held.ready and isfinite(twin.pace.renew), learn=known)
         if self.held.get(uav) is not held:  # it was lost meanwhile
             return
         if held.ready:
@@ -206,25 +209,32 @@ class Twins:
             held.ready = False
             if held.twin.model is not None:
                 self._models[uav] = held.twin.model
-            self._extras.give(uav)
+            self._extras.forget(uav)
 
-    def hand_over(self, uav: int, epoch: int) -> Handover | None:
-        """Hold one no longer; give its twin, between two of its turns; None where it has none yet."""
-        with self.lock:
-            held = self.held.pop(uav, None)
-        if held is None:
+    def copied(self, uav: int, epoch: int) -> Handover | None:
+        """Copy one's twin, between two of its turns; None where there is none yet, or it is worked on for longer."""
+        held = self.held.get(uav)
+        if held is None or not held.lock.acquire(timeout=_BUSY_S):
             return None
-        with held.lock:
+        try:
             if not held.ready or held.bare:
                 return None
-            held.ready = False
-            conflicts, mismatch = self._extras.give(uav)
-            try:
-                load = packed(Load(held.twin, list(held.inbox), conflicts, mismatch))
-            except TypeError:  # a defect: its new owner begins cold
-                _log.exception("uav-%d cannot be handed over; report it", uav)
-                load = b""
+            load = packed(Load(held.twin, list(held.inbox), *self._extras.show(uav)))
+        except TypeError:  # a defect: its new owner begins cold
+            _log.exception("uav-%d cannot be handed over; report it", uav)
+            load = b""
+        finally:
+            held.lock.release()
         return Handover(t=time.time(), uav=uav, epoch=epoch, code=fleet.SOURCES, load=load)
+
+    @property
+    def quiet(self) -> frozenset[int]:
+        """Name those whose holder of before is still the one that writes."""
+        since = time.monotonic() - _QUIET_S
+        with self.lock:
+            return frozenset(
+                uav for uav, held in self.held.items() if not held.written and (not held.ready or held.since > since)
+            )
 
     @property
     def bare(self) -> tuple[int, ...]:

@@ -2,20 +2,20 @@
 
 every 0.1 s, and at once when a token comes or goes or an aircraft is heard of that nobody holds
 unsure     ask everyone what they hold (`Claim`), then go on
-ask        the live holder of what should be ours hands over (`Handover`), each twin as soon as it is packed;
-what it does not hand over in time is taken without
-take       what nobody live holds; the keeper recalls its telemetry and its last model
-announce   what we hold, every 0.5 s and at once when that grew
-asked        for a handover: give up each aircraft and send its twin; the asker is its owner
-heard        a higher claim on what we hold: drop it, without a word
+take       what nobody live holds: the last prediction is renewed at once, telemetry and model are recalled one by one
+ask        the live holder of what should be ours for copies (`Handover`), and take each as it comes; what does not come
+in time is taken without
+announce   what we write for, every 0.5 s and at once when that changed; what came as a copy only once we do write
+asked      for copies: send them, and go on
+heard      a higher claim on what we hold: drop it, without a word
 """
 
 import logging
 import platform
 import threading
 import time
-from collections.abc import Iterable, Iterator
-from typing import Protocol
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Protocol
 
 import msgspec
 
@@ -31,8 +31,8 @@ _TURN_S = 0.1  # between turns without news [s]
 _SETTLE_S = 0.03  # tokens come in bursts [s]
 _ANNOUNCE_S = 0.5
 _ASK_S = 0.5  # for everyone to say what they hold; a frozen worker never does [s]
-_HAND_S = 1.5  # for one to hand over all it was asked for [s]
-_LEAVE_S = 3.0  # to hand everything over at the end [s]
+_HAND_S = 3.0  # for a copy of one that is held elsewhere; its holder writes meanwhile [s]
+_LEAVE_S = 5.0  # for the others to take everything over at the end [s]
 _MOST_EPOCH = 1 << 62  # beyond is no epoch
 
 
@@ -54,8 +54,12 @@ class Keeper(Protocol):
     def drop(self, uavs: Iterable[int]) -> None:
         """Hold these no longer."""
 
-    def hand_over(self, uav: int, epoch: int) -> Handover | None:
-        """Hold one no longer; give its twin."""
+    def copied(self, uav: int, epoch: int) -> Handover | None:
+        """Copy one's twin; None where there is none just now."""
+
+    @property
+    def quiet(self) -> frozenset[int]:
+        """Name those that came as copies and are not written for yet."""
 
     @property
     def bare(self) -> tuple[int, ...]:
@@ -79,6 +83,9 @@ class Claiming:
         self._lock = threading.RLock()
         self._news = threading.Event()
         self._said = float("-inf")
+        self._told: tuple[object, ...] = ()  # what was announced last
+        self._asked_for: dict[int, float] = {}  # since when copies are asked for, by UAV id [s, monotonic]
+        self._asking: dict[str, threading.Thread] = {}  # by worker
 
     # --- from any thread ---------------------------------------------------------------------------------------------
 
@@ -114,7 +121,8 @@ class Claiming:
         """Say what is held; to those who ask also what is known of others."""
         with self._lock:
             seen = ((uav, *rank) for uav, rank in self.claims.seen.items()) if asked else ()
-            held = tuple(self.claims.held.items())
+            quiet = self._keeper.quiet
+            held = tuple((uav, epoch) for uav, epoch in self.claims.held.items() if uav not in quiet)
             return Claim(
                 t=time.time(),
                 worker=self.me,
@@ -151,13 +159,11 @@ class Claiming:
             _log.info("%d aircraft are written for by %s, which has the higher claim", len(lost), claim.worker)
 
     def _asked(self, payload: bytes) -> Iterator[tuple[Handover, None]]:
-        """Hand over one by one: each is written for until its own turn comes."""
-        if not payload:
-            return
-        for uav in _wanted(payload).uavs:
+        """Send copies of what is held, one by one; who asked takes it, and is heard of when it does."""
+        for uav in _wanted(payload).uavs if payload else ():
             with self._lock:
-                given = self.claims.give([uav])
-            if given and (twin := self._keeper.hand_over(uav, given[uav])) is not None:
+                epoch = self.claims.held.get(uav)
+            if epoch is not None and (twin := self._keeper.copied(uav, epoch)) is not None:
                 yield twin, None
 
     # --- one thread --------------------------------------------------------------------------------------------------
@@ -184,14 +190,9 @@ class Claiming:
             self._synchronise()
         with self._lock:
             plan = self.claims.plan(time.monotonic())
-        grown = bool(plan.take or plan.ask)
-        for worker, uavs in plan.ask.items():
-            plan.take += self._ask(worker, uavs)
         self._take(plan.take)
-        if grown or time.monotonic() - self._said >= _ANNOUNCE_S:
-            self._announce()
-        if plan.take:
-            self._keeper.recall(plan.take)
+        self._take(self._ask(plan.ask))
+        if self._news_to_tell() or time.monotonic() - self._said >= _ANNOUNCE_S:
             self._announce()
 
     def leave(self) -> None:
@@ -229,30 +230,67 @@ class Claiming:
         for uav, epoch in renewed.items():
             self._keeper.renew(uav, epoch)
 
-    def _ask(self, worker: str, uavs: list[int]) -> list[int]:
-        """Ask a holder for twins and adopt each that comes; give those that did not."""
+    def _ask(self, wanted: dict[str, list[int]]) -> list[int]:
+        """Ask each holder for copies, all at the same time; give what has been asked for in vain for too long."""
+        now, uavs = time.monotonic(), {uav for mine in wanted.values() for uav in mine}
+        self._keeper.drop(self._asked_for.keys() - uavs - self.claims.held.keys())  # another is their owner by now
+        self._asked_for = {uav: self._asked_for.get(uav, now) for uav in uavs}
+        for worker, mine in wanted.items():
+            if not self.threaded:
+                self._copy(worker, mine)
+            elif worker not in self._asking or not self._asking[worker].is_alive():
+                self._asking[worker] = self._begin(self._copy, worker, mine)
+        return [uav for uav, since in self._asked_for.items() if now - since > _HAND_S and uav not in self.claims.held]
+
+    def _copy(self, worker: str, uavs: list[int]) -> None:
+        """Ask one holder, and take each as it comes."""
         self._keeper.expect(uavs)
-        missing = dict.fromkeys(uavs)
         payload = msgspec.msgpack.encode(Wanted(uavs=tuple(uavs)))
         for twin in self._bus.gather(Handover, worker, payload, _HAND_S):
-            if twin.uav in missing and 0 <= twin.epoch < _MOST_EPOCH:
-                del missing[twin.uav]
-                with self._lock:
-                    self.claims.note(twin.uav, Rank(twin.epoch, worker))
-                    epoch = self.claims.take(twin.uav, _wall_ms())
-                self._keeper.adopt(twin.uav, epoch, twin)
-        self.tick()
-        return list(missing)
+            with self._lock:
+                late = (
+                    twin.uav not in uavs or twin.uav in self.claims.held or not self.claims.may_write(time.monotonic())
+                )
+                if late or not 0 <= twin.epoch < _MOST_EPOCH:
+                    continue
+                self.claims.note(twin.uav, Rank(twin.epoch, worker))
+                epoch = self.claims.take(twin.uav, _wall_ms())
+            self._keeper.adopt(twin.uav, epoch, twin)
 
-    def _take(self, uavs: Iterable[int]) -> None:
+    def _take(self, uavs: list[int]) -> None:
         for uav in uavs:
             with self._lock:
                 epoch = self.claims.take(uav, _wall_ms())
             self._keeper.adopt(uav, epoch, None)
+        if uavs and self.threaded:
+            self._begin(self._keeper.recall, uavs)
+        elif uavs:
+            self._keeper.recall(uavs)
+
+    def _begin(self, act: Callable[..., None], *given: Any) -> threading.Thread:
+        """Do it beside the turns, which go on."""
+        thread = threading.Thread(target=self._watched, args=(act, *given), daemon=True)
+        thread.start()
+        return thread
+
+    def _watched(self, act: Callable[..., None], *given: Any) -> None:
+        try:
+            act(*given)
+        except ConnectionError:  # the session is closed: we are leaving
+            return
+        except Exception:  # a defect met once must not end the claims
+            _log.exception("taking over met a defect; report it")
+        self._news.set()
+
+    def _news_to_tell(self) -> bool:
+        """Tell whether more or other aircraft are written for than was announced."""
+        claim = self.claim()
+        return (claim.held, claim.bare) != self._told
 
     def _announce(self) -> None:
-        self._said = time.monotonic()
-        self._bus.publish(self.claim())
+        claim = self.claim()
+        self._said, self._told = time.monotonic(), (claim.held, claim.bare)
+        self._bus.publish(claim)
 
 
 def _wanted(payload: bytes) -> Wanted:

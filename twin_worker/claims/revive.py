@@ -31,6 +31,20 @@ def revive(twin: Twin, model: Model) -> bool:
     return True
 
 
+def wait(twin: Twin, share: float, *, fly: bool, learn: bool) -> None:
+    """Let the first work of its own wait for a share of its period, so that many taken over at once take turns.
+
+    Args:
+        twin: that has heard what was said before
+        share: of a period, 0..1
+        fly: it has a prediction to renew meanwhile; otherwise it flies ahead at once
+        learn: it has a model meanwhile; otherwise it learns at once
+    """
+    newest, pace = twin.history.newest, twin.pace
+    twin.predict_t = newest - (1.0 - share) * pace.predict if fly else -np.inf
+    twin.identify_t = newest - (1.0 - share) * pace.identify if learn else -np.inf
+
+
 def go_on(twin: Twin, made: Prediction) -> bool:
     """Let a fresh twin renew the last prediction another worker published, until it has flown one of its own.
 

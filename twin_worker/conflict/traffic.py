@@ -52,10 +52,14 @@ class Traffic:
         """Go on with what another worker found of an aircraft that is held here from now on."""
         self._ledgers[uav] = conflicts
 
-    def give(self, uav: int) -> Ledger:
-        """Give what was found of an aircraft that is held here no longer."""
+    def show(self, uav: int) -> Ledger:
+        """Give what was found of an aircraft."""
+        return self._ledgers.get(uav) or Ledger()
+
+    def forget(self, uav: int) -> None:
+        """Hold an aircraft no longer."""
         self._judged.pop(uav, None)
-        return self._ledgers.pop(uav, None) or Ledger()
+        self._ledgers.pop(uav, None)
 
     def active(self, uav: int) -> list[Alert]:
         """Give the conflicts of one held aircraft that are in force."""
