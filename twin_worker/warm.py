@@ -8,7 +8,7 @@ from fleet.autopilots import arduplane, copter, greybox
 from fleet.autopilots.shadow import shadow
 from fleet.codec import encode
 from fleet.contract import Array, History, Item, Prediction, Rows, Sample, State
-from fleet.frames import Origin
+from fleet.frames import Origin, wrap
 from fleet.mission import route
 from fleet.simulate import N_STATE, coupled_plant, linear_plant, simulate
 from fleet.window import Window
@@ -17,7 +17,10 @@ from twin_worker.conflict.traffic import Traffic
 from twin_worker.coupled import identify
 from twin_worker.hybrid import lags
 from twin_worker.identify import AXES, identify_axis
+from twin_worker.linearise import linearise
 from twin_worker.renew import shifted
+from twin_worker.unseen import Unseen
+from twin_worker.verify import verify
 from twin_worker.wind import WindFilter
 
 _SPEED = 22.0  # [m/s]
@@ -53,6 +56,7 @@ def warm_up() -> None:
     _meet(origin)
     _go_on()
     _recall()
+    _learn()
     copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), told, 0.1, ahead)  # type: ignore
 
 
@@ -97,6 +101,16 @@ def _recall() -> None:
     """Read what a gateway tells of the past."""
     rows = Rows(t=Array.of([1e9], "<f8"), x=Array.of(np.zeros((1, 3))))
     read(encode(History(uav=0, t=1e9, samples=(Sample(uav=0, t=1e9, velocity=rows),))))
+
+
+def _learn() -> None:
+    """Identify, verify, and tell what a model is worth, as a thread does that yields to all others."""
+    window = _flight(60.0)
+    plant, known = identify(window, np.zeros(2), load(GENERIC)), len(window) // 2
+    verify(plant, window, known, 0.0, None)
+    Unseen(plant, window, known).lesson(20.0, 5.0)
+    linearise(plant, window)
+    wrap(np.zeros((2, 3))[:, 2])
 
 
 def _flight(seconds: float = 20.0, dt: float = 0.04) -> Window:
