@@ -1,5 +1,6 @@
 """Workers on one bus in memory, and on a real router: who takes over has window and model, and nobody is lost."""
 
+import copy
 import os
 import signal
 import subprocess
@@ -26,6 +27,7 @@ from tests.bench.asking.answerer import prediction
 from twin_worker.claims.protocol import Claiming
 from twin_worker.claims.tape import read
 from twin_worker.claims.tree import pack
+from twin_worker.engine.pace import Pace
 from twin_worker.worker import Worker
 
 PATIENCE_S = 120.0  # an upper bound on a busy machine
@@ -108,6 +110,28 @@ def test_what_is_not_here_yet_or_just_being_worked_on_is_not_copied(bus: MemoryB
     with held.lock:
         assert handed(bus, 2) == []
     assert len(handed(bus, 2)) == 1
+
+
+def test_while_a_twin_is_worked_on_its_last_path_is_renewed(bus: MemoryBus, flown: tuple, heard: tuple) -> None:
+    """A thread that learns may hold a twin for seconds on a busy machine: nobody waits for the next prediction."""
+    worker = Worker(bus, range(1, 5), omega=0.0, pace=Pace(predict=5.0, renew=0.1))
+    worker.listen()
+    for message in heard[-400:]:
+        bus.publish(message)
+    (held,) = worker.holding()
+    held.twin, told = copy.deepcopy(flown[0]), []
+    held.twin.pace, held.twin.base = worker.pace, held.twin.prediction
+    held.inbox.clear()
+    bus.subscribe(Prediction, lambda made, _: told.append(made))
+    rows = f.shifted([m for m in heard if isinstance(m, Sample) and m.position][-20:], 2.0, 1e9)
+    with held.lock:
+        for message in rows:
+            bus.publish(message)
+            worker.turn()
+    times = [made.t for made in told]
+    assert len(times) > 3 and times == sorted(set(times)) and len(held.inbox) == len(rows)
+    worker.turn()
+    assert not held.inbox and all(made.t > times[-1] for made in told[len(times) :])
 
 
 def test_a_first_prediction_is_what_ends_the_quiet(bus: MemoryBus, worker: Worker) -> None:

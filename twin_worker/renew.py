@@ -5,7 +5,7 @@ from math import exp
 import msgspec
 import numpy as np
 
-from fleet.contract import Array, Message
+from fleet.contract import Array, Message, Prediction
 from fleet.frames import to_ned
 from fleet.physics.kernel import kernel
 from twin_worker.memory import Twin
@@ -40,29 +40,39 @@ def shifted(ahead: np.ndarray, path: np.ndarray, passed: float, at: np.ndarray, 
 
 
 def renew(twin: Twin) -> list[Message]:
-    """Give the last path that was flown ahead, from the newest position on; nothing where there is neither.
+    """Give the last path that was flown ahead, from the newest position on; nothing where there is neither."""
+    if twin.base is None:
+        return []
+    t, rows = twin.history.rows("position", max(twin.base.t, twin.history.newest - 1.0))
+    made = renewed(twin, float(t[-1]), rows[-1]) if len(t) else None
+    if made is None:
+        return []
+    twin.prediction = made
+    return [made]
+
+
+def renewed(twin: Twin, t: float, position: np.ndarray) -> Prediction | None:
+    """Give the last path that was flown ahead from a position on, (3,) [1e-7 deg, mm] at `t`; the twin stays as it is.
 
     The departure so far, d, fades:  p(tau) = path(t - t0 + tau) + d exp(-tau / 10 s).
     """
     base = twin.base
     if base is None or twin.origin is None or twin.lost or twin.broken or base.coast_s:
-        return []
-    t, rows = twin.history.rows("position", max(base.t, twin.history.newest - 1.0))
-    if not len(t) or not 0.0 < (passed := float(t[-1]) - base.t) < LATEST_S:
-        return []
+        return None
+    if not 0.0 < (passed := t - base.t) < LATEST_S:
+        return None
     ahead = base.ahead.numpy()
     n = int(ahead.searchsorted(float(ahead[-1]) - passed, side="right"))
     if not n or ahead[n - 1] < LEAST_AHEAD_S:
-        return []
+        return None
     out = np.empty((n, 3), np.float32)
-    shifted(ahead, base.path.numpy(), passed, to_ned(twin.origin, *rows[-1]), out)  # type: ignore[call-arg]
-    twin.prediction = msgspec.structs.replace(
+    shifted(ahead, base.path.numpy(), passed, to_ned(twin.origin, *position), out)  # type: ignore[call-arg]
+    return msgspec.structs.replace(
         base,
-        t=float(t[-1]),
+        t=t,
         state=twin.state,
         ahead=Array(base.ahead.dtype, (n,), base.ahead.data[: ahead.itemsize * n]),
         path=Array("<f4", (n, 3), out.tobytes()),
         tube=Array(base.tube.dtype, (n, 3), base.tube.data[: ahead.itemsize * 3 * n]),
         controller=None,
     )
-    return [twin.prediction]

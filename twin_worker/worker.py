@@ -36,6 +36,7 @@ from twin_worker.engine.learner import Learner
 from twin_worker.engine.pace import Pace, Work
 from twin_worker.engine.quota import LEAST_S, SWEEP_S, Quota
 from twin_worker.engine.rates import Rates
+from twin_worker.engine.stand_in import said_already, stand_in
 from twin_worker.memory import AUTO
 from twin_worker.mismatch.live import Live
 from twin_worker.mismatch.told import word
@@ -73,7 +74,7 @@ class Worker:
         self.pace, self.quota = pace or Pace(), Quota()
         self.sentence = ""
         self.rates = Rates()
-        self.learner = Learner(self.holding, self._publish, self.rates)
+        self.learner = Learner(self._whole, self._publish, self.rates)
         self._swept = float("-inf")  # when the last sweep began [s, monotonic]
         self._first = 0  # whose turn is the first of the next sweep
         self.traffic = Traffic(separation or Separation())
@@ -147,17 +148,24 @@ class Worker:
         """Give what this worker holds, by UAV id."""
         return self._twins.ready()
 
+    def _whole(self) -> list[Held]:
+        """Give those held that have heard what was said before."""
+        return [held for held in self.holding() if not held.bare]
+
     def turn(self) -> int:
         """Advance every twin once; give how many messages were taken in."""
         taken = 0
         for held in self._in_turn():
             waiting = len(held.inbox)
             taken += waiting
-            if held.lock.locked():  # it is identified just now, or handed over
+            if held.lock.locked():  # it is identified just now, or copied
+                if (made := stand_in(held)) is not None:
+                    self._publish(made, held)
                 continue
             try:
                 for result in _advance_all(held, waiting, self.traffic):
-                    self._publish(result, held)
+                    if not said_already(result, held):
+                        self._publish(result, held)
                 self.quota.settle()
             except Exception as error:  # a defect met by one aircraft must not stop the others
                 held.failed = f"{held.twin.name}: found a defect ({error}), its results are missing; report it"

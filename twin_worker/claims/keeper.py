@@ -11,7 +11,7 @@ from typing import Protocol
 
 import fleet
 from fleet.codec import Stamp
-from fleet.contract import Handover, Message, Mismatch, Model, Prediction, Sample
+from fleet.contract import Handover, Message, Mismatch, Model, Prediction, Rows, Sample
 from fleet.fence import Fence
 from fleet.talk import Bus
 from twin_worker.claims.carry import Load, packed, unpacked
@@ -34,6 +34,8 @@ class Held:
     epoch: int
     inbox: deque[Message] = field(default_factory=lambda: deque(maxlen=INBOX))
     arrived: float = float("nan")  # wall time of the newest sample [s, monotonic]
+    placed: Rows | None = None  # positions heard last
+    stood: float = float("-inf")  # data time of what was said while the twin was worked on [s since 1970]
     shed: int = 0
     failed: str = ""  # what went wrong last, a defect of ours
     lock: threading.Lock = field(default_factory=threading.Lock)  # held while the twin changes, or is copied
@@ -87,7 +89,7 @@ class Twins:
                 self._said.setdefault(message.uav, {})[type(message)] = message
             return False
         if isinstance(message, Sample):
-            held.arrived = time.monotonic()
+            held.arrived, held.placed = time.monotonic(), message.position or held.placed
         held.shed += len(held.inbox) == INBOX
         held.inbox.append(message)
         return True

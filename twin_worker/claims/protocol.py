@@ -248,10 +248,8 @@ class Claiming:
         payload = msgspec.msgpack.encode(Wanted(uavs=tuple(uavs)))
         for twin in self._bus.gather(Handover, worker, payload, _HAND_S):
             with self._lock:
-                late = (
-                    twin.uav not in uavs or twin.uav in self.claims.held or not self.claims.may_write(time.monotonic())
-                )
-                if late or not 0 <= twin.epoch < _MOST_EPOCH:
+                wanted = twin.uav in uavs and twin.uav not in self.claims.held and 0 <= twin.epoch < _MOST_EPOCH
+                if not wanted or not self.claims.may_write(time.monotonic()):
                     continue
                 self.claims.note(twin.uav, Rank(twin.epoch, worker))
                 epoch = self.claims.take(twin.uav, _wall_ms())
