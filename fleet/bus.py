@@ -143,7 +143,7 @@ class ZenohBus(AbstractContextManager):
             if (found := reply.ok) is not None and (pair := self._read(kind, found)) is not None:
                 yield pair[0]
 
-    def collect(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
+    def fetch(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
         """Ask and give the bytes of every answer as it comes; other versions are left out."""
         for reply in self._coming(key(kind, who), timeout_s, None):
             if (found := reply.ok) is not None and str(found.encoding) == encoding(kind):

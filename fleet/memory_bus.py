@@ -95,7 +95,7 @@ class MemoryBus(AbstractContextManager):
                 for message, _ in reply(uav, {}, payload):
                     yield decode(kind, encode(message), encoding(kind))
 
-    def collect(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
+    def fetch(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
         """Ask and give the bytes of every answer as it comes."""
         return map(encode, self.gather(kind, who, b"", timeout_s))
 

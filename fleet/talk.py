@@ -101,7 +101,7 @@ class Bus(AbstractContextManager, Protocol):
             ConnectionError: when the session is closed; join the router again.
         """
 
-    def collect(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
+    def fetch(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
         """Ask and give the bytes of every answer as it comes, for at most `timeout_s` [s]; other versions are left out.
 
         Raises:

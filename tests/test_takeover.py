@@ -274,7 +274,7 @@ def test_all_that_are_taken_over_write_before_the_past_of_any_has_come() -> None
     class Asked(MemoryBus):
         seen: ClassVar[list[set[tuple[bool, bool]]]] = []
 
-        def collect(self, kind: type, *_: object) -> Iterator:
+        def fetch(self, kind: type, *_: object) -> Iterator:
             self.seen.append({(held.ready, held.bare) for held in worker._held.values()})
             return iter(())
 

@@ -21,5 +21,5 @@ def recall(bus: Bus, uav: int, known: Mapping[type, Message]) -> list[Message]:
     found: list[Message] = []
     for kind in SELDOM:
         found += [known[kind]] if kind in known else [said for said, _ in bus.ask(kind, uav, PATIENCE_S)]
-    heard = map(read, bus.collect(History, uav, _LONG_S))
+    heard = map(read, bus.fetch(History, uav, _LONG_S))
     return [*found, *(said for said in heard if said is not None and said.uav == uav)]
