@@ -12,6 +12,7 @@ import viser
 
 from fleet.talk import Bus
 from viewer.browser import Browser
+from viewer.bygone import FEW, Bygone
 from viewer.camera import IN_VIEW_M, near, start_at
 from viewer.feed import Feed
 from viewer.flock import MINUTE, Flock
@@ -38,6 +39,7 @@ class App:
     def __init__(self, bus: Bus, server: viser.ViserServer, *, light: bool = False, land: Land | None = None) -> None:
         self._palette = LIGHT if light else DARK
         self.feed, self.flock, self._server = Feed(bus), Flock(), server
+        self._bygone = Bygone(bus, self.feed)
         self.tapes, self._land = Tapes(), land or Land(None, None)
         self.views: dict[int, View] = {}  # by client
         self._unfit: set[int] = set()  # clients whose page could not be opened
@@ -68,7 +70,10 @@ class App:
             if not fleet or any(v.mission is None or v.model is None for v in fleet):
                 with contextlib.suppress(OSError, RuntimeError):
                     self.feed.catch_up()
-            stop.wait(SLOW_S)
+            for _ in range(int(SLOW_S)):
+                self._bygone.ask()
+                if stop.wait(1.0):
+                    return
 
     def tick(self, tick: int) -> None:
         """Draw what is due at this tick."""
@@ -157,7 +162,7 @@ class App:
         chosen = [view.selected for view in self.views.values() if view.selected is not None]
         self.feed.inbox.keen, self.feed.close = frozenset(chosen), frozenset((*needy, *chosen))
         played = [(v, rows) for v in fleet if v.recorded and len(rows := self.feed.track(v))]
-        self.flock.beat({v.uav: placed(rows, v.t - MINUTE, np.inf) for v, rows in played})
+        self.flock.beat({v.uav: placed(rows, v.t - MINUTE, np.inf) for v, rows in [*played, *self._off_beat(fleet)]})
         self.flock.meet(fleet, now)
         if place is None or not self.flock.uavs:
             return
@@ -168,6 +173,12 @@ class App:
         self._cloud = near(np.vstack([self.flock.at, *ahead, *paths]), IN_VIEW_M / UNIT_M)
         if not self.views:
             start_at(self._server, self._cloud)
+
+    def _off_beat(self, fleet: list[Vehicle]) -> list[tuple[Vehicle, np.ndarray]]:
+        """Give the paths of those whose seconds are not ours, or whose past has just come."""
+        early, few = self._bygone.news(), len(fleet) <= FEW
+        found = [v for v in fleet if not v.recorded and (v.uav in early or (few and v.time.pace != 1.0))]
+        return [(v, rows) for v in found if len(rows := self.feed.track(v))]
 
     def _news(self) -> tuple:
         """Give what makes another picture of the fleet, whatever its extent."""

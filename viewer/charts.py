@@ -23,7 +23,7 @@ class Charts:
         self._gui, p = gui, palette
         two = np.array([0.0, 1.0])
         self._band = self._chart(
-            "Prediction error against look-ahead, m",
+            "Error by look-ahead, m",
             (("measured", p.flown), ("band", p.tube), ("horizon", p.horizon)),
             (two,) * 4,
         )
@@ -43,10 +43,10 @@ class Charts:
             data,
             (uplot.Series(label="s"), *series),
             scales={"x": {"time": False}},
-            axes=({}, {"size": 54}),
+            axes=({"size": 32}, {"size": 54}),
             legend={"show": False},
             padding=(10, 16, 0, 0),
-            height=126,
+            height=108,
         )
         return head, plot
 

@@ -9,6 +9,8 @@ SCALE = 0.82  # of the font, of every label: the page draws each letter once for
 LETTER, LINE = 0.0068 * SCALE, 0.020 * SCALE  # width and height of a letter over the height of the picture [-]
 EDGE = 0.02  # a label keeps this far from the edge of the picture [heights of it]
 _SHIFT = {"bottom-center": (-0.5, 0.0), "bottom-left": (0.0, 0.0), "top-center": (-0.5, -1.0), "top-left": (0.0, -1.0)}
+_SHIFT |= {"bottom-right": (-1.0, 0.0), "top-right": (-1.0, -1.0)}
+_OTHER_SIDE = {"bottom-left": "bottom-right", "top-left": "top-right"}  # where there is no room beside its place
 
 
 class Tag(NamedTuple):
@@ -78,11 +80,13 @@ def fitting(tags: list[Tag], sight: Sight) -> list[Tag]:
     boxes: list[np.ndarray] = []
     half = np.array([sight.aspect / 2 - EDGE, 0.5 - EDGE])
     for tag, spot, far in zip(tags, spots, depth, strict=True):
-        box = _box(tag, spot)
-        inside = far > 0 and (np.abs(box) <= half).all()
-        if inside and not any(_overlap(box, other) for other in boxes):
-            shown.append(tag)
-            boxes.append(box)
+        for anchor in (tag.anchor, *filter(None, (_OTHER_SIDE.get(tag.anchor),))):
+            box = _box(one := tag._replace(anchor=anchor), spot)
+            inside = far > 0 and (np.abs(box) <= half).all()
+            if inside and not any(_overlap(box, other) for other in boxes):
+                shown.append(one)
+                boxes.append(box)
+                break
         if len(shown) == MOST:
             break
     return shown

@@ -10,10 +10,12 @@ from viewer.glyphs import Glyphs
 from viewer.ground import Ground
 from viewer.palette import Palette, mix, rgb
 from viewer.routes import NOTHING, Route, circle
-from viewer.strokes import Strokes, chain, dash_lines, faded
+from viewer.strokes import Strokes, chain, dash_lines, faded, rounded
 from viewer.vehicle import Vehicle
 
-DASHES, FEW = 28, 60  # dashes of one predicted path; half as many, and no feet, where there are more than a few
+DASHES, FEW = 30, 60  # dashes of one predicted path; half as many, and no feet, where there are more than a few
+LOOK_S = 60.0  # how far ahead the others' paths are drawn at most: many long ones are a thicket [s]
+PARTS = 3  # of a second of trail, where there are few: it is a curve
 ALERT_DASHES = 18  # dashes of the ring on the ground under who needs an eye
 
 
@@ -43,22 +45,22 @@ class Scene:
         fresh = range(CHUNKS) if who != changes or closed > before + 1 else range(closed - before)
         if fresh == range(1):  # the oldest is drawn anew as the newest; the others only fade
             self.trails = [self.trails[-1], *self.trails[:-1]]
-        colours = self.glyphs.colours(flock)
+        colours, parts = self.glyphs.colours(flock), _parts(flock)
         for age, strokes in enumerate(self.trails):
-            ages = age * STEPS + np.arange(STEPS, -1, -flock.stride)
+            ages = age * STEPS + np.linspace(STEPS, 0, parts * STEPS // flock.stride + 1)
             shares = np.interp(ages, [-STEPS, CHUNKS * STEPS], [0.95, 0.03]) * (0.6 if flock.crowd else 1.0)
             shades = faded(colours, rgb(self._palette.ground), shares)
             if age >= flock.chunks:
                 strokes.draw(NOTHING.legs)
             elif age in fresh:
-                strokes.draw(chain(_bare(flock, flock.chunk(age), selected)), shades.reshape(-1, 2, 3))
+                strokes.draw(chain(rounded(_bare(flock, flock.chunk(age), selected), parts)), shades.reshape(-1, 2, 3))
             else:
                 strokes.colour(shades.reshape(-1, 2, 3), shades.shape[0] * shades.shape[1])
         self._drawn, self._looks = (who, closed), flock.looks.copy()
 
     def draw_heads(self, flock: Flock, selected: int | None) -> None:
         """Draw the newest stretch of every trail up to where the aircraft is: an array of fixed size."""
-        lines = chain(_bare(flock, flock.head(), selected))
+        lines = chain(rounded(_bare(flock, flock.head(), selected), _parts(flock)))
         if np.array_equal(flock.looks, self._head_looks):
             return self.head.draw(lines)
         self._head_looks = flock.looks.copy()
@@ -67,7 +69,7 @@ class Scene:
         self.head.draw(lines, np.repeat(colours, lines.shape[1], axis=0))
 
     def draw_predicted(self, flock: Flock, now: float, selected: int | None) -> None:
-        """Draw every predicted path dashed, from now to its horizon; the selected one has its tube instead."""
+        """Draw the predicted paths dashed, to the horizon or for a minute; the selected one has its tube instead."""
         who = [v for v in predicted(flock) if v.uav != selected]
         if not who:
             return self.predicted.draw(NOTHING.legs)
@@ -76,7 +78,7 @@ class Scene:
         lines = [cut_at_horizon(one.ahead, one.path, clock - one.t, one.until, dashes) for one, clock in told]
         looks = flock.looks[[i for v in who if (i := flock.index(v.uav)) is not None]]
         tints = 0.35 * np.array([rgb(c) for c in self._palette.looks()]) + 0.65 * rgb(self._palette.ink)
-        shades = faded(tints, rgb(self._palette.ground), np.linspace(0.85, 0.3, 2 * dashes))[:, ::2]
+        shades = faded(tints, rgb(self._palette.ground), np.linspace(0.9, 0.1, 2 * dashes))[:, ::2]
         self.predicted.draw(np.concatenate(lines), shades[looks].reshape(-1, 2, 3))
 
     def draw_stems(self, flock: Flock) -> None:
@@ -113,6 +115,11 @@ def _bare(flock: Flock, points: np.ndarray, selected: int | None) -> np.ndarray:
     return points
 
 
+def _parts(flock: Flock) -> int:
+    """Give into how many parts a stretch of trail is cut."""
+    return PARTS if len(flock.uavs) <= FEW else 1
+
+
 def predicted(flock: Flock) -> list[Vehicle]:
     """Choose whose predicted paths are drawn: all, in a crowd those who need an eye."""
     if not flock.crowd:
@@ -120,8 +127,8 @@ def predicted(flock: Flock) -> list[Vehicle]:
     return [v for v, _ in flock.needy if v.forecast is not None]
 
 
-def cut_at_horizon(ahead: np.ndarray, path: np.ndarray, start: float, until: float, dashes: int = 28) -> np.ndarray:
-    """Cut a path into dashes between two look-aheads.
+def cut_at_horizon(ahead: np.ndarray, path: np.ndarray, start: float, until: float, dashes: int = DASHES) -> np.ndarray:
+    """Cut a path into dashes of the same duration between two look-aheads, at most `LOOK_S` of it.
 
     Args:
         ahead: look-ahead of each point, rising, (n,) [s]
@@ -131,6 +138,6 @@ def cut_at_horizon(ahead: np.ndarray, path: np.ndarray, start: float, until: flo
     Returns:
         (dashes, 2, 3); without length where nothing may be claimed any more
     """
-    at = np.linspace(min(max(start, 0.0), until), until, 2 * dashes)
+    at = np.minimum(max(start, 0.0) + np.linspace(0.0, LOOK_S, 2 * dashes), until)
     points = np.stack([np.interp(at, ahead, path[:, i]) for i in range(3)], axis=-1)
     return chain(points)[::2]

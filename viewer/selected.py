@@ -42,6 +42,7 @@ class Selection:
         self._bold = Strokes(scene, "/selected/bold", 2.6)
         self._horizon = Strokes(scene, "/selected/horizon", 4.0)
         self._pins, self._plan = Pins(scene, palette), Plan(scene, palette)
+        self._since = np.inf  # the newest stretch of the path is drawn from here on, brightly [s since 1970]
         self._flown_colour = mix(palette.flown, palette.ground, 0.5)
         self.tube = True
         self.tags: list[Tag] = []  # of what moves
@@ -79,6 +80,7 @@ class Selection:
         bold.add(closed(disc(at, 0.85 * unit)), rgb(p.ink))
         thin.add(np.stack([at, foot]), rgb(p.ink))
         trail = feed.trail(vehicle)
+        self._since = trail[0, 0] if len(trail) > 1 else np.inf
         if len(trail) > 1:
             own = np.vstack([trail[::2], trail[-1:]])
             sound = ~mismatch.within(own[:, 0], vehicle.mismatch)[1:]
@@ -139,8 +141,8 @@ class Selection:
             thin.add(_beyond(told, start), rgb(self._palette.muted))
 
     def draw_flight(self, vehicle: Vehicle, rows: np.ndarray, now: float, unit: float) -> None:
-        """Draw the whole flown path (n, 4), faintly, with what happened on it; `unit` as for `draw`."""
-        sound = ~mismatch.within(rows[:, 0], vehicle.mismatch)[1:]
+        """Draw the flown path (n, 4) before its newest stretch, with what happened on it; `unit` as for `draw`."""
+        sound = ~mismatch.within(rows[:, 0], vehicle.mismatch)[1:] & (rows[:-1, 0] < self._since)
         self._flown.draw(chain(rows[:, 1:])[sound] if len(rows) > 1 else NOTHING.legs, self._flown_colour)
         found = vehicle.mismatch
         self._mismatch.draw(mismatch.lines(found, rows), rgb(self._palette.mismatch))

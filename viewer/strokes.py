@@ -44,6 +44,19 @@ def chain(points: np.ndarray) -> np.ndarray:
     return np.stack([points[..., :-1, :], points[..., 1:, :]], axis=-2)
 
 
+def rounded(points: np.ndarray, parts: int) -> np.ndarray:
+    """Lay a smooth curve through points (..., n, 3), each stretch in so many parts: (..., (n - 1) parts + 1, 3)."""
+    if parts < 2 or points.shape[-2] < 2:
+        return points
+    slope = np.gradient(points, axis=-2)
+    s = (np.arange(parts) / parts)[:, None]
+    a, b, da, db = (
+        x[..., None, :] for x in (points[..., :-1, :], points[..., 1:, :], slope[..., :-1, :], slope[..., 1:, :])
+    )
+    curve = a + (b - a) * s * s * (3 - 2 * s) + s * (1 - s) * ((1 - s) * da - s * db)
+    return np.concatenate([curve.reshape(*points.shape[:-2], -1, 3), points[..., -1:, :]], axis=-2)
+
+
 def dashed(points: np.ndarray) -> np.ndarray:
     """Join every second pair of neighbours: (n, 3) -> (n // 2, 2, 3)."""
     return chain(points)[::2]

@@ -40,6 +40,14 @@ class Track:
         last = self._rows[self._n - 1].tolist()
         return UNIT_M * dist(spot[1:], last[1:]) > LEAP_M + LEAP_M_S * max(spot[0] - last[0], 0.0)
 
+    def lay_before(self, rows: np.ndarray) -> None:
+        """Put earlier points first: (n, 4) as of `rows`; what is not earlier than all that is held is left out."""
+        held = self.rows()
+        joined = np.vstack([_before(rows, held), held])
+        self.clear()
+        if len(joined):
+            self.add([tuple(row) for row in joined.tolist()])
+
     def clear(self) -> None:
         """Forget the flight."""
         self._n, self._step, self._last = 0, STEP_S, -np.inf
@@ -61,6 +69,12 @@ class Trail:
         self._rows[self._n % TRAIL_ROWS] = row
         self._n += 1
 
+    def lay_before(self, rows: np.ndarray) -> None:
+        """Put earlier rows first, (n, 5), as many as there is room for; what is not earlier is left out."""
+        held = self.rows()
+        joined = np.vstack([_before(rows, held), held])[-TRAIL_ROWS:]
+        self._rows[: len(joined)], self._n = joined, len(joined)
+
     def clear(self) -> None:
         """Forget it."""
         self._n = 0
@@ -70,6 +84,11 @@ class Trail:
         if self._n <= TRAIL_ROWS:
             return self._rows[: self._n].copy()
         return np.roll(self._rows, -(self._n % TRAIL_ROWS), axis=0)
+
+
+def _before(rows: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Give the rows whose time is before the first one held."""
+    return rows[rows[:, 0] < held[0, 0]] if len(held) else rows
 
 
 def placed(rows: np.ndarray, t: np.ndarray, slack: float = 2.0) -> np.ndarray:

@@ -20,12 +20,12 @@ from viewer.panels import Panels
 from viewer.place import UNIT_M, Place
 from viewer.routes import NOTHING, route
 from viewer.scene import Scene
-from viewer.selected import Selection
+from viewer.selected import BEYOND_S, Selection
 from viewer.timeline.deck import Timeline
 from viewer.timeline.tapes import Tapes
 from viewer.vehicle import Vehicle
 
-NEAR_M = 800.0  # items of the route within this are shown with an aircraft one turns to [m]
+SINCE_S = 40.0  # so much of the flown path is shown with an aircraft one turns to [s]
 WHOLE_S = 3.0  # what could not be drawn counts as mended after so long without a defect [s]
 ROOM = 1.35  # how much more than what was flown is framed, while it grows [-]
 
@@ -128,10 +128,11 @@ class View:
         vehicle, place = self.timeline.one(uav), self._feed.place
         if vehicle is None or place is None or (at := vehicle.where(time.monotonic())) is None:
             return
-        told = [vehicle.forecast.path] if vehicle.forecast is not None else []
-        around = route(vehicle.mission, place, self.scene.ground.height).points[1:]
-        close = around[np.linalg.norm(around - at, axis=1) < NEAR_M / UNIT_M]
-        self.camera.fly_to(np.vstack([at, *told, close]))
+        told, flown = vehicle.forecast, self._feed.track(vehicle)
+        until = max(told.until, BEYOND_S) if told is not None else 0.0
+        ahead = [told.at(np.linspace(0, until, 40))] if told is not None else []
+        around = np.vstack([at, *ahead, flown[flown[:, 0] > vehicle.clock(time.monotonic()) - SINCE_S, 1:]])
+        self.camera.fly_to(np.vstack([around, around * [1, 1, 0] + [0, 0, self.scene.ground.height]]))
 
     def move(self, flock: Flock, now: float, tick: int) -> None:
         """Draw what moves: aircraft at the full rate, heads of trails, stems and the selected UAV more slowly."""

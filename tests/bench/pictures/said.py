@@ -1,0 +1,121 @@
+"""What is said of a flight: flown into a recording, judged by twins that need not hurry, and said again on a bus."""
+
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from contextlib import nullcontext
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from fleet.bus import connect, open_router
+from fleet.codec import Stamp
+from fleet.contract import Found, Mismatch, Prediction, Sample
+from fleet.telemetry.recordings import Recording
+from tests.bench.mismatch.flown import Inline
+from tests.bench.mismatch.world import baseline
+from tests.bench.viewing.process import free_port
+from twin_worker.conflict.traffic import Traffic
+from twin_worker.mismatch.live import ALL, Live
+from twin_worker.twin import Twin, advance
+
+ROOT = Path(__file__).resolve().parents[3]
+STAMP = Stamp(1, 0xABCD)
+HASTE, SLOW = 40.0, 0.12  # times as fast as it was: until the moment, and from then on, for a browser takes its time
+SETTLED_S = 120.0  # so late a moment may be, at the earliest [s]
+NEAR_S, FAR_S, STEADY = 40.0, 90.0, 8  # a horizon for a picture, and for so many predictions in a row [s]
+
+Said = list[tuple[float, Any, Stamp | None]]
+"""When [s since 1970], what, and by whose claim."""
+
+
+def flown(name: str, *options: str) -> Path:
+    """Fly simulated aircraft into a recording, kept for the next time."""
+    path = Path(tempfile.gettempdir()) / f"parauav-pictures-{name}.tlog"
+    if not path.is_file():
+        command = [sys.executable, "-m", "fleet.cli", "fly", *options, "--seed", "1", "--tlog", str(path)]
+        subprocess.run(command, cwd=ROOT, check=True)
+    return path
+
+
+def judged(path: Path, diagnosed: int | None = None) -> Said:
+    """Let twins judge a recording; of one UAV also what its simulation lacks. Everything said, in the order of time."""
+    said: Said = []
+    twins: dict[int, Twin] = {}
+    traffic, hand = Traffic(), Inline()
+    with tempfile.TemporaryDirectory() as folder:
+        live = Live(hand, {ALL: baseline(1, Path(folder))}) if diagnosed is not None else None
+    for now, news in Recording(str(path), 0).steps():
+        for message in news:
+            said.append((now, message, None))
+            twin = twins.setdefault(message.uav, Twin(message.uav))
+            said += [(now, told, STAMP) for told in traffic.after(twin.uav, twin.turned_t, advance(twin, (message,)))]
+            if live is not None and isinstance(message, Sample) and message.uav == diagnosed:
+                hand.now = message.t
+                said += [(now, told, STAMP) for told in live.turn([(twin, nullcontext())])]
+    return said
+
+
+def moment(said: Said, since: float = SETTLED_S, uav: int | None = None) -> tuple[int, float]:
+    """Choose whom to show and when [s since 1970]: the last whose horizon is neither near nor open for a while.
+
+    Args:
+        said: all that was said
+        since: of its time, from when on [s]
+        uav: of whom alone; None: of anybody
+    """
+    best = (0 if uav is None else uav, said[-1][0])
+    runs: dict[int, list[float]] = defaultdict(list)
+    for t, message, _ in said:
+        if isinstance(message, Prediction) and t > said[0][0] + since and uav in (None, message.uav):
+            run = runs[message.uav]
+            if message.horizon_open or not NEAR_S <= message.horizon_s <= FAR_S:
+                run.clear()
+                continue
+            run.append(t)
+            best = (message.uav, run[0]) if len(run) == STEADY else best
+    return best
+
+
+def named_s(said: Said) -> float:
+    """Tell how long after the first word a mismatch was first named and predicted with [s]."""
+    found = (m for _, m, _ in said if isinstance(m, Mismatch) and m.outcome is Found.NAMED and m.adapted)
+    return float(next(found).t) - said[0][0]
+
+
+class Speaker:
+    """Says it on a router of its own: in haste until a moment [s since 1970], then slowly, so that it can be seen."""
+
+    def __init__(self, said: Said, moment: float) -> None:
+        self._said, self._moment, self.router = said, moment, f"tcp/127.0.0.1:{free_port()}"
+        self.there, self._stop = threading.Event(), threading.Event()  # the moment has come; enough is said
+        self._session = open_router(self.router)
+        self._thread = threading.Thread(target=self._speak)
+
+    def __enter__(self) -> "Speaker":
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._session.close()
+
+    def begin(self) -> None:
+        """Begin to speak: whoever is to hear all of it listens."""
+        self._thread.start()
+
+    def _speak(self) -> None:
+        with connect(self.router) as bus:
+            due, before = time.monotonic(), self._said[0][0]
+            for t, message, stamp in self._said:
+                due += (t - before) / (SLOW if t > self._moment else HASTE)
+                before = t
+                if self._stop.wait(max(due - time.monotonic(), 0.0)):
+                    return
+                bus.publish(message, stamp)
+                if t >= self._moment:
+                    self.there.set()
