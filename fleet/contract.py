@@ -660,14 +660,14 @@ class Claim(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Handover(msgspec.Struct, frozen=True, kw_only=True):
-    """One aircraft's twin on its way to another worker, which writes for it from now on."""
+    """A copy of one aircraft's twin for its new owner; who gave it goes on writing until the new one does."""
 
     topic: ClassVar[str] = "@handover"
     version: ClassVar[int] = 1
 
-    t: Annotated[float, Meta(description="when it was handed over, by the worker's clock [s since 1970]")]
+    t: Annotated[float, Meta(description="when it was copied, by the worker's clock [s since 1970]")]
     uav: Annotated[int, Meta(description="UAV id")]
-    epoch: Annotated[int, Meta(description="under which it was written for; the new owner's is higher")]
+    epoch: Annotated[int, Meta(description="under which it is written for; the new owner's is higher")]
     code: Annotated[str, Meta(description="hash of the sources that wrote `load`; others must not read it")]
     load: Annotated[bytes, Meta(description="twin, messages not yet taken in, open conflicts, mismatch")] = b""
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fleet.contract import Message, Model, Prediction, Sample
 from twin_worker.claims.carry import CARRIED, Load, packed, unpacked
-from twin_worker.claims.revive import revive
+from twin_worker.claims.revive import go_on, revive
 from twin_worker.claims.tree import pack, unpack
 from twin_worker.memory import Twin, hear
 from twin_worker.twin import advance
@@ -130,6 +130,16 @@ def test_a_published_model_flies_at_once_and_about_as_well(twin: Twin, cold: Twi
     before = twin.prediction
     assert made.method in f.ROUTE, made.sentence
     assert made.t - before.t < 3.0 and made.path.shape[1] == 3
+
+
+def test_the_last_prediction_of_another_is_said_to_be_that_and_trusted_less(twin: Twin) -> None:
+    fresh, last = Twin(1), twin.prediction
+    assert go_on(fresh, last) and fresh.base is not None and fresh.base.sentence.endswith("another worker, renewed")
+    before, after = last.tube.numpy(), fresh.base.tube.numpy()
+    assert (after >= before).all() and (after[0] > before[0]).any()
+    assert fresh.base.horizon_s == max(last.horizon_s - fresh.pace.predict, 0.0)
+    assert (fresh.base.path.numpy() == last.path.numpy()).all()
+    assert not go_on(fresh, msgspec.structs.replace(last, tube=last.ahead))
 
 
 def test_a_model_that_cannot_be_is_not_believed(twin: Twin, cold: Twin) -> None:

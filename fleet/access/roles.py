@@ -41,7 +41,7 @@ SAID: dict[str, Said] = {
     "@fleet/prediction": Said((WORKER,), 32 * MB),  # 4 KB for each of its aircraft
     "@gateway": Said((GATEWAY,), MB),
     "@claim": Said((WORKER,), MB),
-    "@handover": Said((WORKER,), 32 * MB, asked=(WORKER,)),  # to ask for it is to take an aircraft away
+    "@handover": Said((WORKER,), 32 * MB, asked=(WORKER,)),  # all that is known of an aircraft
 }
 MOST = max(said.most for said in SAID.values())
 MESSAGE_MOST = MOST + MB  # what a session puts together from fragments before anything looks at it [bytes]

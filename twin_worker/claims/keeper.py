@@ -141,9 +141,11 @@ class Twins:
     def recall(self, uavs: list[int]) -> None:
         """Begin some without their twins: with the gateway's last minutes, and the model published last.
 
-        All of them go on at once, the past comes one by one, and what follows from it is spread over the usual periods.
+        All of them go on at once. The past comes one by one, first to those whose future is known for the shortest
+        time, and what follows from it is spread over the usual periods.
         """
         begun = [(uav, twin) for uav in uavs if (twin := self._go_on(uav)) is not None]
+        begun.sort(key=lambda one: one[1].prediction.horizon_s if one[1].prediction else 0.0)
         for k, (uav, twin) in enumerate(begun):
             self._recall(uav, twin, k / len(begun))
 
@@ -211,6 +213,8 @@ class Twins:
             held.ready = False
             if held.twin.model is not None:
                 self._models[uav] = held.twin.model
+            if held.twin.prediction is not None:
+                self._predictions[uav] = held.twin.prediction
             self._extras.forget(uav)
 
     def copied(self, uav: int, epoch: int) -> Handover | None:

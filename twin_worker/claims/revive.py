@@ -3,11 +3,12 @@
 import msgspec
 import numpy as np
 
-from fleet.contract import Model, Outcome, Prediction, State
+from fleet.contract import Array, Model, Outcome, Prediction, State
 from fleet.physics.wrench import N_PAR, NAMES
 from twin_worker.airframe_prior import prior
 from twin_worker.coupled import Coupled
 from twin_worker.memory import Believed, Twin
+from twin_worker.renew import LATEST_S
 
 _TRIM = np.array([0.0, 0.0, 0.0, 0.5])  # inputs that nothing is known of
 
@@ -48,15 +49,25 @@ def wait(twin: Twin, share: float, *, fly: bool, learn: bool) -> None:
 def go_on(twin: Twin, made: Prediction) -> bool:
     """Let a fresh twin renew the last prediction another worker published, until it has flown one of its own.
 
-    It keeps the origin of the local frame, too, and flies no other before it has heard what was said before.
+    It keeps the origin of the local frame, too. Its path may have been flown up to one period before: the tube is as
+    wide as it would be so much later, where that is wider.
     """
     try:
-        n = len(made.ahead.numpy())
+        ahead, tube = made.ahead.numpy(), made.tube.numpy()
         shapes = [(each.dtype, each.numpy().shape) for each in (made.ahead, made.path, made.tube)]
     except (ValueError, TypeError):
         return False
+    n = len(ahead) if ahead.ndim else 0
     if n < 2 or shapes != [("<f4", (n,)), *[("<f4", (n, 3))] * 2]:
         return False
+    age = min(twin.pace.predict, LATEST_S)
+    later = np.column_stack([np.interp(ahead + age, ahead, half) for half in tube.T])
+    made = msgspec.structs.replace(
+        made,
+        tube=Array.of(np.maximum(tube, later)),
+        horizon_s=max(made.horizon_s - age, 0.0),
+        sentence=f"{made.sentence}; the last of another worker, renewed",
+    )
     twin.origin, twin.prediction, twin.base, twin.predict_t = made.ned_origin(), made, made, made.t
     return True
 

@@ -79,6 +79,7 @@ def leave(site: Site, worker: Worker) -> dict[str, Any]:
     worker.signal(signal.SIGTERM)
     found = _taken_over(site, uavs, was, begun)
     until(lambda: worker.process.poll() is not None, _PATIENCE_S, "the end of a worker")
+    found["ended_s"] = time.monotonic() - begun
     site.lose(worker)
     return found | _fits(uavs, fits, site.reader.rows())
 

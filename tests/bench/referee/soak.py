@@ -108,11 +108,12 @@ class Soak:
 
 
 def _told(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Give how often, and the longest time without an accepted prediction: in the middle of the faults, and at most."""
-    gaps = [row["longest_gap_s"] for row in rows]
-    taken = [row["taken_s"] for row in rows if row.get("taken_s") is not None]
-    told = {"times": len(rows), "longest_gap_s": [round(float(np.median(gaps)), 2), round(max(gaps), 2)]}
-    return told | ({"taken_s": [round(float(np.median(taken)), 2), round(max(taken), 2)]} if taken else {})
+    """Give how often, and times: in the middle of the faults, and at most."""
+    told: dict[str, Any] = {"times": len(rows)}
+    for name in ("longest_gap_s", "taken_s", "ended_s"):
+        if took := [row[name] for row in rows if row.get(name) is not None]:
+            told[name] = [round(float(np.median(took)), 2), round(max(took), 2)]
+    return told
 
 
 def _bad(found: dict[str, Any]) -> bool:
