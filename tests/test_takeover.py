@@ -182,6 +182,26 @@ def test_a_cold_takeover_has_telemetry_mission_and_model(bus: MemoryBus, heard: 
     assert told and told[0].method in f.ROUTE
 
 
+def test_what_was_foreseen_is_renewed_until_the_turn_to_fly_comes(bus: MemoryBus, heard: tuple, flown: tuple) -> None:
+    """Of many taken over at once each flies ahead in its turn; that it hears of mission and parameters is no news."""
+    Publisher(bus).publish(heard)
+    worker = Worker(bus, range(1, 5), omega=0.0, pace=Pace(predict=5.0, renew=0.1))
+    for kind in (Model, Prediction):
+        worker._twins.overhear([m for m in flown[1] if isinstance(m, kind)][-1], Stamp(7, int(OTHER, 16)))
+    worker._twins.adopt(1, 9, None)
+    twin = worker._twins._go_on(1)
+    assert twin is not None and worker._twins.bare == (1,)
+    worker._twins._recall(1, twin, 0.8)
+    assert twin.mission is not None and worker._twins.bare == ()
+    told: list[Prediction] = []
+    bus.subscribe(Prediction, lambda made, _: told.append(made))
+    worker.claiming.claims.unsure = False
+    for message in f.shifted([m for m in heard if isinstance(m, Sample) and m.position][-12:], 1.2, 1e9):
+        worker._hear(message)
+        worker.turn()
+    assert len(told) > 2 and all(made.sentence.endswith("another worker, renewed") for made in told)
+
+
 def test_many_messages_are_one_and_what_does_not_fit_is_left_out(heard: tuple[Message, ...]) -> None:
     samples = tuple(m for m in heard if isinstance(m, Sample))[:200]
     statuses = tuple(m for m in heard if isinstance(m, Status))

@@ -170,8 +170,10 @@ class Twins:
             return
         model = self._models.pop(uav, None)
         with held.lock:
+            base = twin.base
             for message in past:
                 hear(twin, message)
+            twin.base = base  # mission and parameters are news to this twin alone: the path it renews was flown by them
             known = model is not None and revive(twin, model)
             wait(twin, share, fly=held.ready and isfinite(twin.pace.renew), learn=known)
         if self.held.get(uav) is not held:  # it was lost meanwhile
