@@ -660,7 +660,7 @@ class Claim(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Handover(msgspec.Struct, frozen=True, kw_only=True):
-    """A copy of one aircraft's twin for its new owner; who gave it goes on writing until the new one does."""
+    """A copy of one aircraft's twin for its new owner; who holds it writes until that does."""
 
     topic: ClassVar[str] = "@handover"
     version: ClassVar[int] = 1
