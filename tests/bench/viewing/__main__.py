@@ -6,10 +6,10 @@
 
 A router, the feeder, the viewer as an operator starts it, one browser with software rendering and three websocket
 clients, all on this machine: the browser takes the most of it. `server_cpu` is of one core, all threads of the viewer.
-`clients` are bytes received. `pose_to_screen` is from the publishing of a sample to the first frame with its place.
-`plain`: a scene with a node for each aircraft, on the same feed, without a browser in the way.
-`callback_floor`: what a process takes that hears the same and does nothing in a Python callback for each message;
-`collect_floor`: the same where messages are put aside and taken out ten times a second, as the viewer does.
+`clients` are bytes received: of the browser, then of the three. `pose_to_screen` is from the publishing of a sample to
+the first frame with its place. `plain`: a scene with a node for each aircraft, on the same feed, without a browser in
+the way. `callback_floor`: what a process takes of one core that hears the same and does nothing in a Python callback
+for each message; `collect_floor`: the same where messages are put aside and taken out ten times a second.
 """
 
 import argparse
@@ -22,6 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from tests.cable import Cable
 
 from .page import Page
 from .process import cpu_s, free_port, rss_mb, start, tell
@@ -80,8 +82,9 @@ def with_page(args: argparse.Namespace, router: str, feeder: Any) -> dict[str, A
     port = free_port()
     command = "viewer", "--port", str(port), "--router", router
     viewer = start(*command)
+    cable = Cable(port)
     with Page(args.chromium) as page:
-        page.open(port)
+        page.open(cable.port)
         began = float(tell(feeder))
         page.await_node("/fleet/vehicles")
         found: dict[str, Any] = {"first_scene_s": round(time.time() - began, 2)}
@@ -91,7 +94,7 @@ def with_page(args: argparse.Namespace, router: str, feeder: Any) -> dict[str, A
         watchers = [Watcher(port) for _ in range(3)]
         wait(SAMPLES_S)
         page.watch("/fleet/vehicles", began)
-        found |= watched(viewer.pid, watchers, args.seconds)
+        found |= watched(viewer.pid, [cable, *watchers], args.seconds)
         found["page"] = page.seen()
         for watcher in watchers:
             watcher.close()
@@ -108,12 +111,13 @@ def with_page(args: argparse.Namespace, router: str, feeder: Any) -> dict[str, A
         found["restart"] = {"start_s": round(listening - spawned, 2), "usable_s": round(time.time() - listening, 2)}
     viewer.terminate()
     viewer.wait(30)
+    cable.close()
     return found
 
 
-def watched(pid: int, watchers: list[Watcher], seconds: float) -> dict[str, Any]:
-    """Let time pass; give what the server and each client took."""
-    before, memory = [watcher.bytes for watcher in watchers], []
+def watched(pid: int, watchers: list[Any], seconds: float) -> dict[str, Any]:
+    """Let time pass; give what the server and each client took, the browser first where there is one."""
+    before, memory = [watcher.received for watcher in watchers], []
     cpu, begin = cpu_s(pid), time.time()
     while (passed := time.time() - begin) < seconds:
         memory.append((passed / 60, rss_mb(pid)))
@@ -123,8 +127,8 @@ def watched(pid: int, watchers: list[Watcher], seconds: float) -> dict[str, Any]
     return {
         "seconds": round(spent, 1),
         "server_cpu": share(pid, cpu, begin),
-        "clients_kB_s": [round((w.bytes - b) / spent / 1e3, 1) for w, b in zip(watchers, before, strict=True)],
-        "clients_first_s": [round(watcher.first_s, 2) for watcher in watchers],
+        "clients_kB_s": [round((w.received - b) / spent / 1e3, 1) for w, b in zip(watchers, before, strict=True)],
+        "clients_first_s": [round(one.first_s, 2) for one in watchers if isinstance(one, Watcher)],
         "memory_MB": [round(mb, 1) for mb in held[:: max(len(held) // 20, 1)]],
         "memory_MB_min_late": _slope(minutes[-len(held) // 3 :], held[-len(held) // 3 :]),
     }

@@ -57,6 +57,7 @@ def main() -> int:
         tick, due = 0, time.monotonic()
         while True:
             feed.listen()
+            feed.poses(tuple(nodes))  # of a crowd `all` reads a part at a time; here every place is drawn every time
             with server.atomic():
                 for vehicle in feed.all():
                     if vehicle.uav not in nodes:

@@ -27,7 +27,7 @@ class Watcher:
     """One client; what it received is counted and thrown away."""
 
     def __init__(self, port: int) -> None:
-        self.bytes = self.frames = 0
+        self.received = self.frames = 0  # bytes, and messages of the socket
         self.first_s = float("nan")  # until the first frame came [s]
         protocol = f"viser-v{viser.__version__}"
         self._began = time.monotonic()
@@ -44,7 +44,7 @@ class Watcher:
         for frame in self._socket:
             if not self.frames:
                 self.first_s = time.monotonic() - self._began
-            self.bytes += len(frame)
+            self.received += len(frame)
             self.frames += 1
 
     def close(self) -> None:
