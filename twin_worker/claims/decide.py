@@ -42,6 +42,7 @@ class Plan:
 
     take: list[int] = field(default_factory=list)
     ask: dict[str, list[int]] = field(default_factory=dict)
+    sure: bool = field(default=False, compare=False)  # false: nothing may be claimed just now, whatever is missing
 
 
 class Claims:
@@ -127,6 +128,7 @@ class Claims:
         plan = Plan()
         if not self._ready(now):
             return plan
+        plan.sure = True
         plan.take += [uav for uav, epoch in self.held.items() if self._outdone(uav, epoch)]
         missing = self.known - self.held.keys()
         for uav, who in owners(sorted(missing), self._candidates()).items():

@@ -191,7 +191,8 @@ class Claiming:
         with self._lock:
             plan = self.claims.plan(time.monotonic())
         self._take(plan.take)
-        self._take(self._ask(plan.ask))
+        if plan.sure:  # after a moment of doubt, as on a busy machine, it is waited no longer than before
+            self._take(self._ask(plan.ask))
         if self._news_to_tell() or time.monotonic() - self._said >= _ANNOUNCE_S:
             self._announce()
 
