@@ -1,8 +1,6 @@
 """A thread that identifies one aircraft after another, so that the telemetry of the others never waits for it."""
 
-import contextlib
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -15,7 +13,6 @@ from twin_worker.twin import identify, identify_due
 
 _log = logging.getLogger(__name__)
 _IDLE_S = 0.05
-_NICE = 10  # how far it yields to what predicts, in this process and in others
 _LEAST, _GROWS = 0.1, 1.2  # share of its time that it may work: never less, and how it recovers after a pause [-]
 _REST_S = 1.0  # it pauses no longer, however long it worked: at any pace everyone's turn comes [s]
 Publish = Callable[[Message, Held], None]
@@ -45,9 +42,10 @@ class Learner:
         return min(worked * (1.0 / self._share - 1.0), _REST_S) if worked else _IDLE_S
 
     def run(self, stop: threading.Event) -> None:
-        """Identify until told to stop."""
-        with contextlib.suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        """Identify until told to stop, at the priority of those who predict.
+
+        A lower one would turn against them: where all cores are busy it would sleep with what they wait for in hand.
+        """
         worked = 0.0
         while not stop.wait(self.rest(worked)):
             held = self._next()
