@@ -1,5 +1,7 @@
 """Which of several verified models is in force: the one that strays least when it flies the route."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from coupled_flights import aircraft, fly, known
@@ -8,6 +10,7 @@ from flights import T0, linear_flight, truth
 from fleet.contract import Outcome, Verdict
 from fleet.window import STATES
 from twin_worker import choose as choosing
+from twin_worker import learn as learning
 from twin_worker.memory import Believed, Twin
 from twin_worker.unseen import Unseen
 
@@ -94,6 +97,20 @@ def test_models_are_flown_now_and_then_not_every_hop(monkeypatch):
     assert len(twin.pool) == 1
     verified(twin, choosing.FLY_S + 0.1, 5.0, monkeypatch)
     assert len(twin.pool) == 2
+
+
+def test_a_stretch_that_was_searched_from_afresh_is_gone_on_with_for_a_while(monkeypatch):
+    afresh, twin = [], Twin(1)
+
+    def identify(window, wind, airframe, last, near):
+        afresh.extend([round(window.t[-1] - WINDOW.t[-1])] if near is None else [])
+        return known(aircraft(0), window.t[0], window.t[-1])
+
+    monkeypatch.setattr(learning.coupled, "identify", identify)
+    for second in range(20):
+        learning._identify(twin, replace(WINDOW, t=WINDOW.t + second))
+    every = round(learning._AFRESH_S)
+    assert afresh == [0, every, 2 * every, 3 * every, 4 * every + 1]  # the fourth try goes on, the fifth does not
 
 
 def test_without_a_route_there_is_nothing_to_fly():

@@ -30,6 +30,7 @@ _HELD_SHARE = 0.3, 0.5  # of what there is, held out [-]
 _FREE_RUN_S = (2.0, 4.0, 2.0, 8.0)  # free-run length of the n-th try of `--method paper` [s]
 _SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the stretch the n-th try uses [-]
 _RUN_S, _RUN_EVERY_S = 20.0, 5.0  # free runs that show what they are worth: how long, how often [s]
+_AFRESH_S = 4.0  # between searches that begin afresh [s]
 _TELL_S = 5.0  # between models that say nothing new [s]
 
 
@@ -108,11 +109,15 @@ def _why_not(twin: Twin, window: Window | None) -> Verdict | None:
 
 def _identify(twin: Twin, known: Window) -> Plant:
     """Identify the aircraft; every further try begins elsewhere, or on another share of the window."""
-    attempt = twin.tries % len(_SHARE)
-    twin.tries += 1
+    attempt, now = twin.tries % len(_SHARE), float(known.t[-1])
+    if twin.method != PAPER and twin.afresh_t <= now < twin.afresh_t + _AFRESH_S:
+        attempt = 0  # a stretch that has hardly changed says from afresh what it said just now
+    else:
+        twin.tries += 1
     known = known.part(int(len(known) * (1 - _SHARE[attempt])), len(known))
     if twin.method != PAPER:
         near = twin.near if attempt == 0 and twin.near and twin.near.t1 > known.t[0] else None
+        twin.afresh_t = now if near is None else twin.afresh_t
         twin.near = coupled.identify(known, twin.wind.wind, twin.airframe, twin.last, near)
         return twin.near
     before = twin.plant if isinstance(twin.plant, tuple) else (None, None)

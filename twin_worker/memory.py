@@ -127,6 +127,7 @@ class Twin:
     turned_t: float = -np.inf  # data time of the last turn of the loop
     wind_t: float = -np.inf
     identify_t: float = -np.inf
+    afresh_t: float = -np.inf  # last identified without a model to begin at
     predict_t: float = -np.inf
     renew_t: float = -np.inf
     score_t: float = -np.inf
