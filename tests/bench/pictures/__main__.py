@@ -5,8 +5,8 @@
 
 Eight aircraft fly a recording, which twins judge that need not hurry; all of it is then said on the bus again, in haste
 until the moment of the picture and slowly from then on: a browser without a graphics card takes its time. So is the
-flight whose airspeed sensor fails. The flight played again is a real one, under `fleet up --replay`. The crowd is a
-synthetic fleet that speaks on the bus.
+flight whose airspeed sensor fails. The flight played again is a real one. The crowd is a synthetic fleet that speaks on
+the bus.
 """
 
 import argparse
@@ -23,8 +23,8 @@ from fleet.contract import Alert, AlertKind, Cause, Found, Mismatch
 from tests.bench.viewing.page import ARGS
 from tests.bench.viewing.process import free_port, start, tell
 
-from .page import command, page, running, shoot, turn_to, viewer
-from .said import ROOT, Said, Speaker, flown, judged, moment, named_s
+from .page import command, page, shoot, turn_to, viewer
+from .said import ROOT, Said, Speaker, flown, judged, moment, named_s, played
 
 OUT = ROOT / "viewer"
 REAL = "real/alfa_20180718_155331_1_engine_failure.tlog"
@@ -92,18 +92,16 @@ def many(browser: Any, out: Path) -> None:
 
 
 def replay(browser: Any, out: Path) -> None:
-    """Show a real flight played again: what was predicted then against what happened."""
-    router = f"tcp/127.0.0.1:{free_port()}"
+    """Show a real flight played again, at a time before its end: what was claimed then, and what happened."""
     flight = Path(os.environ["PARAUAV_RECORDINGS"]) / REAL
-    options = ("--replay", str(flight), "--speed", "4", "--router", router, "--no-viewer")
-    with ExitStack() as held:
-        held.enter_context(running("fleet.cli", "up", *options))
-        one = held.enter_context(page(browser, held.enter_context(viewer(router))))
+    said = played(judged(flight), flight.name)
+    with Speaker(said, said[-1][0]) as speaker, viewer(speaker.router) as address, page(browser, address) as one:
+        speaker.begin()
         one.get_by_text("recording ended").first.wait_for(timeout=240_000)
         bar = one.locator(".strip").bounding_box()
         one.mouse.click(bar["x"] + SHARE * bar["width"], bar["y"] + 0.5 * bar["height"])
-        one.get_by_text("Not live").wait_for(timeout=20_000)
-        turn_to(one, 1)
+        one.get_by_text("Not live").wait_for(timeout=60_000)
+        turn_to(one, said[0][1].uav)
         shoot(one, out / "replay.png")
 
 

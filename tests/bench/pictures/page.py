@@ -20,7 +20,7 @@ from .said import ROOT
 SIZE = {"width": 1600, "height": 900}
 MOST_BYTES = 300_000
 TRIES = 4  # a page that is still being built hears no key
-VIVID = 60  # so far lie the parts of a vivid colour apart [of 255]
+VIVID = 36  # so far lie the parts of a vivid colour apart [of 255]
 FRAMES = 30  # drawn before the picture: it stands still
 
 
@@ -93,7 +93,7 @@ def packed_png(image: Image.Image) -> bytes:
     pixels = np.asarray(image).reshape(1, -1, 3)
     vivid = np.ptp(pixels.astype(int), axis=2) > VIVID
     colours: list[int] = []
-    for which, n in ((vivid, 128), (~vivid, 128)):
+    for which, n in ((vivid, 152), (~vivid, 104)):
         part = Image.fromarray(pixels[which][None]).quantize(n, method=Image.Quantize.MEDIANCUT)
         colours += (part.getpalette() or [])[: 3 * n]
     palette, packed = Image.new("P", (1, 1)), io.BytesIO()

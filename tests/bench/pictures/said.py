@@ -13,7 +13,7 @@ from typing import Any
 
 from fleet.bus import connect, open_router
 from fleet.codec import Stamp
-from fleet.contract import Found, Mismatch, Prediction, Sample
+from fleet.contract import Account, Found, Mismatch, Prediction, Sample, Status
 from fleet.telemetry.recordings import Recording
 from tests.bench.mismatch.flown import Inline
 from tests.bench.mismatch.world import baseline
@@ -57,6 +57,16 @@ def judged(path: Path, diagnosed: int | None = None) -> Said:
                 hand.now = message.t
                 said += [(now, told, STAMP) for told in live.turn([(twin, nullcontext())])]
     return said
+
+
+def played(said: Said, name: str) -> Said:
+    """Have a gateway say beside it that it plays a recording."""
+    found: Said = []
+    for t, message, stamp in said:
+        found.append((t, message, stamp))
+        if isinstance(message, Status):
+            found.append((t, Account(t=t, links=(f"replay:{name}",), uavs=(message.uav,)), None))
+    return found
 
 
 def moment(said: Said, since: float = SETTLED_S, uav: int | None = None) -> tuple[int, float]:
