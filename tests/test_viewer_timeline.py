@@ -337,6 +337,7 @@ def test_what_is_not_answered_yet_is_said_so(flown) -> None:
     assert compare.misses(past.forecast, past.tape.path(past.then, past.then + 60), past.then) == []
     assert "not answered yet" in strip.compared([], past.forecast.t, past.then, DARK)
     assert "nothing was predicted" in strip.compared([], None, past.then, DARK)
+    assert "nothing was claimed 5 s ahead" in strip.compared([], past.forecast.t, past.then, DARK, 4.9)
 
 
 # --- the bar ---

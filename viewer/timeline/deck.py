@@ -165,7 +165,8 @@ class Timeline:
         words = ""
         if past is not None:
             told = past.forecast
-            words = strip.compared(misses, told.t if told is not None else None, past.then, self._palette)
+            reach = told.t + told.until - past.then if told is not None else 0.0
+            words = strip.compared(misses, told.t if told is not None else None, past.then, self._palette, reach)
         self._panel.draw(bar, self._head(t, span), words, self._banner(t, span))
 
     def _head(self, t: float | None, span: Span) -> str:

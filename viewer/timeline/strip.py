@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable
 from html import escape
+from math import inf
 
 from viewer.datatime import moment
 from viewer.events import Event, Kind
 from viewer.palette import MARK, Palette
-from viewer.timeline.compare import Miss
+from viewer.timeline.compare import STEPS_S, Miss
 from viewer.timeline.player import Span
 
 WIDTH = 1000  # of the drawing; the page stretches it
@@ -65,10 +66,12 @@ def touched(send: str) -> str:
     return f'onpointerdown="{code}" onpointermove="if(event.buttons&1){{{code}}}"'
 
 
-def compared(misses: list[Miss], told_t: float | None, then: float, palette: Palette) -> str:
-    """Say what was predicted then against what happened, look-ahead by look-ahead."""
+def compared(misses: list[Miss], told_t: float | None, then: float, palette: Palette, claimed_s: float = inf) -> str:
+    """Say what was predicted then against what happened, look-ahead by look-ahead; so far ahead it was claimed [s]."""
     if told_t is None:
         return "nothing was predicted at this time"
+    if claimed_s < STEPS_S[0]:
+        return f"nothing was claimed {STEPS_S[0]:.0f} s ahead at this time"
     if not misses:
         return "what was predicted here is not answered yet"
     parts = "".join(

@@ -88,7 +88,7 @@ def many(browser: Any, out: Path) -> None:
         one.get_by_text("200 UAVs").first.wait_for(timeout=60_000)
         one.locator("tr.pick").first.dispatch_event("pointerdown")
         command(one, "Show the whole fleet")
-        shoot(one, out / "crowd.png", 60)
+        shoot(one, out / "crowd.png")
 
 
 def replay(browser: Any, out: Path) -> None:

@@ -21,7 +21,7 @@ SIZE = {"width": 1600, "height": 900}
 MOST_BYTES = 300_000
 TRIES = 4  # a page that is still being built hears no key
 VIVID = 36  # so far lie the parts of a vivid colour apart [of 255]
-FRAMES = 30  # drawn before the picture: it stands still
+FRAMES = 20  # drawn before the picture: it stands still
 
 
 @contextlib.contextmanager
