@@ -1,6 +1,6 @@
 """Pictures of the page for the README, of aircraft that fly, twins that judge, and a browser that draws.
 
-    PARAUAV_RECORDINGS=recordings python -m tests.bench.pictures             all five, six minutes on two cores
+    PARAUAV_RECORDINGS=recordings python -m tests.bench.pictures             all five
     python -m tests.bench.pictures --only selected mismatch --out pictures   some of them
 
 Eight aircraft fly a recording, which twins judge that need not hurry; all of it is then said on the bus again, in haste
