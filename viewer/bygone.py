@@ -41,8 +41,13 @@ class Bygone:
         for sample in sorted(said.samples[-MOST:], key=lambda one: one.t):
             with contextlib.suppress(ValueError, IndexError, TypeError, OverflowError):  # a strange one is left out
                 early.hear_sample(sample, place, time.monotonic())
-        if self._feed.lay_before(early, place):
-            self._laid.add(said.uav)
+        found = self._feed.one(said.uav)
+        if found is None or place is not self._feed.place:
+            return
+        with self._feed.lock:  # a copy shares its histories with the one it is of
+            found.track.lay_before(early.track.rows())
+            found.trail.lay_before(early.trail.rows())
+        self._laid.add(said.uav)
 
     def news(self) -> frozenset[int]:
         """Take those whose past came since this was last asked."""

@@ -229,16 +229,6 @@ class Feed:
         with self.lock:
             return vehicle.track.rows()
 
-    def lay_before(self, early: Vehicle, place: Place) -> bool:
-        """Lay a path flown earlier, in the frame of a place, before what was heard of that UAV; tell whether it is."""
-        with self.lock:
-            found = self._vehicles.get(early.uav)
-            if found is None or place is not self._place:
-                return False
-            found.track.lay_before(early.track.rows())
-            found.trail.lay_before(early.trail.rows())
-            return True
-
     def past(self, vehicle: Vehicle) -> list[Kept]:
         """Copy what is kept of the forecasts of the last half minute, oldest first."""
         with self.lock:
