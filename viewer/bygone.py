@@ -6,6 +6,7 @@ import time
 from fleet.contract import History
 from fleet.talk import Bus
 from viewer.feed import Feed
+from viewer.inbox import Head
 from viewer.vehicle import Vehicle
 
 FEW = 60  # UAVs up to which everybody's past is asked for; of more that of those somebody looks at
@@ -40,7 +41,8 @@ class Bygone:
             return
         for sample in sorted(said.samples[-MOST:], key=lambda one: one.t):
             with contextlib.suppress(ValueError, IndexError, TypeError, OverflowError):  # a strange one is left out
-                early.hear_sample(sample, place, time.monotonic())
+                head = Head(sample.uav, sample.t, sample.attitude, sample.position, sample.air)
+                early.hear_sample(head, place, time.monotonic())
         found = self._feed.one(said.uav)
         if found is None or place is not self._feed.place:
             return
