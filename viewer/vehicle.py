@@ -19,7 +19,6 @@ from fleet.contract import (
     Model,
     Prediction,
     Rows,
-    Sample,
     State,
     Status,
 )
@@ -164,7 +163,7 @@ class Vehicle:
             return self.forecast.at(self.clock(now) - self.forecast.t)
         return self.at
 
-    def hear_sample(self, sample: Head | Sample, place: Place, now: float) -> None:
+    def hear_sample(self, sample: Head, place: Place, now: float) -> None:
         """Take over the newest rows of a sample."""
         if not isfinite(sample.t):
             raise ValueError(

@@ -25,8 +25,8 @@ from viewer.timeline.deck import Timeline
 from viewer.timeline.tapes import Tapes
 from viewer.vehicle import Vehicle
 
-SINCE_S = 40.0  # so much of the flown path is shown with an aircraft one turns to [s]
 WHOLE_S = 3.0  # what could not be drawn counts as mended after so long without a defect [s]
+SINCE_S = 40.0  # so much of the flown path is shown with an aircraft one turns to [s]
 ROOM = 1.35  # how much more than what was flown is framed, while it grows [-]
 
 
