@@ -192,11 +192,14 @@ class ZenohBus(AbstractContextManager):
         def on_token(sample: zenoh.Sample) -> None:
             told(str(sample.key_expr).removeprefix(_LIVE), sample.kind == zenoh.SampleKind.PUT)
 
-        live = self._session.liveliness()
-        self._declared.append(live.declare_subscriber(_LIVE + "**", on_token))
-        for reply in live.get(_LIVE + "**", zenoh.handlers.FifoChannel(_TOKENS), timeout=1.0):
+        self._declared.append(self._session.liveliness().declare_subscriber(_LIVE + "**", on_token))
+        self.recount(told)
+
+    def recount(self, told: Token) -> None:
+        """Call `told(name, True)` for every process that is present now."""
+        for reply in self._session.liveliness().get(_LIVE + "**", zenoh.handlers.FifoChannel(_TOKENS), timeout=1.0):
             if reply.ok is not None:
-                on_token(reply.ok)
+                told(str(reply.ok.key_expr).removeprefix(_LIVE), True)
 
     def close(self) -> None:
         """Close the session."""

@@ -108,6 +108,10 @@ class MemoryBus(AbstractContextManager):
     def attend(self, told: Token) -> None:
         """Call `told(name, lives)` for every process that is present or comes."""
         self._attends.append(told)
+        self.recount(told)
+
+    def recount(self, told: Token) -> None:
+        """Call `told(name, True)` for every process that is present now."""
         for name in self._present:
             told(name, True)
 

@@ -114,6 +114,9 @@ class Bus(AbstractContextManager, Protocol):
     def attend(self, told: Token) -> None:
         """Call `told(name, lives)` for every process that is present, comes or goes; those there now at once."""
 
+    def recount(self, told: Token) -> None:
+        """Call `told(name, True)` for every process that is present now."""
+
     def close(self) -> None:
         """Leave the bus."""
 

@@ -236,6 +236,12 @@ class Twins:
         return Handover(t=time.time(), uav=uav, epoch=epoch, code=fleet.SOURCES, load=load)
 
     @property
+    def kept(self) -> dict[int, bool]:
+        """Tell of each that is held or expected whether its twin is here."""
+        with self.lock:
+            return {uav: held.ready for uav, held in self.held.items()}
+
+    @property
     def quiet(self) -> frozenset[int]:
         """Name those whose holder of before is still the one that writes."""
         since = time.monotonic() - _QUIET_S

@@ -8,6 +8,7 @@ in time is taken without
 announce   what we write for, every 0.5 s and at once when that changed; what came as a copy only once we do write
 asked      for copies: send them, and go on
 heard      a higher claim on what we hold: drop it, without a word
+mend       who announces and is not known to live is looked for; what is claimed and came to nothing is begun anew
 """
 
 import logging
@@ -33,6 +34,7 @@ _ANNOUNCE_S = 0.5
 _ASK_S = 0.5  # for everyone to say what they hold; a frozen worker never does [s]
 _HAND_S = 3.0  # for a copy of one that is held elsewhere; its holder writes meanwhile [s]
 _LEAVE_S = 5.0  # for the others to take everything over at the end [s]
+_MEND_S = 1.0  # between looks for what was left half done [s]
 _MOST_EPOCH = 1 << 62  # beyond is no epoch
 
 
@@ -56,6 +58,10 @@ class Keeper(Protocol):
 
     def copied(self, uav: int, epoch: int) -> Handover | None:
         """Copy one's twin; None where there is none just now."""
+
+    @property
+    def kept(self) -> dict[int, bool]:
+        """Tell of each that is held or expected whether its twin is here."""
 
     @property
     def quiet(self) -> frozenset[int]:
@@ -86,6 +92,9 @@ class Claiming:
         self._told: tuple[object, ...] = ()  # what was announced last
         self._asked_for: dict[int, float] = {}  # since when copies are asked for, by UAV id [s, monotonic]
         self._asking: dict[str, threading.Thread] = {}  # by worker
+        self._recalling: list[threading.Thread] = []
+        self._stranger = False  # somebody unknown announces: the news of a life may come before that of its last end
+        self._mended = float("-inf")
 
     # --- from any thread ---------------------------------------------------------------------------------------------
 
@@ -149,6 +158,7 @@ class Claiming:
         if claim.worker == self.me:
             return
         with self._lock:
+            self._stranger |= claim.worker not in self.claims.peers and not claim.leaving
             held = {uav: epoch for uav, epoch in claim.held if 0 <= epoch < _MOST_EPOCH}
             lost = self.claims.heard(claim.worker, held, claim.leaving)
             for uav, epoch, worker in claim.seen:
@@ -193,6 +203,7 @@ class Claiming:
         self._take(plan.take)
         if plan.sure:  # after a moment of doubt, as on a busy machine, it is waited no longer than before
             self._take(self._ask(plan.ask))
+            self._mend()
         if self._news_to_tell() or time.monotonic() - self._said >= _ANNOUNCE_S:
             self._announce()
 
@@ -234,7 +245,6 @@ class Claiming:
     def _ask(self, wanted: dict[str, list[int]]) -> list[int]:
         """Ask each holder for copies, all at the same time; give what has been asked for in vain for too long."""
         now, uavs = time.monotonic(), {uav for mine in wanted.values() for uav in mine}
-        self._keeper.drop(self._asked_for.keys() - uavs - self.claims.held.keys())  # another is their owner by now
         self._asked_for = {uav: self._asked_for.get(uav, now) for uav in uavs}
         for worker, mine in wanted.items():
             if not self.threaded:
@@ -261,10 +271,33 @@ class Claiming:
             with self._lock:
                 epoch = self.claims.take(uav, _wall_ms())
             self._keeper.adopt(uav, epoch, None)
+        self._recall(uavs)
+
+    def _recall(self, uavs: list[int]) -> None:
         if uavs and self.threaded:
-            self._begin(self._keeper.recall, uavs)
+            self._recalling.append(self._begin(self._keeper.recall, uavs))
         elif uavs:
             self._keeper.recall(uavs)
+
+    def _mend(self) -> None:
+        """Put right what crossing messages, a lost one or a defect left half done; nothing of it is usual."""
+        now = time.monotonic()
+        if now - self._mended < _MEND_S:
+            return
+        self._mended = now
+        if self._stranger:
+            self._stranger = False
+            self._bus.recount(self._token)
+        self._recalling = [hand for hand in self._recalling if hand.is_alive()]
+        busy = bool(self._recalling) or any(hand.is_alive() for hand in self._asking.values())
+        with self._lock:
+            held, kept = dict(self.claims.held), self._keeper.kept
+            self._keeper.drop(kept.keys() - held.keys() - self._asked_for.keys())
+        if lacking := [uav for uav in held if not kept.get(uav)] if not busy else []:
+            _log.warning("%d aircraft are held without their twins; they begin from what was said before", len(lacking))
+            for uav in lacking:
+                self._keeper.adopt(uav, held[uav], None)
+            self._recall(lacking)
 
     def _begin(self, act: Callable[..., None], *given: Any) -> threading.Thread:
         """Do it beside the turns, which go on."""
