@@ -38,6 +38,7 @@ class Bus(AbstractContextManager, Protocol):
     """What every process talks through."""
 
     writer: int  # random id of this process on the bus
+    bad: int  # messages heard that do not fit the contract
 
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
         """Send one message to whoever listens."""

@@ -1,5 +1,6 @@
 """The live driver: messages from the bus to the twins this worker holds, results back, one line per UAV."""
 
+import contextlib
 import copy
 import logging
 import threading
@@ -11,7 +12,7 @@ import msgspec
 from msgspec import Raw
 
 from fleet.airframes import GENERIC, Airframe, load
-from fleet.codec import Stamp, encode
+from fleet.codec import Stamp, decode, encode
 from fleet.contract import (
     Alert,
     FleetState,
@@ -24,7 +25,7 @@ from fleet.contract import (
     Status,
     WhatIf,
 )
-from fleet.talk import Bus
+from fleet.talk import Bus, Letter
 from twin_worker.claims.carry import Load
 from twin_worker.claims.keeper import Held, Twins
 from twin_worker.claims.past import SELDOM
@@ -48,6 +49,7 @@ from twin_worker.whatif.grid import resample, wanted
 _log = logging.getLogger(__name__)
 _SILENT_S = 1.0  # wall time without news after which data time runs on by the wall clock [s]
 _STATE_S = 1.0  # between fleet tables [s]
+_OTHERS_S = 0.4  # between looks at what others predict [s]
 _SWEEP_S = 0.015  # of telemetry is taken in at once [s]
 _LATE_S = 0.2  # between sweeps, from which telemetry counts as late [s]
 _END_S = 1.0  # for a thread to end what it has begun: one that learns yields to all others, and is left behind [s]
@@ -89,7 +91,7 @@ class Worker:
         self.bus.subscribe(Sample, lambda message, _: self._hear(message), self._wants)
         for kind in SELDOM:
             self.bus.subscribe(kind, lambda message, _: self._hear(message), self._may_want)
-        self.bus.subscribe(Prediction, self._overhear)
+        self.bus.collect(Prediction, self._overhear_all)
         self.bus.subscribe(Model, self._overhear, lambda uav: uav in self.uavs and uav not in self._held)
         self.bus.answer(Prediction, self._predictions)
         self.bus.answer(Predictions, lambda *_: [(self._at_once(), None)])
@@ -122,6 +124,20 @@ class Worker:
         self.claiming.overheard(said.uav, stamp)
         if self._twins.overhear(said, stamp) and isinstance(said, Prediction):
             self.traffic.hear(said)
+
+    def _overhear_all(self, letters: list[Letter]) -> None:
+        """Read what others predict: the newest of each aircraft, a few times a second."""
+        for uav, payload, named, stamp in letters:
+            if uav in self._held:
+                self.claiming.overheard(uav, stamp)
+                continue
+            said: Prediction | None = None
+            with contextlib.suppress(ValueError):
+                said = decode(Prediction, payload, named)
+            if said is None or said.uav != uav:  # who may write about one must not write about another
+                self.bus.bad += 1
+            else:
+                self._overhear(said, stamp)
 
     def take(self, uav: int, load: Load) -> None:
         """Keep what came with a twin from another worker."""
@@ -246,13 +262,16 @@ class Worker:
             hand.join(_END_S)
 
     def _turn_while(self, condition: Callable[[], bool]) -> None:
-        due, pause = 0.0, threading.Event()
+        due, listen, pause = 0.0, 0.0, threading.Event()
         while condition():
             self._news.wait(timeout=0.1)
             pause.wait(_SWEEP_S)
             self._news.clear()
             self.claiming.tick()
             self.turn()
+            if time.monotonic() >= listen:
+                listen = time.monotonic() + _OTHERS_S
+                self.bus.hand_out((Prediction,))
             if time.monotonic() >= due:
                 due = time.monotonic() + _STATE_S
                 self.bus.publish(self.state())

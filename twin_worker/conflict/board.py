@@ -11,7 +11,7 @@ from twin_worker.conflict.forecast import LONGEST_S, STEP, Forecast, forecast
 
 _ROWS = int(LONGEST_S / STEP) + 1
 _MOST = 4_096  # aircraft on one board; more are a stranger's
-_NEWS_S = 0.5  # what follows the last that was heard sooner says nothing new: pairs are judged once a second [s]
+_NEWS_S = 2.0  # what follows the last that was heard sooner hardly says anything new: paths are flown minutes ahead [s]
 _FAR = np.array([1e4, 1e4, -1e4])  # corner whose image gives the scale from one NED frame to another [m]
 
 
