@@ -3,7 +3,7 @@
 import numpy as np
 
 from fleet.window import Window
-from twin_worker.engine.pace import Work
+from twin_worker.engine.pace import SOON, Work
 from twin_worker.horizon import AHEAD
 from twin_worker.hybrid import ensemble
 from twin_worker.hybrid.fly import fly_hybrid
@@ -76,7 +76,7 @@ def _lengthened(path: np.ndarray, further: np.ndarray) -> np.ndarray:
 def _spread(twin: Twin, begin: tuple[Situation, Start]) -> None:
     """Fly the ensemble where it is due."""
     t = float(begin[1].good.t[-1])
-    known = twin.spread_t <= t < twin.spread_t + twin.pace.ensemble and twin.instead is None
+    known = twin.spread_t <= t < twin.spread_t + SOON * twin.pace.ensemble and twin.instead is None
     if twin.hybrid is None or known or not twin.may(Work.ENSEMBLE):
         return
     rng = np.random.default_rng((twin.uav, int(t)))

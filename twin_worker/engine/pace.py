@@ -4,7 +4,7 @@ import argparse
 from dataclasses import dataclass, fields
 from enum import StrEnum
 
-SOON = 0.9  # share of a period after which work that follows telemetry is due: rows never come on the beat [-]
+SOON = 0.9  # share of a period after which work that follows telemetry or a flight is due: neither keeps the beat [-]
 
 
 class Work(StrEnum):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from twin_worker.engine.pace import Work
 
-SWEEP_S = 0.05  # of heavy work in one sweep [s]
+SWEEP_S = 0.05  # of heavy work in one sweep, CPU [s]
 LEAST_S = 1e-3  # the same where telemetry is late: as much as one piece of work [s]
 _SHARE = {Work.PREDICT: 1.0, Work.IDENTIFY: 0.7, Work.ENSEMBLE: 0.5}  # of a sweep, up to which each kind may begin [-]
 
@@ -16,7 +16,7 @@ class Quota:
     """What may be begun in one sweep; without a limit everything.
 
     Attributes:
-        limit: of heavy work in one sweep [s]
+        limit: of heavy work in one sweep, CPU [s]
         hurry: an aircraft waits for its first prediction, so that nothing else is begun
         behind: telemetry of this aircraft waits: what would be foreseen now is old already
         aside: kinds that are done by another hand
@@ -40,7 +40,7 @@ class Quota:
     def settle(self) -> None:
         """End the work in hand, if any."""
         if self._since is not None:
-            self._spent += time.perf_counter() - self._since
+            self._spent += time.thread_time() - self._since
             self._since = None
 
     def grants(self, work: Work) -> bool:
@@ -53,5 +53,5 @@ class Quota:
         granted = self._spent < self.limit * _SHARE[work] and not (self.hurry and work is not Work.PREDICT)
         (self.done if granted else self.refused)[work] += 1
         if granted:
-            self._since = time.perf_counter()
+            self._since = time.thread_time()
         return granted
