@@ -19,6 +19,7 @@ from fleet.telemetry.recordings import Recording
 from fleet.telemetry.thinned import Thinned
 
 PATIENCE_S = 60.0
+FILES = 12  # so many that a terminal that is read late on a busy machine is still read before the last
 PEAK = """
 import resource, sys
 from pathlib import Path
@@ -77,23 +78,23 @@ def test_progress_rises_to_the_end(tmp_path, monkeypatch):
 
 def test_ctrl_c_ends_an_inspection_at_once(tmp_path):
     path = tmp_path / "flight.tlog"
-    long_tlog.write(path, 180)
+    long_tlog.write(path, 60)
     primary, secondary = os.openpty()
-    command = [sys.executable, "-m", "fleet.cli", "inspect", str(path)]
+    command = [sys.executable, "-m", "fleet.cli", "inspect", *FILES * [str(path)]]
     with subprocess.Popen(command, cwd=ROOT, env=env(), stdout=secondary, stderr=secondary) as child:
         os.close(secondary)
         shown, told = b"", False
         try:
             while read := _read_terminal(primary):  # to the end: who is not read, cannot write its last words
                 shown += read
-                if not told and re.search(rb"flight\.tlog[^\r\n]*[1-9]\d?%[^\r\n]*reading", shown):
+                if not told and re.search(rb"flight\.tlog[^\r\n]*%[^\r\n]*reading", shown):
                     child.send_signal(signal.SIGINT)
                     told = True
             assert told and child.wait(timeout=PATIENCE_S) == 0
         finally:
             child.kill()
     os.close(primary)
-    assert b"Traceback" not in shown and b"100%" not in shown
+    assert b"Traceback" not in shown and shown.count(b"diagnose") < FILES
 
 
 def _read_terminal(primary: int) -> bytes:
