@@ -37,7 +37,7 @@ def main(router: str, low: int, high: int) -> None:
         for uav in range(low, high):
             twin = Twin(uav)
             twin.prediction = prediction(uav)
-            worker._held[uav] = Held(twin, epoch=int(time.time() * 1e3))
+            worker._held[uav] = Held(twin, worker.claiming.claims.take(uav, int(time.time() * 1e3)))
         worker.claiming.threaded = True
         worker.listen()
         size = len(msgspec.msgpack.encode(worker._held[low].twin.prediction))
