@@ -104,7 +104,7 @@ def _recall() -> None:
 
 
 def _learn() -> None:
-    """Identify, verify, and tell what a model is worth, as a thread does that yields to all others."""
+    """Identify, verify, and tell what a model is worth: whoever first does holds the lock of an aircraft meanwhile."""
     window = _flight(60.0)
     plant, known = identify(window, np.zeros(2), load(GENERIC)), len(window) // 2
     verify(plant, window, known, 0.0, None)

@@ -52,7 +52,7 @@ _STATE_S = 1.0  # between fleet tables [s]
 _OTHERS_S = 0.4  # between looks at what others predict [s]
 _SWEEP_S = 0.015  # of telemetry is taken in at once [s]
 _LATE_S = 0.2  # between sweeps, from which telemetry counts as late [s]
-_END_S = 1.0  # for a thread to end what it has begun: one that learns yields to all others, and is left behind [s]
+_END_S = 1.0  # for a thread to end what it has begun; one that is late is left behind [s]
 _NEW_S = 2.0  # an aircraft that came so lately is predicted before any other work begins [s]
 
 
