@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 
 from fleet.access.roles import SAID
-from fleet.contract import TOPICS
+from fleet.contract import PER_UAV, TOPICS
 
 M = TypeVar("M")
 _STAMP = struct.Struct("<QQ")
@@ -72,6 +72,18 @@ def decode(kind: type[M], payload: bytes, named: str = "") -> M:
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         what = f"{len(payload)} bytes that do not fit ({_short(str(error))})"
         raise ValueError(f"{kind.__name__}: found {what}; resend") from None
+
+
+def decode_from(kind: type[M], uav: int | None, payload: bytes, named: str = "") -> M:
+    """Unpack one message that came under the key of a UAV, as `decode`.
+
+    Raises:
+        ValueError: also where it is of another: who may write about one aircraft must not write about another, or none.
+    """
+    message: Any = decode(kind, payload, named)
+    if kind in PER_UAV and message.uav != uav:
+        raise ValueError(f"{kind.__name__}: found one of uav {message.uav} under the key of {uav}, expected its own")
+    return message  # type: ignore[no-any-return]
 
 
 def _short(text: str) -> str:

@@ -1,6 +1,5 @@
 """The live driver: messages from the bus to the twins this worker holds, results back, one line per UAV."""
 
-import contextlib
 import copy
 import logging
 import threading
@@ -12,7 +11,7 @@ import msgspec
 from msgspec import Raw
 
 from fleet.airframes import GENERIC, Airframe, load
-from fleet.codec import Stamp, decode, encode
+from fleet.codec import Stamp, decode_from, encode
 from fleet.contract import (
     Alert,
     FleetState,
@@ -131,10 +130,9 @@ class Worker:
             if uav in self._held:
                 self.claiming.overheard(uav, stamp)
                 continue
-            said: Prediction | None = None
-            with contextlib.suppress(ValueError):
-                said = decode(Prediction, payload, named)
-            if said is None or said.uav != uav:  # who may write about one must not write about another
+            try:
+                said = decode_from(Prediction, uav, payload, named)
+            except ValueError:
                 self.bus.bad += 1
             else:
                 self._overhear(said, stamp)

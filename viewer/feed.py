@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet.codec import Stamp, decode, encoding
+from fleet.codec import Stamp, decode_from, encoding
 from fleet.contract import (
-    PER_UAV,
     Account,
     Alert,
     AlertKind,
@@ -140,12 +139,9 @@ class Feed:
         if not self.inbox.crowd:
             self._read()
         try:
-            message: Any = decode(kind, letter.payload)
+            message: Any = decode_from(kind, uav, letter.payload)
         except ValueError:
             self._counts["strange"] += 1
-            return
-        if kind in PER_UAV and message.uav != uav:
-            self._counts["strange"] += 1  # whoever may write about one aircraft must not write about another
             return
         self._hear(kind, message, letter.stamp, letter.now)
 
