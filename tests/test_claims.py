@@ -5,7 +5,7 @@ import pytest
 
 from fleet.codec import Stamp
 from fleet.fence import GIVE_UP_S, Fence
-from twin_worker.claims.decide import PAUSE_S, SETTLE_S, Claims, Plan, Rank
+from twin_worker.claims.decide import PAUSE_S, SETTLE_S, SILENT_S, Claims, Plan, Rank
 from twin_worker.claims.owner import owner, owners
 
 IDS = range(100)
@@ -25,6 +25,11 @@ def claims(me: str = "b", *, peers: tuple[str, ...] = (), known: range = range(0
     one.tick(now, True)
     one.synced(WALL)
     return one
+
+
+def owned_by(name: str, others: dict[str, range]) -> list[int]:
+    """Give what another worker owns, of what "b" may hold, too."""
+    return [uav for uav, who in owners(IDS, {"b": IDS, **others}).items() if who == name]
 
 
 # --- owner -----------------------------------------------------------------------------------------------------------
@@ -170,6 +175,30 @@ def test_who_is_leaving_owns_nothing_but_is_still_asked() -> None:
     assert one.plan(0.0) == Plan(ask={"a": list(IDS)})
     one.leaving = True
     assert one.plan(0.0) == Plan()
+
+
+def test_who_says_nothing_while_others_speak_passes_for_dead_until_it_speaks() -> None:
+    one = claims(peers=("a",))
+    one.heard("a", dict.fromkeys(range(4), WALL))
+    one.tick(0.0, True)
+    one.heard("a", {})
+    for now in np.arange(0.1, 2.0, 0.1):
+        one.hears = True
+        one.tick(now, True)
+        assert now > SILENT_S or not one.plan(now).take
+    assert one.plan(1.9) == Plan(take=list(range(4))) and not one.heirs()
+    one.heard("a", {})
+    assert one.lives("a") and not set(one.plan(1.9).take) & set(owned_by("a", one.heirs()))
+
+
+def test_where_nothing_at_all_is_heard_nobody_passes_for_dead() -> None:
+    one = claims(peers=("a",), known=IDS)
+    one.heard("a", dict.fromkeys(IDS, WALL))
+    for turn in range(100):
+        one.tick(0.1 * turn, True)
+    one.hears = True  # as much comes at once as was on the way for long
+    one.tick(10.0, True)
+    assert one.lives("a") and not one.plan(10.0).take
 
 
 def test_its_own_name_and_ids_beyond_its_range_are_nobody_s_news() -> None:

@@ -3,7 +3,8 @@
 A worker knows the others by their liveliness tokens and what they hold by their announcements. An aircraft belongs to
 its `owner`. The owner asks a live holder for a copy of its twin, and takes what nobody live holds. Every taking raises
 the aircraft's epoch; of two writers the higher `Rank` is believed, by readers and by both: who held it before goes on
-writing until it hears of the higher claim, so that nobody waits.
+writing until it hears of the higher claim, so that nobody waits. Who has a token and says nothing passes for dead, too:
+a frozen process keeps its token for longer than a lease.
 
     unsure    after a pause, and with no router in sight: writes nothing and claims nothing until it has asked the
               others what they hold
@@ -19,6 +20,8 @@ from twin_worker.claims.owner import owners
 
 PAUSE_S = 0.8  # a worker that stood still for longer may have been replaced [s]
 SETTLE_S = 1.5  # after the router came back, before anything is claimed [s]
+SILENT_S = 0.9  # without a word of a worker, while others are heard; longer than `PAUSE_S`, so that it knows, too [s]
+_STEP_S = 0.3  # of silence counted between two ticks at most: what was late itself hears no silence [s]
 
 
 class Rank(NamedTuple):
@@ -61,6 +64,9 @@ class Claims:
         self.known: set[int] = set()  # ids of ours that were heard of
         self.leaving = False
         self.unsure = True
+        self.hears = False  # anything was heard since the last tick
+        self._heard = float("-inf")  # tick at which that was so last
+        self._silence: dict[str, float] = {}  # of each peer [s]
         self._settled = float("-inf")
         self._ticked = float("nan")
 
@@ -72,18 +78,21 @@ class Claims:
         if worker != self.me and (old is None or old.incarnation <= incarnation):
             leaving = old is not None and old.incarnation == incarnation and old.leaving
             self.peers[worker] = Peer(ids, incarnation, leaving)
+            self._silence[worker] = 0.0
 
     def vanished(self, worker: str, incarnation: int) -> None:
         """Take the end of a token; one of an earlier life says nothing."""
         old = self.peers.get(worker)
         if old is not None and old.incarnation <= incarnation:
-            del self.peers[worker]
+            del self.peers[worker], self._silence[worker]
 
     def heard(self, worker: str, held: Mapping[int, int], leaving: bool = False) -> list[int]:
         """Take an announcement: epochs by UAV id; give what is lost to a higher claim."""
         peer = self.peers.get(worker)
         if peer is not None:
             self.peers[worker] = peer._replace(leaving=leaving)
+            self._silence[worker] = 0.0
+        self.hears = True
         lost = []
         for uav, epoch in held.items():
             rank = Rank(epoch, worker)
@@ -109,6 +118,13 @@ class Claims:
         if not in_sight:
             self.unsure, self._settled = True, now + SETTLE_S
         self._ticked = now
+        if self.hears:
+            step, self._heard, self.hears = min(now - self._heard, _STEP_S), now, False
+            self._silence = {worker: silence + step for worker, silence in self._silence.items()}
+
+    def lives(self, worker: str) -> bool:
+        """Tell whether another worker has a token and speaks."""
+        return self._silence.get(worker, float("inf")) <= SILENT_S
 
     def may_write(self, now: float) -> bool:
         """Tell whether results may be published now."""
@@ -147,15 +163,19 @@ class Claims:
     def _outdone(self, uav: int, epoch: int) -> bool:
         """Tell whether readers believe one that is no more, which took what is held here before it said so."""
         rank = self.seen[uav]
-        return rank > Rank(epoch, self.me) and rank.worker not in self.peers
+        return rank > Rank(epoch, self.me) and not self.lives(rank.worker)
 
     def _candidates(self) -> dict[str, range]:
-        return {self.me: self.ids} | {name: peer.ids for name, peer in self.peers.items() if not peer.leaving}
+        return {self.me: self.ids} | self.heirs()
+
+    def heirs(self) -> dict[str, range]:
+        """Give what the other workers that live and stay may hold."""
+        return {name: peer.ids for name, peer in self.peers.items() if self.lives(name) and not peer.leaving}
 
     def _holder(self, uav: int) -> str | None:
         """Give the live worker that is known to hold an aircraft; None where it is free."""
         rank = self.seen.get(uav)
-        return rank.worker if rank is not None and rank.worker in self.peers else None
+        return rank.worker if rank is not None and self.lives(rank.worker) else None
 
     def take(self, uav: int, wall_ms: int) -> int:
         """Hold an aircraft from now on; give the epoch, which is above every one seen and not below the clock's."""

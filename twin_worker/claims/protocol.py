@@ -5,7 +5,7 @@ unsure     ask everyone what they hold (`Claim`), then go on
 take       what nobody live holds: the last prediction is renewed at once, telemetry and model are recalled one by one
 ask        the live holder of what should be ours for copies (`Handover`), and take each as it comes; what does not come
 in time is taken without
-announce   what we write for, every 0.5 s and at once when that changed; what came as a copy only once we do write
+announce   what we write for, every 0.25 s and at once when that changed; what came as a copy only once we do write
 asked      for copies: send them, and go on
 heard      a higher claim on what we hold: drop it, without a word
 mend       who announces and is not known to live is looked for; what is claimed and came to nothing is begun anew
@@ -30,7 +30,7 @@ from twin_worker.claims.decide import Claims, Rank
 _log = logging.getLogger(__name__)
 _TURN_S = 0.1  # between turns without news [s]
 _SETTLE_S = 0.03  # tokens come in bursts [s]
-_ANNOUNCE_S = 0.5
+_ANNOUNCE_S = 0.25  # several times in `SILENT_S` [s]
 _ASK_S = 0.5  # for everyone to say what they hold; a frozen worker never does [s]
 _HAND_S = 3.0  # for a copy of one that is held elsewhere; its holder writes meanwhile [s]
 _LEAVE_S = 5.0  # for the others to take everything over at the end [s]
@@ -110,6 +110,7 @@ class Claiming:
     def hear_of(self, uav: int) -> None:
         """Learn that there is an aircraft; where nobody holds it, its owner does before long."""
         claims = self.claims
+        claims.hears = True
         if uav in claims.ids and uav not in claims.known:
             claims.known.add(uav)
             self._news.set()
@@ -219,7 +220,7 @@ class Claiming:
     def _heirs(self) -> bool:
         """Tell whether anyone is there to hand what is still held to."""
         with self._lock:
-            others = [peer.ids for peer in self.claims.peers.values() if not peer.leaving]
+            others = self.claims.heirs().values()
             return any(uav in ids for uav in self.claims.held for ids in others)
 
     def tick(self) -> bool:
