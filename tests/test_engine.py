@@ -144,3 +144,13 @@ def test_predictions_come_ten_times_a_second_where_that_is_asked_for(heard: tupl
     made = [m for message in rest for m in advance(twin, (message,)) if isinstance(m, Prediction)]
     per_s = len(made) / (made[-1].t - made[0].t)
     assert 7.0 < per_s < 11.0
+
+
+@pytest.mark.parametrize("change", [{"coast_s": 2.0}, {"t": f.T0 - 100.0}])
+def test_a_path_that_cannot_be_renewed_is_flown_anew_before_long(heard: tuple, twin: Twin, change: dict) -> None:
+    twin.pace = Pace(predict=60.0, identify=1000.0, renew=0.1)
+    twin.identify_t = twin.data_t
+    twin.base = msgspec.structs.replace(twin.prediction, **change)
+    rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 3.0], 3.0, 1e9)
+    made = [m for message in rest for m in advance(twin, (message,)) if isinstance(m, Prediction)]
+    assert made and made[0].t < heard[-1].t + 1.5 and twin.base.coast_s == 0.0

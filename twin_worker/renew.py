@@ -51,15 +51,19 @@ def renew(twin: Twin) -> list[Message]:
     return [made]
 
 
+def renewable(twin: Twin, t: float) -> bool:
+    """Tell whether there is a path to renew at `t`: flown while telemetry came, and not long before."""
+    base = twin.base
+    return base is not None and not (twin.lost or twin.broken or base.coast_s) and t < base.t + LATEST_S
+
+
 def renewed(twin: Twin, t: float, position: np.ndarray) -> Prediction | None:
     """Give the last path that was flown ahead from a position on, (3,) [1e-7 deg, mm] at `t`; the twin stays as it is.
 
     The departure so far, d, fades:  p(tau) = path(t - t0 + tau) + d exp(-tau / 10 s).
     """
     base = twin.base
-    if base is None or twin.origin is None or twin.lost or twin.broken or base.coast_s:
-        return None
-    if not 0.0 < (passed := t - base.t) < LATEST_S:
+    if base is None or twin.origin is None or not renewable(twin, t) or not (passed := t - base.t) > 0.0:
         return None
     ahead = base.ahead.numpy()
     n = int(ahead.searchsorted(float(ahead[-1]) - passed, side="right"))

@@ -18,7 +18,7 @@ from twin_worker.kinds import command_in_force
 from twin_worker.learn import learn
 from twin_worker.memory import Twin, hear
 from twin_worker.mismatch.marks import EVERY_S, mark
-from twin_worker.renew import renew
+from twin_worker.renew import renew, renewable
 
 LOST_S = 3.0  # without a sample: link lost [s]
 _TICK_S = 1.0  # between turns while data are silent, between scorings, and of tries to foresee [s]
@@ -89,14 +89,21 @@ def _turn(twin: Twin, now: float) -> list[Message]:
         twin.predict_t = twin.renew_t = now
         made = foresee(twin, now)
         new = twin.prediction if made else None
-        if new is None:  # telemetry has a gap just now, or too little of it has come: it is tried again before long
-            twin.predict_t = now - max(pace.predict - _TICK_S, 0.0)
+        if new is None:  # telemetry has a gap just now, or too little of it has come
+            _again(twin, now)
         twin.base = new or twin.base  # which is not renewed for ever
         results += [*made, *watch(twin, now, new)]
     elif _due(now, twin.renew_t, SOON * pace.renew) and twin.may(Work.RENEW):
         twin.renew_t = now
         results += renew(twin)
+        if not twin.lost and not renewable(twin, twin.history.newest):
+            _again(twin, now)
     return results
+
+
+def _again(twin: Twin, now: float) -> None:
+    """Let the next flight ahead be tried before long."""
+    twin.predict_t = min(twin.predict_t, now - max(twin.pace.predict - _TICK_S, 0.0))
 
 
 def identify_due(twin: Twin) -> bool:
