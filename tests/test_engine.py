@@ -15,6 +15,7 @@ from twin_worker.engine.learner import Learner
 from twin_worker.engine.pace import Pace, Work, read_pace
 from twin_worker.engine.quota import Quota
 from twin_worker.engine.rates import OVER_S, Rates
+from twin_worker.predict import LEAST_AHEAD_S
 from twin_worker.renew import LATEST_S, renew
 from twin_worker.twin import Twin, advance
 
@@ -135,6 +136,16 @@ def test_nothing_is_renewed_that_is_old_void_or_lost(twin: Twin) -> None:
     few = {name: Array.of(getattr(short.base, name).numpy()[:2]) for name in ("ahead", "path", "tube")}
     short.base = msgspec.structs.replace(short.base, **few)
     assert renew(short) == []
+
+
+def test_the_shortest_flight_ahead_is_renewed_as_long_as_any(twin: Twin) -> None:
+    n = int(np.searchsorted(twin.prediction.ahead.numpy(), LEAST_AHEAD_S)) + 1
+    few = {name: Array.of(getattr(twin.prediction, name).numpy()[:n]) for name in ("ahead", "path", "tube")}
+    twin.base = msgspec.structs.replace(twin.prediction, **few)
+    for seconds in (0.5, 5.0, LATEST_S - 0.5):
+        on(twin, seconds, np.zeros(3))
+        (made,) = renew(twin)
+        assert made.ahead.numpy()[-1] > LEAST_AHEAD_S - seconds - 5.0
 
 
 def test_predictions_come_ten_times_a_second_where_that_is_asked_for(heard: tuple, twin: Twin) -> None:

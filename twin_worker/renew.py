@@ -9,7 +9,6 @@ from fleet.contract import Array, Message, Prediction
 from fleet.frames import to_ned
 from fleet.physics.kernel import kernel
 from twin_worker.memory import Twin
-from twin_worker.predict import LEAST_AHEAD_S
 
 LATEST_S = 10.0  # after a flight ahead it is renewed no longer [s]
 _BACK_S = 10.0  # in which an aircraft is back on the path that was foreseen [s]
@@ -67,7 +66,7 @@ def renewed(twin: Twin, t: float, position: np.ndarray) -> Prediction | None:
         return None
     ahead = base.ahead.numpy()
     n = int(ahead.searchsorted(float(ahead[-1]) - passed, side="right"))
-    if not n or ahead[n - 1] < LEAST_AHEAD_S:
+    if n < 2:
         return None
     out = np.empty((n, 3), np.float32)
     shifted(ahead, base.path.numpy(), passed, to_ned(twin.origin, *position), out)  # type: ignore[call-arg]
