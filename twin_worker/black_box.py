@@ -20,7 +20,7 @@ _BLOCK = 64  # samples between two products of many rows [-]
 _CAP = 1e4  # a run that leaves this has diverged [scaled units]
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def normal_equations(
     F: np.ndarray, G: np.ndarray, C: np.ndarray, x0: np.ndarray, y: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -72,7 +72,7 @@ def normal_equations(
     return squares, g, H
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def squared_errors(
     F: np.ndarray, G: np.ndarray, C: np.ndarray, x0: np.ndarray, y: np.ndarray, w: np.ndarray
 ) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def free_run(D: np.ndarray, x0: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
     """Run x' = A x + B u + c from x0, D = [A B c] (n, n + m + 1), u (N, m), out (N, n) with out[0] = x0."""
     n, m = out.shape[1], u.shape[1]
@@ -24,7 +24,7 @@ def free_run(D: np.ndarray, x0: np.ndarray, u: np.ndarray, out: np.ndarray) -> N
             out[k + 1, i] = min(max(s, -1e6), 1e6)
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def normal_equations(
     D: np.ndarray, y: np.ndarray, u: np.ndarray, ok: np.ndarray, W: np.ndarray, length: int
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:

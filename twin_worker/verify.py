@@ -28,7 +28,7 @@ def hold(y: np.ndarray, ok: np.ndarray, length: int) -> np.ndarray:
     return np.where(ok[:, None] & ok[starts][:, None], y[starts], np.nan)
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def fit_percent(y: np.ndarray, y_hat: np.ndarray) -> np.ndarray:
     """Give the fit of each column over the rows both have, (n,) [%]; -100 where nothing is left or it diverged."""
     rows, columns = y.shape

@@ -120,7 +120,7 @@ def corner_speed(before: np.ndarray, after: np.ndarray, limit: Limits) -> float:
     return sqrt(limit.acc_corner * limit.radius / max(1.0 / half - 1.0, 1e-6))
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def _fastest(to_go: float, end: float, acc: float, jerk: float) -> float:
     """Give the speed from which the end is reached at its speed: d = v^2 / 2a + v a / 2j [m/s]."""
     way = max(to_go, 0.0) + end * end / (2.0 * acc) + end * acc / (2.0 * jerk)
@@ -128,7 +128,7 @@ def _fastest(to_go: float, end: float, acc: float, jerk: float) -> float:
     return acc * (sqrt(b * b + 2.0 * way / acc) - b)
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def _top(n: float, e: float, limit: float, par: np.ndarray) -> float:
     """Give the ground speed along the horizontal direction (n, e) that the top airspeed leaves [m/s]."""
     level = sqrt(n * n + e * e)
@@ -140,7 +140,7 @@ def _top(n: float, e: float, limit: float, par: np.ndarray) -> float:
     return min(limit, max(left, 0.5) / level)
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def follow(
     ref: np.ndarray, segments: np.ndarray, x: np.ndarray, v: np.ndarray, par: np.ndarray, dt: float, out: np.ndarray
 ) -> None:
@@ -179,7 +179,7 @@ def follow(
             x[i] += dt * v[i]
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def _advance(ref: np.ndarray, segments: np.ndarray, length: float, top: float, jerk: float, dt: float) -> None:
     """Move the reference one step along its segment."""
     row = segments[int(ref[AT])]
@@ -197,7 +197,7 @@ def _advance(ref: np.ndarray, segments: np.ndarray, length: float, top: float, j
         ref[S], ref[S_DOT], ref[S_DDOT] = length, 0.0, 0.0
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def _over(ref: np.ndarray, row: np.ndarray, dt: float) -> bool:
     """Count the wait at the end of a segment; tell whether it is over."""
     if row[END] > 0.0:

@@ -18,7 +18,7 @@ _STEPS = 8
 _PACE = (1e-3, 1e-3, 1e-4)  # of the numerical slope
 
 
-@nb.njit(cache=True, error_model="numpy")
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def follow(command: np.ndarray, y: np.ndarray, lag: np.ndarray, out: np.ndarray) -> None:
     """Run the lag over commands, (n,) [rad], into `out`, (n,); where the command is nan it begins anew from `y`."""
     wn, zeta, bias = lag[0], lag[1], lag[2]
