@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from twin_worker.compiled.straight import straight
 from twin_worker.horizon import path_length
 
 AT = np.arange(0.0, 61.0, 5.0)  # look-ahead at which paths are compared [s]
@@ -45,7 +46,7 @@ class Contest:
             ahead: look-ahead from there, (k,) [s]
             paths: NED, (k, 3) [m] by method
         """
-        rows = {m: np.column_stack([np.interp(AT, ahead, column) for column in path.T]) for m, path in paths.items()}
+        rows = {method: straight(AT, ahead, path) for method, path in paths.items()}
         self.waiting.append((t, speed, rows))
 
     def forget(self) -> None:
@@ -60,7 +61,7 @@ class Contest:
             near = np.abs(t[np.clip(np.searchsorted(t, at), 0, len(t) - 1)] - at)
             if begun < t[0] or near.max() > _HOLE_S:
                 continue
-            truth = np.column_stack([np.interp(at, t, column) for column in flown.T])
+            truth = straight(at, t, flown)
             length = path_length(truth, speed)
             for method, path in paths.items():
                 self._take(method, float(np.mean(np.linalg.norm(path - truth, axis=1)[1:] / length[1:])))

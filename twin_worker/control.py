@@ -6,6 +6,7 @@ learnt from flight, where one was, and else the autopilot's default, which is sa
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -27,6 +28,8 @@ _TEXTBOOK = ("chi_inf", "k_path", "k_orbit", "R_fillet", "R_orbit", "phi_max", "
 TOLD_OF = {"arduplane": _ARDUPLANE, "px4": _PX4, "textbook": _TEXTBOOK}
 """Parameters that shape a path, by law; the others are flown with all the same."""
 TOLD_OF_GUIDANCE = (*_ARDUPLANE[:5], "AIRSPEED_CRUISE", "TECS_CLMB_MAX", "TECS_SINK_MAX")
+_CONTROLS = 1024  # of fixed wings that are kept
+_Given = tuple[tuple[str, float], ...]
 CRUISE_OF = {"arduplane": "AIRSPEED_CRUISE", "px4": "FW_AIRSPD_TRIM", "textbook": "Va_c"}
 CRUISES = (*CRUISE_OF.values(), "WP_SPD", "MPC_XY_CRUISE", "Q_WP_SPD")  # what a wished speed overrides
 
@@ -90,9 +93,16 @@ def on_wings(
         law: name in `laws.LAWS`
         sentence: of the law as in `Prediction`, where it is flown by its guidance alone
     """
-    asked = asked or {}
+    given = (tuple(each.items()) if each else () for each in (received, identified, asked))
+    return _on_wings(*given, law, sentence)
+
+
+@lru_cache(maxsize=_CONTROLS)
+def _on_wings(given: _Given, identified: _Given, wished: _Given, law: str, sentence: str) -> Control:
+    """Give the same; parameters hardly ever change, and to read them takes as long as to fly a minute."""
+    received, asked = dict(given), dict(wished)
     _, missing = laws.read(law, {**received, **asked})
-    learnt = {name: value for name, value in (identified or {}).items() if name in missing}
+    learnt = {name: value for name, value in identified if name in missing}
     values, absent = laws.read(law, {**received, **learnt, **asked})
     known = dict.fromkeys(values, RECEIVED)
     known |= dict.fromkeys(learnt, IDENTIFIED) | dict.fromkeys(set(asked) & set(values), ASKED)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from fleet.window import Window
+from twin_worker.compiled.straight import straight
 from twin_worker.engine.pace import SOON, Work
 from twin_worker.horizon import AHEAD
 from twin_worker.hybrid import ensemble
@@ -93,4 +94,4 @@ def in_force(twin: Twin, method: str, ahead: np.ndarray) -> np.ndarray | None:
     """
     if twin.spread is None or method not in (HYBRID, BOTH, DYNAMICS):
         return None
-    return np.column_stack([np.interp(ahead, AHEAD, column) for column in twin.spread.T])
+    return straight(ahead, AHEAD, twin.spread)

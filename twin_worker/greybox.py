@@ -15,8 +15,10 @@ from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.shadow import shadow
 from fleet.contract import Item
 from fleet.frames import G, Origin
-from fleet.mission import KIND, TAKEOFF, VA_C, Route, route
+from fleet.mission import KIND, TAKEOFF, VA_C, Route
+from twin_worker.compiled.straight import straight
 from twin_worker.control import CRUISE_OF, Control, on_wings
+from twin_worker.predict import unrolled
 from twin_worker.track import STEP, Track
 from twin_worker.whatif.instead import Instead, gone_over
 
@@ -111,7 +113,7 @@ def fly(track: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
 def _fly(seen: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarray) -> Ahead:
     law_now = on_wings(board.params, grey.identified, sentence=law.LAW)
     par = law_now.par(_altitude(seen, board))
-    way = route(board.items, seq=int(seq[0]), origin=board.origin, params=board.params, first=board.first)
+    way = unrolled(board.items, int(seq[0]), board.origin, board.params, board.first)
     if not len(way.legs):
         return Ahead(None, int(seq[-1]), way.said or "the mission has no legs to fly")
     w, V = air_of(seen, board.wind)
@@ -131,7 +133,7 @@ def _fly(seen: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
     if board.instead is not None and board.instead.speed is not None:
         state[3] = board.instead.speed
     law.follow(flown.ctl, flown.par, flown.way.legs, flown.lags, state, w, STEP, out)
-    path = np.column_stack([np.interp(ahead, STEP * np.arange(len(out)), column) for column in out.T])
+    path = straight(ahead, STEP * np.arange(len(out)), out)
     seq_now = int(seq[-1]) if board.instead is None else board.instead.seq
     return Ahead(path, seq_now, flown.way.said, flown.law)
 

@@ -1,5 +1,6 @@
 """A plant: the identified model of one aircraft, coupled or two linear axes, behind one door."""
 
+import numba as nb
 import numpy as np
 
 from fleet.physics.actuators import TAU, lagged
@@ -49,19 +50,25 @@ def settled(plant: Plant, good: Window) -> tuple:
 
 def _level(plant: Coupled, recent: Window) -> np.ndarray:
     """Move the six offsets so that the model's mean acceleration is what was flown."""
-    par, y = plant.par.copy(), recent.x.copy()
+    par, y = plant.par.copy(), np.ascontiguousarray(recent.x)
     par[WIND:] = 0.0
-    delta = lagged(recent.u, recent.dt, TAU)
-    rate, total = np.empty(9), np.zeros(9)
-    rows = range(0, len(y), _EVERY)
-    for k in rows:
-        rates_of_change(y[k], delta[k], par, plant.at, rate)
-        total += rate
+    total = np.zeros(9)
+    rows = _add_rates(y, lagged(np.ascontiguousarray(recent.u), recent.dt, TAU), par, plant.at, total)
     n = min(LINE * 4, len(y) // 2)
     flown = (y[-n:].mean(axis=0) - y[:n].mean(axis=0)) / ((len(y) - n) * recent.dt)
-    miss = flown - total / len(rows)
+    miss = flown - total / rows
     par[list(OFFSETS)] += miss[_DRIVEN]
     return par
+
+
+@nb.njit(cache=True, nogil=True)
+def _add_rates(y: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, total: np.ndarray) -> int:
+    """Add x' of every `_EVERY`th row to `total`, (9,); give how many that are."""
+    rate, rows = np.empty(9), range(0, len(y), _EVERY)
+    for k in rows:
+        rates_of_change(y[k], delta[k], par, at, rate)
+        total += rate
+    return len(rows)
 
 
 def _centred(axis: Axis, recent: Window) -> np.ndarray:

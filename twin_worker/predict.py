@@ -16,6 +16,7 @@ from fleet.frames import Origin, wrap
 from fleet.mission import FIRST, KIND, LAND, P_D, P_N, READ, SPEED, TAKEOFF, Route, route
 from fleet.simulate import N_STATE, simulate
 from fleet.window import Window
+from twin_worker.compiled.straight import straight
 from twin_worker.control import CRUISE_OF, Control, on_wings
 from twin_worker.history import History
 from twin_worker.plant import Plant, acting, settled
@@ -156,6 +157,11 @@ def held(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float) -> np.nda
     return out
 
 
+def _reported(history: History, name: str, at: np.ndarray, longest: float) -> np.ndarray:
+    """Give what was reported last at each time, nan after `longest` seconds, (len(at), k)."""
+    return held(*history.rows(name, at[0] - longest - 1.0), at, longest)
+
+
 def fly_ahead(now: Situation, plant: Plant, ahead: np.ndarray) -> Flown:
     """Predict with the identified model and the controller twin in closed loop.
 
@@ -174,14 +180,13 @@ def heard(now: Situation) -> Heard | Flown:
     if len(good) < 5.0 / good.dt:
         return Flown(None, -1, f"{good.seconds:.0f} s on this route, 5 s are needed; wait")
     at = good.t[(len(good) - 1) % _SHADOW_STEP :: _SHADOW_STEP]
-    seq = held(*now.history.rows("leg"), at, 15.0)[:, 0]
+    seq = _reported(now.history, "leg", at, 15.0)[:, 0]
     if not np.isfinite(seq[-1]):
         return Flown(None, -1, "the mission item in force is not reported (MISSION_CURRENT)")
     seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
     board = now.onboard
     first = FIRST.get(board.autopilot, 1)
-    params = tuple((name, board.params[name]) for name in READ if name in board.params)
-    way = _unrolled(board.items, int(seq[0]), now.origin, params, first)
+    way = unrolled(board.items, int(seq[0]), now.origin, board.params, first)
     said = way.said
     if not len(way.legs):
         return Flown(None, int(seq[-1]), said or "the mission has no legs to fly")
@@ -190,17 +195,21 @@ def heard(now: Situation) -> Heard | Flown:
     return Heard(good, way.legs, start, _telemetry(good, at, now.history), seq, altitude, said)
 
 
+def unrolled(items: tuple[Item, ...], seq: int, origin: Origin, params: Mapping[str, float], first: int) -> Route:
+    """Give the legs from item `seq` on, that nobody changes; as `route`."""
+    return _unrolled(items, seq, origin, tuple((name, params[name]) for name in READ if name in params), first)
+
+
 @lru_cache(maxsize=_ROUTES)
 def _unrolled(
     items: tuple[Item, ...], seq: int, origin: Origin, params: tuple[tuple[str, float], ...], first: int
 ) -> Route:
-    """Give the legs from item `seq` on, that nobody changes; as `route`."""
     return route(items, seq=seq, origin=origin, params=dict(params), first=first)
 
 
 def known_wind(now: Situation, good: Window) -> tuple[float, float]:
     """Give the wind the autopilot believes in: its own where it tells it, else the twin's, NED [m/s]."""
-    reported = held(*now.history.rows("wind"), good.t[-1:], _WIND_S)[0]
+    reported = _reported(now.history, "wind", good.t[-1:], _WIND_S)[0]
     w_n, w_e = reported if np.isfinite(reported).all() else now.wind.wind[:2]
     return float(w_n), float(w_e)
 
@@ -297,7 +306,7 @@ def at_times(p: np.ndarray, step: float, start: Start, ctl: np.ndarray, ahead: n
     if not landed and len(p) <= min(ahead[-1], ahead[0] + LEAST_AHEAD_S) / step:
         return Flown(None, start.seq, f"the twin leaves its envelope {len(p) * step:.0f} s ahead", True)
     t, beyond = step * np.arange(len(p)), None if landed else np.nan
-    path = np.column_stack([np.interp(ahead, t, column, right=beyond) for column in p.T])
+    path = straight(ahead, t, p, beyond)
     return Flown(path, start.seq, start.sentence, law=start.law)
 
 
@@ -325,7 +334,7 @@ def _on_this_route(window: Window, since: float) -> Window:
 def _telemetry(good: Window, at: np.ndarray, history: History) -> tuple[np.ndarray, ...]:
     """Give what the controller twin is synchronised on at times `at`: t p v euler rates Va phi_c theta_c delta."""
     k = np.searchsorted(good.t, at)
-    command, Va = held(*history.rows("command"), at, 1.0), held(*history.rows("air"), at, 1.0)[:, 0]
+    command, Va = _reported(history, "command", at, 1.0), _reported(history, "air", at, 1.0)[:, 0]
     euler, rates = good.x[k, 6:9], good.x[k, 3:6]
     euler[:, 2] = wrap(euler[:, 2])
     rows = (at - at[0], good.p[k], good.v[k], euler, rates, Va, command[:, 0], command[:, 1], good.u[k])
@@ -335,7 +344,7 @@ def _telemetry(good: Window, at: np.ndarray, history: History) -> tuple[np.ndarr
 def _start(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Give state (12,), commands and inputs in force (6,) and air (4,) at the end of the window."""
     state = np.concatenate([good.p[-1], good.x[-3:, :6].mean(axis=0), good.x[-1, 6:]])
-    command = held(*now.history.rows("command"), good.t[-1:], 1.0)[0, :2]
+    command = _reported(now.history, "command", good.t[-1:], 1.0)[0, :2]
     command = np.where(np.isfinite(command), command, good.x[-1, 6:8])
     command = np.concatenate([command, acting(good)])
     return state, command, np.array([*now.wind.wind[:2], now.wind.scale, _gust(now, good)])

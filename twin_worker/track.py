@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.frames import Origin, to_ned, wrap
+from twin_worker.compiled.straight import straight
 from twin_worker.history import History
 from twin_worker.preprocess import fill
 
@@ -79,14 +80,14 @@ def track(history: History, origin: Origin, *, until: float, seconds: float) -> 
 def _laid(t: np.ndarray, x: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lay rows on the grid, straight where there are too few for more."""
     if len(t) < 4:
-        return np.column_stack([np.interp(grid, t, column) for column in x.T]), np.ones(len(grid), bool)
+        return straight(grid, t, x), np.ones(len(grid), bool)
     values, ok, _ = fill(t, x, grid, _LONGEST)
     return values, ok
 
 
 def _slope(t: np.ndarray, p: np.ndarray) -> np.ndarray:
     before, after = np.maximum(t - _SLOPE_S, t[0]), np.minimum(t + _SLOPE_S, t[-1])
-    ends = [np.column_stack([np.interp(at, t, column) for column in p.T]) for at in (before, after)]
+    ends = [straight(at, t, p) for at in (before, after)]
     return (ends[1] - ends[0]) / (after - before)[:, None]
 
 

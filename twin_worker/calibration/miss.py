@@ -3,31 +3,41 @@
 M1 is |p_hat - p| / max(path flown, 2 s of ground speed). Every function takes one prediction or many at once.
 """
 
+from math import sqrt
+
+import numba as nb
 import numpy as np
 
 AHEAD = np.concatenate([np.arange(0.0, 61.0), np.arange(64.0, 181.0, 4.0)])  # look-ahead of every prediction, (91,) [s]
 LIMIT = 0.10  # relative error at which trust ends [-]
 QUANTILE = 0.9  # share of flights that tube and horizon are meant to hold [-]
-_NORTH = np.array([1.0, 0.0])
 _FLOOR_S = 2.0  # least path length, as seconds of ground speed [s]
 
 
 def track_frame(path: np.ndarray, ahead: np.ndarray = AHEAD) -> np.ndarray:
     """Give the horizontal unit vector along paths (..., n, 3) at each point, (..., n, 2); north where one stands."""
-    step = _slope(path[..., :2], ahead[: path.shape[-2]])
-    length = np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2)[..., None]
-    still = length <= 1e-6
-    return np.where(still, _NORTH, step / np.where(still, 1.0, length))
-
-
-def _slope(x: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Give the slope of x (..., n, 2) over uneven times (n,), of second order inside, (..., n, 2)."""
-    rate = np.diff(x, axis=-2) / np.diff(t)[:, None]
-    before = (np.diff(t)[1:] / (t[2:] - t[:-2]))[:, None]  # the nearer side weighs more
-    out = np.empty_like(x)
-    out[..., 1:-1, :] = before * rate[..., :-1, :] + (1.0 - before) * rate[..., 1:, :]
-    out[..., 0, :], out[..., -1, :] = rate[..., 0, :], rate[..., -1, :]
+    out = np.empty((*path.shape[:-1], 2))
+    each = np.ascontiguousarray(path, float).reshape(-1, *path.shape[-2:])
+    _frame_each(each, np.ascontiguousarray(ahead, float), out.reshape(-1, path.shape[-2], 2))
     return out
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath
+def _frame_each(path: np.ndarray, t: np.ndarray, out: np.ndarray) -> None:
+    """Fill in the unit vectors of each path, (m, n, 2): its slope over uneven times, of second order inside."""
+    n = path.shape[1]
+    for i in range(len(path)):
+        for k in range(n):
+            first, last = max(k - 1, 0), min(k, n - 2)
+            east, north = 0.0, 0.0
+            before = (t[k + 1] - t[k]) / (t[k + 1] - t[k - 1]) if 0 < k < n - 1 else 1.0  # the nearer side weighs more
+            for j in range(first, last + 1):
+                share, step = (before if j == first else 1.0 - before), t[j + 1] - t[j]
+                north += share * ((path[i, j + 1, 0] - path[i, j, 0]) / step)
+                east += share * ((path[i, j + 1, 1] - path[i, j, 1]) / step)
+            length = sqrt(north * north + east * east)
+            still = length <= 1e-6  # false for nan
+            out[i, k, 0], out[i, k, 1] = (1.0, 0.0) if still else (north / length, east / length)
 
 
 def along_cross_down(along: np.ndarray, error: np.ndarray) -> np.ndarray:

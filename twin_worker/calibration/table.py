@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import erfinv
 
 from twin_worker.calibration.miss import AHEAD, QUANTILE
+from twin_worker.compiled.straight import straight
 
 KNOTS = np.array([1.0, 2, 3, 5, 8, 12, 18, 27, 40, 60, 80, 120, 180])  # look-aheads that tables are written at [s]
 COLUMN = np.searchsorted(AHEAD, KNOTS)  # of each in AHEAD
@@ -95,7 +96,7 @@ class Doubt:
 
 def at_look_aheads(ahead: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Interpolate what is written by knot and axis, (13, 3), at look-aheads, (n, 3)."""
-    return np.column_stack([np.interp(ahead, KNOTS, column) for column in rows.T])
+    return straight(ahead, KNOTS, rows)
 
 
 def law_of_growth(method: str, ahead: np.ndarray) -> np.ndarray:

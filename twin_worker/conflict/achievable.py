@@ -12,7 +12,7 @@ from math import hypot, isfinite, radians, sqrt, tan
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from fleet import mission as m
 from fleet.autopilots import arduplane
@@ -124,4 +124,4 @@ def _steep(leg: np.ndarray, rate: float, able: Ability, share: float) -> list[tu
 
 
 def _p(excess: float, sigma: float) -> float:
-    return float(norm.cdf(excess / sigma))
+    return float(ndtr(excess / sigma))

@@ -11,14 +11,16 @@ ahead weighs little by itself and no horizon cuts it off.
 """
 
 from functools import lru_cache
-from math import isfinite
+from math import ceil, floor, isfinite
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 from scipy.stats import norm, qmc
 
 from fleet.contract import Prediction
 from fleet.frames import Origin, to_geodetic
+from twin_worker.compiled.straight import straight
 from twin_worker.horizon import track_frame
 
 STEP = 2.0  # grid in fleet time, the same for all: instants k STEP [s since 1970]
@@ -44,8 +46,9 @@ class Forecast(NamedTuple):
 
     def covariance(self) -> np.ndarray:
         """Give nn, ne, ee of the horizontal covariance and the vertical variance, (n, 4) [m2]."""
-        (c, s), (a, b, d) = self.along.T, (self.sigma**2).T
-        return np.column_stack([a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c, d])
+        out = np.empty((len(self.path), 4))
+        _turned(self.along, self.sigma, out)
+        return out
 
     def draws(self, until: float = np.inf) -> np.ndarray:
         """Give 128 equally probable flights up to an instant [s since 1970], NED, (128, k, 3) [m]."""
@@ -75,14 +78,24 @@ def forecast(made: Prediction) -> Forecast | None:
     if not _sound(made, ahead, path, tube):
         return None
     t = made.t + ahead
-    first, last = int(np.ceil(t[0] / STEP)), int(np.floor(min(t[-1], t[0] + LONGEST_S) / STEP))
+    first, last = ceil(t[0] / STEP), floor(min(t[-1], t[0] + LONGEST_S) / STEP)
     if last < first:
         return None
     at = STEP * np.arange(first, last + 1)
-    laid = [np.column_stack([np.interp(at, t, column) for column in rows.T]) for rows in (path, tube)]
-    sigma = np.maximum(laid[1] / axis_z(made.quantile), _LEAST)
-    along = track_frame(laid[0], STEP * np.arange(len(at))) if len(at) > 1 else np.array([[1.0, 0.0]])
-    return Forecast(made, first, laid[0], along, sigma)
+    mean = straight(at, t, path)
+    sigma = np.maximum(straight(at, t, tube) / axis_z(made.quantile), _LEAST)
+    along = track_frame(mean, at - at[0]) if len(at) > 1 else np.array([[1.0, 0.0]])
+    return Forecast(made, first, mean, along, sigma)
+
+
+@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
+def _turned(along: np.ndarray, sigma: np.ndarray, out: np.ndarray) -> None:
+    """Fill in the covariance of every row, (n, 4)."""
+    for k in range(len(out)):
+        c, s = along[k, 0], along[k, 1]
+        a, b = sigma[k, 0] ** 2, sigma[k, 1] ** 2
+        out[k, 0], out[k, 1], out[k, 2] = a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c
+        out[k, 3] = sigma[k, 2] ** 2
 
 
 def _sound(made: Prediction, ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
@@ -95,12 +108,20 @@ def _sound(made: Prediction, ahead: np.ndarray, path: np.ndarray, tube: np.ndarr
         0 < made.t < 4e9
         and 0 < made.quantile < 1
         and isfinite(made.quantile)
-        and np.isfinite(ahead).all()
-        and (np.diff(ahead) > 0).all()
-        and (np.abs(path) < _MOST).all()
-        and (tube >= 0).all()
-        and (tube < _MOST).all()
+        and _credible(ahead, path, tube)
         and abs(lat) < 8.9e8
         and abs(lon) <= 1.8e9
         and abs(alt) <= 1e8
     )
+
+
+@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
+def _credible(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
+    """Tell whether times are finite and rise, and places and half-axes are near; false for nan."""
+    for k in range(len(ahead)):
+        if not np.isfinite(ahead[k]) or (k and not ahead[k] > ahead[k - 1]):
+            return False
+        for i in range(3):
+            if not (abs(path[k, i]) < _MOST and 0.0 <= tube[k, i] < _MOST):
+                return False
+    return True

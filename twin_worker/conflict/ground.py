@@ -1,7 +1,7 @@
 """Whether a predicted flight comes too near to the ground. Terrain is unknown: height is above home, and said so."""
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from fleet.contract import AlertKind
 from fleet.frames import Origin
@@ -27,7 +27,7 @@ def sinks(flight: Forecast, home: Origin, margin: float, until: float = np.inf) 
     k = max(int(np.searchsorted(flight.t, until, side="right")), 1)
     height, sigma = above(flight, home)[:k], flight.sigma[:k, 2]
     z = (margin - height) / sigma
-    p = float(norm.cdf(z.max()))
+    p = float(ndtr(z.max()))
     first = int(np.flatnonzero(z >= min(z.max(), 0.0))[0])  # where the mean goes below, else where it comes nearest
     at = float(flight.t[first])
     danger = (

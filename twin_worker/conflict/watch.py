@@ -4,7 +4,6 @@ import numpy as np
 
 from fleet.contract import Alert, AlertKind, Prediction
 from fleet.frames import Origin, to_ned
-from fleet.mission import route
 from twin_worker.calibration.written import GUESSED
 from twin_worker.conflict.achievable import Now, ability, achievable
 from twin_worker.conflict.fence import fence, leaves
@@ -13,6 +12,7 @@ from twin_worker.conflict.ground import ROTORS_M, WINGS_M, above, sinks
 from twin_worker.conflict.ledger import Finding
 from twin_worker.kinds import WINGS, hangs
 from twin_worker.memory import Twin
+from twin_worker.predict import unrolled
 from twin_worker.rotor import RETURN_MODES
 
 _SHORT_S, _LONG_S = 10.0, 12.0  # confidence horizon below which an alert is raised, above which it is withdrawn [s]
@@ -132,8 +132,7 @@ def _mission(twin: Twin, now: float) -> Finding:
     if twin.mission.seq < twin.first_item:
         return nothing
     p = to_ned(twin.origin, *position[-1:].T)[0]
-    more = {"params": _params(twin), "limit": 16, "first": twin.first_item}
-    way = route(twin.mission.items, seq=twin.mission.seq, origin=twin.origin, **more)  # type: ignore[arg-type]
+    way = unrolled(twin.mission.items, twin.mission.seq, twin.origin, _params(twin), twin.first_item)
     wind = np.array([*twin.wind.wind[:2], twin.wind.sigma])
     return achievable(Now(now, p, twin.origin, wind, way), ability(_params(twin), position[-1, 2] * 1e-3))
 

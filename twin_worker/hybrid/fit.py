@@ -38,15 +38,11 @@ def flight_of(good: Window, history: History, scale: float) -> Flight:
         history: telemetry as it came: airspeed and commands
         scale: true over reported airspeed [-]
     """
-    every = lags.STEP
-    at = good.t[-1] - every * np.arange(int(good.seconds / every) + 1)[::-1]
+    at, V = airspeed_of(good, history, scale)
 
     def on(x: np.ndarray) -> np.ndarray:
         return np.interp(at, good.t, x)
 
-    t_air, air = history.rows("air", at[0] - 2.0)
-    told = len(t_air) > 1 and float(air[:, 0].max()) > 3.0
-    V = np.interp(at, t_air, air[:, 0]) * scale if told else on(np.linalg.norm(good.x[:, :3], axis=1))
     asked = _commands(history, at)
     h = -on(good.p[:, 2])
     V_c = asked[:, 4] + V / scale
@@ -55,6 +51,15 @@ def flight_of(good: Window, history: History, scale: float) -> Flight:
         delta_t=on(good.u[:, 3]), climb_c=_climb(asked[:, 3] + h), V_c=V_c * scale,
         phi_c=asked[:, 0], theta_c=asked[:, 1],
     )  # fmt: skip
+
+
+def airspeed_of(good: Window, history: History, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Give rows of `lags.STEP`, newest last, (n,) [s], and the true airspeed at each, (n,) [m/s]; as `flight_of`."""
+    at = good.t[-1] - lags.STEP * np.arange(int(good.seconds / lags.STEP) + 1)[::-1]
+    t_air, air = history.rows("air", at[0] - 2.0)
+    if len(t_air) > 1 and float(air[:, 0].max()) > 3.0:
+        return at, np.interp(at, t_air, air[:, 0]) * scale
+    return at, np.interp(at, good.t, np.linalg.norm(good.x[:, :3], axis=1))
 
 
 def _climb(h_c: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from fleet import hybrid as H
 from fleet.window import Window
-from twin_worker.hybrid.fit import Hybrid, flight_of
+from twin_worker.hybrid.fit import Hybrid, airspeed_of
 from twin_worker.predict import Flown, Situation, Start, at_times
 from twin_worker.wind import DRIFT, DRIFT_S, GUST, GUST_S
 
@@ -20,8 +20,8 @@ _NO_CHANCE = np.empty((0, 4))
 
 def start_of(now: Situation, good: Window) -> np.ndarray:
     """Give the state at the end of the window, (N_START,)."""
-    flown = flight_of(good.part(max(len(good) - _LOOK_ROWS, 0), len(good)), now.history, now.wind.scale)
-    V = float(flown.V[-_SPEED_ROWS:].mean())
+    _, airspeed = airspeed_of(good.part(max(len(good) - _LOOK_ROWS, 0), len(good)), now.history, now.wind.scale)
+    V = float(airspeed[-_SPEED_ROWS:].mean())
     out = np.empty(H.N_START)
     out[:3], out[H.V] = good.p[-1], V
     out[[H.PHI, H.THETA, H.PSI, H.P_RATE, H.Q_RATE]] = good.x[-1, [6, 7, 8, 3, 4]]
