@@ -26,7 +26,8 @@ def entry(args: argparse.Namespace, role: str = TOOLS) -> Entry:
         OSError: when it cannot be read.
     """
     told = {} if args.config is None else _read(args.config)
-    paths = {name: args.config.parent / told[name] for name in ("certificates", "passwords") if name in told}
+    # absolute: what `fleet router` writes is read elsewhere, zenohd under systemd runs in /
+    paths = {n: args.config.absolute().parent / told[n] for n in ("certificates", "passwords") if n in told}
     return Entry(args.router or told.get("at", ROUTER), role, **paths)
 
 

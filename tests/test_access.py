@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from conftest import ROOT, unused_port
 
-from fleet import commands
+from fleet import cli, commands
 from fleet.access.entry import ROUTER, Entry
 from fleet.access.knock import answers
 from fleet.access.papers import ending, papers_of, password_of
@@ -65,6 +65,16 @@ def test_the_command_line_wins_over_the_file(tmp_path: Path) -> None:
     both = told(file, "--router=tcp/10.0.0.2:7447")
     assert entry(both).at == "tcp/10.0.0.2:7447"
     assert passed_on(both) == ["--router=tcp/10.0.0.2:7447", file]
+
+
+def test_paths_hold_wherever_what_is_written_with_them_is_read(
+    papers: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    shutil.copytree(papers, tmp_path / "certificates")
+    written(tmp_path, '[router]\nat = "tls/127.0.0.1:7447"\ncertificates = "certificates"\n')
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["router", "--config=fleet.toml"]) == 0
+    assert f'"{tmp_path}/certificates/router.pem"' in capsys.readouterr().out  # zenohd may run in another folder
 
 
 @pytest.mark.parametrize(
