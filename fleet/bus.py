@@ -23,6 +23,7 @@ _WAITED_FOR = (Claim,)  # seldom and needed: the sender waits where the way is f
 _LIVE = f"{ROOT}/@live/"
 _PUT_ASIDE = 20_000  # messages of a class that wait until they are handed out
 _ANSWERS = 4096  # that may wait to be read
+_AT_LEISURE = zenoh.Priority.DATA_LOW  # of answers of megabytes, that telemetry and predictions overtake
 _TOKENS = 4096  # asked for at once; with the usual channel more than 256 would block for ever
 
 
@@ -139,20 +140,22 @@ class ZenohBus(AbstractContextManager):
 
     def gather(self, kind: type[M], who: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
         """Ask with a payload and give every answer as it comes."""
-        for reply in self._coming(key(kind, who), timeout_s, payload):
+        for reply in self._coming(key(kind, who), timeout_s, payload, _AT_LEISURE):
             if (found := reply.ok) is not None and (pair := self._read(kind, found)) is not None:
                 yield pair[0]
 
     def fetch(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
         """Ask and give the bytes of every answer as it comes; other versions are left out."""
-        for reply in self._coming(key(kind, who), timeout_s, None):
+        for reply in self._coming(key(kind, who), timeout_s, priority=_AT_LEISURE):
             if (found := reply.ok) is not None and str(found.encoding) == encoding(kind):
                 yield found.payload.to_bytes()
 
     def _replies(self, name: str, timeout_s: float, payload: bytes | None = None) -> list[zenoh.Reply]:
         return list(self._coming(name, timeout_s, payload))
 
-    def _coming(self, name: str, timeout_s: float, payload: bytes | None) -> Iterator[zenoh.Reply]:
+    def _coming(
+        self, name: str, timeout_s: float, payload: bytes | None = None, priority: zenoh.Priority | None = None
+    ) -> Iterator[zenoh.Reply]:
         try:
             yield from self._session.get(
                 name,
@@ -161,6 +164,7 @@ class ZenohBus(AbstractContextManager):
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,
                 payload=payload,
+                priority=priority,
             )
         except zenoh.ZError as error:
             raise ConnectionError(
