@@ -38,6 +38,11 @@ class ServoMap:
     gain_down: np.ndarray
     sentence: str
 
+    def same(self, other: "ServoMap") -> bool:
+        """Tell whether another turns pulses into the same inputs."""
+        pairs = ((self.trim, other.trim), (self.gain_up, other.gain_up), (self.gain_down, other.gain_down))
+        return self is other or all(np.array_equal(one, another) for one, another in pairs)
+
     def inputs(self, pulses: np.ndarray) -> np.ndarray:
         """Turn pulse widths (n, 8) [us] into inputs (n, 4) in the order of `fleet.window.INPUTS` [-]."""
         out = np.empty((len(pulses), len(_INPUTS)))

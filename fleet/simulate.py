@@ -16,7 +16,7 @@ GUIDE_EVERY = 2  # model steps between guidance steps; 0.08 s on the 0.04 s grid
 N_STATE = 12  # p_n p_e p_d, u v w, p q r, phi theta psi
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def _body_to_ned(u: float, v: float, w: float, phi: float, theta: float, psi: float) -> tuple[float, float, float]:
     cf, sf, ct, st, cp, sp = cos(phi), sin(phi), cos(theta), sin(theta), cos(psi), sin(psi)
     return (
@@ -26,7 +26,7 @@ def _body_to_ned(u: float, v: float, w: float, phi: float, theta: float, psi: fl
     )
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def _linear_axis(D: np.ndarray, at: np.ndarray, x: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Advance x' = at + A (x - at) + B (u - at) + c, D = [A B c], at = [x_mean u_mean]."""
     n, m = len(x), len(u)
@@ -41,7 +41,7 @@ def _linear_axis(D: np.ndarray, at: np.ndarray, x: np.ndarray, u: np.ndarray) ->
     return out
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def _linear_step(
     lon: np.ndarray, lon_at: np.ndarray, lat: np.ndarray, lat_at: np.ndarray, x: np.ndarray, delta: np.ndarray
 ) -> None:
@@ -53,7 +53,7 @@ def _linear_step(
     x[6], x[8], x[3], x[5], x[1] = x_lat
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, error_model="numpy", nogil=True)
 def simulate(
     ctl: np.ndarray,
     par: np.ndarray,

@@ -19,7 +19,7 @@ from twin_worker.plant import DYNAMICS
 from twin_worker.predict import LEAST_AHEAD_S
 from twin_worker.track import Track
 
-_LOOK_BACK_S = 62.0  # telemetry a prediction starts from [s]
+LOOK_BACK_S = 62.0  # telemetry a prediction starts from [s]
 _TELL_S = 10.0  # between laws and parameters that are no news [s]
 _STALE_S = 3.0  # positions older than other telemetry by more say nothing of now [s]
 _MISSED = 2  # autopilot parameters that may be lacking where they count as known [-]
@@ -33,7 +33,7 @@ def foresee(twin: Twin, now: float) -> list[Message]:
     Without positions it coasts: the twin flies on from the last good state until its confidence horizon is over.
     """
     assert twin.origin is not None
-    flown = seen(twin, _LOOK_BACK_S)
+    flown = seen(twin, LOOK_BACK_S, turned=False)
     if flown is None:
         return []
     coast = _coasts(twin, flown, now)
@@ -135,7 +135,7 @@ def _controller(twin: Twin, made: Flight, now: float) -> Controller | None:
 
 def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
     """Fly the identified model, else the law of its kind, else turn on; give the flight and when it starts."""
-    window = twin.window(_LOOK_BACK_S)
+    window = twin.window(LOOK_BACK_S)
     whole = window is not None and bool(window.ok[-1])
     why = twin.verdict.sentence
     if twin.ground.landed and twin.instead is None:
@@ -150,7 +150,7 @@ def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
             twin.state = _state(twin, State.PREDICTING)
             return first, float(window.t[-1])  # type: ignore[union-attr]
         why = first.sentence
-    second = fly_kind(twin, flown, ahead)
+    second = fly_kind(twin, flown.turned(twin.history), ahead)
     if _good(second):
         twin.state = _state(twin, State.PREDICTING)
         said = second.sentence if hangs(twin) else f"{second.sentence}; {why}"
@@ -180,8 +180,14 @@ def _group(twin: Twin, flight: Flight, flown: Track) -> str:
     known = "known"
     if control is not None and len(control.absent) > _MISSED:
         known = "identified" if IDENTIFIED in control.known.values() else "absent"
-    usual = float(np.median(np.linalg.norm(flown.v, axis=1)))
-    return group_of(flight.method, flight.law, airframe_class(twin.vehicle, usual), known)
+    return group_of(flight.method, flight.law, airframe_class(twin.vehicle, _usual(flown.v)), known)
+
+
+def _usual(v: np.ndarray) -> float:
+    """Give the median speed of velocities, (n, 3) [m/s]."""
+    ranked = np.sort(np.einsum("ij,ij->i", v, v))
+    n = len(ranked)
+    return 0.5 * float(np.sqrt(ranked[(n - 1) // 2]) + np.sqrt(ranked[n // 2]))
 
 
 def _state(twin: Twin, otherwise: State) -> State:

@@ -48,10 +48,10 @@ def nothing(sentence: str, seq: int = -1) -> Flight:
     return Flight(None, "", "", seq, sentence)
 
 
-def seen(twin: Twin, seconds: float = _BACK_S) -> Track | None:
-    """Give what was flown of late, from positions and velocities alone."""
+def seen(twin: Twin, seconds: float = _BACK_S, *, turned: bool = True) -> Track | None:
+    """Give what was flown of late, from positions and velocities alone; `turned`: with its attitude."""
     assert twin.origin is not None
-    return track(twin.history, twin.origin, until=twin.history.newest, seconds=seconds)
+    return track(twin.history, twin.origin, until=twin.history.newest, seconds=seconds, turned=turned)
 
 
 def hangs(twin: Twin) -> bool:

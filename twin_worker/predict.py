@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
+import numba as nb
 import numpy as np
 
 from fleet.autopilots import arduplane, laws
@@ -151,10 +152,21 @@ def held(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float) -> np.nda
     """Hold each row until the next, nan before the first and after `longest` seconds, (len(at), k)."""
     if not len(t):
         return np.full((len(at), x.shape[1]), np.nan)
-    k = np.searchsorted(t, at, side="right") - 1
-    out = x[np.clip(k, 0, None)].astype(float)
-    out[(k < 0) | (at - t[np.clip(k, 0, None)] > longest)] = np.nan
+    out = np.empty((len(at), x.shape[1]))
+    _hold(t, x, np.ascontiguousarray(at), longest, out)
     return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _hold(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float, out: np.ndarray) -> None:
+    """Fill in the last row before each of some rising times, nan where it is none or old, (k, m)."""
+    k = -1
+    for i in range(len(at)):
+        while k + 1 < len(t) and t[k + 1] <= at[i]:
+            k += 1
+        known = k >= 0 and not at[i] - t[k] > longest
+        for j in range(x.shape[1]):
+            out[i, j] = x[k, j] if known else np.nan
 
 
 def _reported(history: History, name: str, at: np.ndarray, longest: float) -> np.ndarray:
@@ -179,7 +191,8 @@ def heard(now: Situation) -> Heard | Flown:
     good = _on_this_route(now.window, now.onboard.since)
     if len(good) < 5.0 / good.dt:
         return Flown(None, -1, f"{good.seconds:.0f} s on this route, 5 s are needed; wait")
-    at = good.t[(len(good) - 1) % _SHADOW_STEP :: _SHADOW_STEP]
+    every = slice((len(good) - 1) % _SHADOW_STEP, None, _SHADOW_STEP)
+    at = good.t[every]
     seq = _reported(now.history, "leg", at, 15.0)[:, 0]
     if not np.isfinite(seq[-1]):
         return Flown(None, -1, "the mission item in force is not reported (MISSION_CURRENT)")
@@ -192,7 +205,7 @@ def heard(now: Situation) -> Heard | Flown:
         return Flown(None, int(seq[-1]), said or "the mission has no legs to fly")
     start = way.start if np.isfinite(way.start).all() else good.p[0]
     altitude = now.origin.alt_mm * 1e-3 - float(good.p[-1, 2])
-    return Heard(good, way.legs, start, _telemetry(good, at, now.history), seq, altitude, said)
+    return Heard(good, way.legs, start, _telemetry(good, every, now.history), seq, altitude, said)
 
 
 def unrolled(items: tuple[Item, ...], seq: int, origin: Origin, params: Mapping[str, float], first: int) -> Route:
@@ -331,13 +344,13 @@ def _on_this_route(window: Window, since: float) -> Window:
     return window.part(min(start, len(window) - 2), len(window))
 
 
-def _telemetry(good: Window, at: np.ndarray, history: History) -> tuple[np.ndarray, ...]:
-    """Give what the controller twin is synchronised on at times `at`: t p v euler rates Va phi_c theta_c delta."""
-    k = np.searchsorted(good.t, at)
+def _telemetry(good: Window, every: slice, history: History) -> tuple[np.ndarray, ...]:
+    """Give what the controller twin is synchronised on at some rows: t p v euler rates Va phi_c theta_c delta."""
+    at = good.t[every]
     command, Va = _reported(history, "command", at, 1.0), _reported(history, "air", at, 1.0)[:, 0]
-    euler, rates = good.x[k, 6:9], good.x[k, 3:6]
+    euler, rates = good.x[every, 6:9].copy(), good.x[every, 3:6]
     euler[:, 2] = wrap(euler[:, 2])
-    rows = (at - at[0], good.p[k], good.v[k], euler, rates, Va, command[:, 0], command[:, 1], good.u[k])
+    rows = (at - at[0], good.p[every], good.v[every], euler, rates, Va, command[:, 0], command[:, 1], good.u[every])
     return tuple(np.ascontiguousarray(row) for row in rows)
 
 

@@ -3,14 +3,14 @@
 Source: Huang 2021, section 3.2 (time-stamp calibration, eq. 18; Lagrange interpolation, eq. 19).
 """
 
-from math import ceil, floor
+from math import ceil, cos, floor, sin
 
 import numba as nb
 import numpy as np
 
 from fleet.airframe import ServoMap
-from fleet.frames import Origin, ned_to_body, to_ned
-from fleet.window import STATES, Window
+from fleet.frames import Origin, to_ned
+from fleet.window import INPUTS, STATES, Window
 from twin_worker.history import History
 
 DT = 0.04  # grid of every window [s]
@@ -21,8 +21,8 @@ _LEAST_ROWS = 4, 8  # of every kind, to go on and to begin
 _FEWEST = 50  # grid times of a window
 _BENT = 8.0  # usual gaps that the four points of a cubic may span [-]
 _LOST = 1.6  # usual gaps from which a gap means lost samples [-]
-_SPLIT = (6, 9, 12)  # where velocity, position and pulses begin in what is laid
-_WIDTH = 20
+_LAID, _TURN, _WIDTH = 12, 16, 22  # where inputs begin in what is kept, cosines and sines of the angles, and its end
+_SPARE_S = 20.0  # place for so much more is made at once [s]
 
 
 def lagrange(t: np.ndarray, y: np.ndarray, grid: np.ndarray) -> np.ndarray:
@@ -107,13 +107,15 @@ class Grid:
     def __init__(self, keep_s: float = 160.0) -> None:
         self.keep_s = keep_s
         self._origin: Origin | None = None
+        self._servos: ServoMap | None = None
+        self._first, self._stop = 0, 0  # rows in use of the three below
         self._k = np.empty(0, np.int64)  # grid times in steps of DT
-        self._laid = np.empty((0, _WIDTH))  # attitude, velocity, position, pulses
+        self._laid = np.empty((0, _WIDTH))  # attitude, velocity, position, inputs, and what turns it to the body
         self._ok = np.empty((0, 2), bool)  # measured or filled; filled
 
     def clear(self) -> None:
         """Forget everything, as after a jump of the clock."""
-        self._k = self._k[:0]
+        self._first, self._stop = 0, 0
 
     def window(
         self, history: History, origin: Origin, servos: ServoMap, wind: np.ndarray, *, until: float, seconds: float
@@ -130,46 +132,91 @@ class Grid:
         Returns:
             the window, or None while any needed kind of row is missing
         """
-        if self._origin != origin:
+        if self._origin != origin or self._servos is None or not servos.same(self._servos):
             self.clear()
-            self._origin = origin
+        self._origin, self._servos = origin, servos
         if not self._extend(history, until):
             return None
-        first = np.searchsorted(self._k, ceil((until - seconds) / DT - 1e-3))
-        last = np.searchsorted(self._k, floor(until / DT + 1e-3), side="right")
+        used = slice(self._first, self._stop)
+        k, laid, known = self._k[used], self._laid[used], self._ok[used]
+        first = k.searchsorted(ceil((until - seconds) / DT - 1e-3))
+        last = k.searchsorted(floor(until / DT + 1e-3), side="right")
         rows = slice(first, last)
         if last - first < _FEWEST:
             return None
-        attitude, v, p, pulses = np.split(self._laid[rows], _SPLIT, axis=1)
-        ok, filled = self._ok[rows].T
-        x = np.empty((len(v), len(STATES)))
-        x[:, :3] = ned_to_body(attitude[:, 0], attitude[:, 1], attitude[:, 2], v - wind)
-        x[:, 3:6], x[:, 6:] = attitude[:, 3:], attitude[:, :3]
-        return Window(self._k[rows] * DT, x, servos.inputs(pulses), p, v, ok, filled)
+        x, u, p, v = (np.empty((last - first, width)) for width in (len(STATES), len(INPUTS), 3, 3))
+        _seen(laid[rows], np.asarray(wind, float), x, u, p, v)
+        ok, filled = known[rows].T.copy()
+        return Window(k[rows] * DT, x, u, p, v, ok, filled)
 
     def _extend(self, history: History, until: float) -> bool:
         """Lay the tail anew from where rows may still have come; tell whether every kind is there."""
-        settled = self._k[-1] * DT - _SETTLED_S if len(self._k) else max(until - self.keep_s, 0.0)
+        begun = self._stop > self._first
+        settled = self._k[self._stop - 1] * DT - _SETTLED_S if begun else max(until - self.keep_s, 0.0)
         rows = {name: history.rows(name, settled - _BEFORE_S) for name in LONGEST_GAP}
-        if any(len(t) < _LEAST_ROWS[not len(self._k)] for t, _ in rows.values()):
-            return len(self._k) > 0
-        start = settled if len(self._k) else max(settled, *(float(t[0]) for t, _ in rows.values()))
+        if any(len(t) < _LEAST_ROWS[not begun] for t, _ in rows.values()):
+            return begun
+        start = settled if begun else max(settled, *(float(t[0]) for t, _ in rows.values()))
         stop = min(until, *(float(t[-1]) for t, _ in rows.values()))
         k = np.arange(ceil(start / DT), floor(stop / DT) + 1)
         if not len(k):
-            return len(self._k) > 0
+            return begun
         assert self._origin is not None
         laid, ok, filled = _lay(rows, k * DT, self._origin)
-        keep = slice(*np.searchsorted(self._k, [k[0] - int(self.keep_s / DT), k[0]]))
-        if len(self._k) and len(laid):  # angles go on from the turn they were on
-            laid[:, :3] += 2 * np.pi * np.round((self._before(keep) - laid[0, :3]) / (2 * np.pi))
-        self._k = np.concatenate([self._k[keep], k])
-        self._laid = np.concatenate([self._laid[keep], laid])
-        self._ok = np.concatenate([self._ok[keep], np.column_stack([ok, filled])])
+        self._join(k, laid, np.column_stack([ok, filled]))
         return True
 
-    def _before(self, keep: slice) -> np.ndarray:
-        return self._laid[keep.stop - 1, :3] if keep.stop > keep.start else np.zeros(3)
+    def _join(self, k: np.ndarray, laid: np.ndarray, ok: np.ndarray) -> None:
+        """Have these rows, (n,), (n, 20), (n, 2), instead of all from the first of them on."""
+        at = [k[0] - int(self.keep_s / DT), k[0]]
+        first, stop = (self._first + int(row) for row in self._k[self._first : self._stop].searchsorted(at))
+        if self._stop > self._first:  # angles go on from the turn they were on
+            before = self._laid[stop - 1, :3] if stop > first else np.zeros(3)
+            laid[:, :3] += 2 * np.pi * np.round((before - laid[0, :3]) / (2 * np.pi))
+        if stop + len(k) > len(self._k):
+            self._make_place(first, stop, len(k))
+            first, stop = 0, stop - first
+        new = slice(stop, stop + len(k))
+        assert self._servos is not None
+        self._k[new], self._laid[new, :_LAID], self._ok[new] = k, laid[:, :_LAID], ok
+        self._laid[new, _LAID:_TURN] = self._servos.inputs(laid[:, _LAID:])
+        _turn(self._laid[new])
+        self._first, self._stop = first, new.stop
+
+    def _make_place(self, first: int, stop: int, more: int) -> None:
+        """Keep rows `first` to `stop` in arrays that have place for `more`, and for some time to come."""
+        size = stop - first + more + int(_SPARE_S / DT)
+        for name in ("_k", "_laid", "_ok"):
+            old = getattr(self, name)
+            new = np.empty((size, *old.shape[1:]), old.dtype)
+            new[: stop - first] = old[first:stop]
+            setattr(self, name, new)
+
+
+@nb.njit(cache=True, nogil=True)  # no fastmath: as `fleet.frames.ned_to_body` has it
+def _turn(laid: np.ndarray) -> None:
+    """Fill in the cosines and sines of every row's angles: a window is turned anew with every new wind."""
+    for k in range(len(laid)):
+        for i in range(3):
+            laid[k, _TURN + 2 * i], laid[k, _TURN + 2 * i + 1] = cos(laid[k, i]), sin(laid[k, i])
+
+
+@nb.njit(cache=True, nogil=True)  # no fastmath: as `fleet.frames.ned_to_body` has it
+def _seen(laid: np.ndarray, wind: np.ndarray, x: np.ndarray, u: np.ndarray, p: np.ndarray, v: np.ndarray) -> None:
+    """Fill in states, (n, 9), inputs, (n, 4), positions and velocities, (n, 3), of rows as `Grid` keeps them."""
+    for k in range(len(laid)):
+        row = laid[k]
+        cf, sf, ct, st, cp, sp = row[16], row[17], row[18], row[19], row[20], row[21]
+        for i in range(4):
+            u[k, i] = row[_LAID + i]
+        for i in range(3):
+            v[k, i], p[k, i] = row[6 + i], row[9 + i]
+            x[k, 6 + i], x[k, 3 + i] = row[i], row[3 + i]
+        n, e, d = row[6] - wind[0], row[7] - wind[1], row[8] - wind[2]
+        ahead, right = cp * n + sp * e, cp * e - sp * n
+        x[k, 0] = ct * ahead - st * d
+        x[k, 1] = sf * st * ahead + cf * right + sf * ct * d
+        x[k, 2] = cf * st * ahead - sf * right + cf * ct * d
 
 
 def _lay(

@@ -1,6 +1,6 @@
 """Where an aircraft was and how it moved, from positions and velocities alone: all that every vehicle sends."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -48,9 +48,15 @@ class Track:
         bad = np.flatnonzero(~self.ok)
         return self.part(max(int(bad[-1]) + 1 if len(bad) else 0, int(np.searchsorted(self.t, since))), len(self))
 
+    def turned(self, history: History) -> "Track":
+        """Give the same with its attitude."""
+        return replace(self, euler=_attitude(history, self.t))
 
-def track(history: History, origin: Origin, *, until: float, seconds: float) -> Track | None:
+
+def track(history: History, origin: Origin, *, until: float, seconds: float, turned: bool = True) -> Track | None:
     """Lay the newest `seconds` before `until` on one grid; velocity is differentiated where none is sent.
+
+    Not `turned` its attitude is nan as yet: to lay it takes longer than all else, and not all need it.
 
     Returns:
         the track, or None before a second and a half of positions
@@ -72,9 +78,9 @@ def track(history: History, origin: Origin, *, until: float, seconds: float) -> 
         ok &= also
     else:
         v = _slope(grid, p)
-    euler = _attitude(history, grid)
     said = "" if moving else "no velocity rows: it is differentiated from positions, which costs precision"
-    return Track(grid, p, v, euler, ok, said)
+    found = Track(grid, p, v, np.full((n, 3), np.nan), ok, said)
+    return found.turned(history) if turned else found
 
 
 def _laid(t: np.ndarray, x: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

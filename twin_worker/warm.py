@@ -3,27 +3,35 @@
 import numpy as np
 
 from fleet import hybrid
+from fleet.airframe import servo_map
 from fleet.airframes import GENERIC, load
 from fleet.autopilots import arduplane, copter, greybox
 from fleet.autopilots.shadow import shadow
 from fleet.codec import encode
 from fleet.contract import Array, History, Item, Prediction, Rows, Sample, State
-from fleet.frames import Origin, wrap
+from fleet.frames import Origin, to_geodetic, wrap
 from fleet.mission import route
 from fleet.simulate import N_STATE, coupled_plant, linear_plant, simulate
 from fleet.window import Window
+from twin_worker.calibration.ledger import Ledger
+from twin_worker.calibration.miss import AHEAD
 from twin_worker.claims.tape import read
 from twin_worker.conflict.traffic import Traffic
 from twin_worker.coupled import identify
+from twin_worker.history import History as Telemetry
 from twin_worker.hybrid import lags
 from twin_worker.identify import AXES, identify_axis
 from twin_worker.linearise import linearise
+from twin_worker.plant import settled
+from twin_worker.predict import held
+from twin_worker.preprocess import Grid
 from twin_worker.renew import shifted
 from twin_worker.unseen import Unseen
 from twin_worker.verify import verify
 from twin_worker.wind import WindFilter
 
 _SPEED = 22.0  # [m/s]
+_HOME = Origin(470_000_000, 80_000_000, 100_000)
 _ITEMS = tuple(
     Item(seq=k, command=16, lat_e7=470_000_000 + 90_000 * k, lon_e7=80_000_000, alt_m=100.0) for k in range(3)
 )
@@ -33,9 +41,8 @@ def warm_up() -> None:
     """Run every compiled function of the worker once; from the disk cache this takes about a second."""
     window = _flight()
     axes = [identify_axis(axis, window, 2.0)[1] for axis in AXES]
-    origin = Origin(470_000_000, 80_000_000, 100_000)
     par, _ = arduplane.parameters({})
-    legs = route(_ITEMS, seq=1, origin=origin, params={}).legs
+    legs = route(_ITEMS, seq=1, origin=_HOME, params={}).legs
     n = len(window)
     euler, rates = np.ascontiguousarray(window.x[:, 6:]), np.ascontiguousarray(window.x[:, 3:6])
     heard = [np.full(n, _SPEED), np.zeros(n), np.zeros(n), window.u, np.ones(n, np.int64)]
@@ -53,9 +60,10 @@ def warm_up() -> None:
     ahead, grey = np.empty((5, 3)), np.ones(greybox.N_PAR)
     greybox.follow(grey_ctl, par, legs, grey, np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0]), np.zeros(2), 0.1, ahead)  # type: ignore
     segments, told = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
-    _meet(origin)
+    _meet()
     _go_on()
     _recall()
+    _remember(window)
     _learn()
     copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), told, 0.1, ahead)  # type: ignore
 
@@ -71,7 +79,7 @@ def _in_the_large(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: Wi
     lags.identify(window.x[:, 6], window.x[:, 6])
 
 
-def _meet(origin: Origin) -> None:
+def _meet() -> None:
     """Let two aircraft fly at each other."""
     traffic, ahead = Traffic(), np.arange(0.0, 20.0)
     for uav, way in ((0, 1.0), (1, -1.0)):
@@ -81,7 +89,7 @@ def _meet(origin: Origin) -> None:
             t=1e9,
             state=State.PREDICTING,
             method="",
-            origin=(origin.lat_e7, origin.lon_e7, origin.alt_mm),
+            origin=(_HOME.lat_e7, _HOME.lon_e7, _HOME.alt_mm),
             ahead=Array.of(ahead),
             path=Array.of(path),
             tube=Array.of(np.ones((20, 3))),
@@ -103,11 +111,26 @@ def _recall() -> None:
     read(encode(History(uav=0, t=1e9, samples=(Sample(uav=0, t=1e9, velocity=rows),))))
 
 
+def _remember(window: Window) -> None:
+    """Lay telemetry on the grid, hold what was reported, and answer a prediction."""
+    place = to_geodetic(_HOME, window.p).astype(float)
+    history = Telemetry()
+    for name, rows in (("attitude", window.x[:, 3:]), ("velocity", window.v), ("position", place)):
+        history.put(name, window.t, rows)
+    history.put("servo", window.t, np.full((len(window), 8), 1500.0))
+    Grid().window(history, _HOME, servo_map({}), np.zeros(3), until=float(window.t[-1]), seconds=10.0)
+    held(window.t, window.v, window.t, 1.0)
+    book = Ledger()
+    book.add(0.0, "", "", np.outer(AHEAD, [_SPEED, 0.0, 0.0]), _SPEED)
+    book.answer(window.t, window.p)
+
+
 def _learn() -> None:
     """Identify, verify, and tell what a model is worth: whoever first does holds the lock of an aircraft meanwhile."""
     window = _flight(60.0)
     plant, known = identify(window, np.zeros(2), load(GENERIC)), len(window) // 2
     verify(plant, window, known, 0.0, None)
+    settled(plant, window)
     Unseen(plant, window, known).lesson(20.0, 5.0)
     linearise(plant, window)
     wrap(np.zeros((2, 3))[:, 2])

@@ -4,7 +4,7 @@ What telemetry does not show (filters, integrators, angle flown on a circle) fol
 cannot know, an integrator's value at its beginning, is shifted at the end until the outputs meet the reported ones.
 """
 
-from math import nan, sqrt
+from math import isfinite, nan, sqrt
 
 import numpy as np
 
@@ -30,9 +30,10 @@ def _find(ctl: np.ndarray, legs: np.ndarray, seq: float) -> int:
     return -1
 
 
-@making
-def _usable(p: np.ndarray, v: np.ndarray, euler: np.ndarray) -> bool:
-    return bool(np.all(np.isfinite(p)) and np.all(np.isfinite(v)) and np.all(np.isfinite(euler)))
+@kernel
+def _known(x: np.ndarray) -> bool:
+    """Tell whether all three are finite; `numpy.all` would make an array each time."""
+    return isfinite(x[0]) and isfinite(x[1]) and isfinite(x[2])
 
 
 @making
@@ -73,7 +74,7 @@ def shadow(
     miss = np.full((n, 6), nan)  # reported minus replayed: theta_c, delta_t, delta_a, delta_e, delta_r, phi_c
     last = -1
     for k in range(n):
-        if not _usable(p[k], v[k], euler[k]):
+        if not (_known(p[k]) and _known(v[k]) and _known(euler[k])):
             continue
         if last < 0:
             ctl = engage(par, legs, start, p[k], v[k], euler[k], Va[k], theta_c[k], delta[k, 3])
@@ -85,7 +86,7 @@ def shadow(
             continue
         phi_k, theta_k, thr_k, _ = fly(ctl, par, legs, p[k], v[k], euler[k], Va[k], nan, dt)
         miss[k, 0], miss[k, 1], miss[k, 5] = theta_c[k] - theta_k, delta[k, 3] - thr_k, wrap(phi_c[k] - phi_k)
-        if np.all(np.isfinite(rates[k])):
+        if _known(rates[k]):
             roll = phi_c[k] if np.isfinite(phi_c[k]) else phi_k
             pitch = theta_c[k] if np.isfinite(theta_c[k]) else theta_k
             delta_a, delta_e, delta_r = stabilise(ctl, par, roll, pitch, euler[k], rates[k], Va[k], dt)

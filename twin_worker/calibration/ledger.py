@@ -4,17 +4,17 @@ Every look-ahead is answered as soon as it has been flown, all predictions at on
 look-aheads without an answer and ends the wait for the first passage; so do events, which end the prediction.
 """
 
-from collections import deque
-
 import numpy as np
 
-from twin_worker.calibration.miss import AHEAD, LIMIT, along_cross_down, least_length, track_frame
+from twin_worker.calibration.miss import AHEAD, least_length, track_frame
 from twin_worker.calibration.table import KNOTS
+from twin_worker.compiled.answer import Known, Said, answer_each
+from twin_worker.compiled.straight import straight
 
 ROWS = 96  # predictions remembered
 EVERY_S = 5.0  # a prediction is remembered this often [s]
-_GAP_S = 2.5  # positions farther apart than this are a hole [s]
 _STRIDE_S = 1.0  # the path flown is measured in strides of so long [s]
+_STRIDES = int(1.3 * AHEAD[-1] / _STRIDE_S)  # remembered
 
 
 class Ledger:
@@ -43,7 +43,7 @@ class Ledger:
         self._least = np.ones(ROWS)  # least path length [m]
         self._begun = np.full(ROWS, np.nan)  # odometer at t0 [m]
         self._before = np.zeros(ROWS)  # relative error at the look-ahead before [-]
-        self._odometer: deque[tuple[float, float]] = deque(maxlen=int(1.3 * AHEAD[-1] / _STRIDE_S))
+        self._odometer = np.empty((0, 2))  # time, and length flown until then [s since 1970, m]
         self._stride_from = np.zeros(3)  # where the odometer stands
         self._at = -1  # newest row
 
@@ -80,70 +80,30 @@ class Ledger:
         """
         self._measure(t, flown)
         self.until = float(t[-1])
-        rows = np.flatnonzero(self.live)
-        column = np.arange(len(AHEAD))
-        due = (self.t0[rows, None] + AHEAD <= self.until) & (column >= self.next[rows, None])
-        due &= column < self.size[rows, None]
-        k, j = np.nonzero(due)
-        if not len(k):
-            return k, j
-        r = rows[k]
-        self._score(r, j, *self._flown(self.t0[r] + AHEAD[j], t, flown))
-        np.maximum.at(self.next, r, j + 1)
-        self.live[rows] = self.next[rows] < self.size[rows]
-        return r, j
+        answered = np.empty((int((self.size - self.next)[self.live].sum()), 2), np.int64)
+        said = Said(self.t0, self.size, self.path, self.along, self.tube, self._least)
+        known = Known(
+            self.score, self.next, self.live, self.followed, self.passed, self.watched, self._begun, self._before
+        )
+        happened = np.ascontiguousarray(t, float), np.ascontiguousarray(flown, float), self._odometer
+        n = answer_each(said, known, happened, answered)  # type: ignore[call-arg]
+        return answered[:n, 0], answered[:n, 1]
 
     def _measure(self, t: np.ndarray, flown: np.ndarray) -> None:
         """Let the odometer run on."""
-        last = self._odometer[-1][0] if self._odometer else -np.inf
+        last = self._odometer[-1, 0] if len(self._odometer) else -np.inf
         if not last <= t[-1]:
-            self._odometer.clear()
+            self._odometer = self._odometer[:0]
             last = -np.inf
         if not np.isfinite(last):
-            self._odometer.append((float(t[0]), 0.0))
+            self._odometer = np.array([[t[0], 0.0]])
             self._stride_from, last = flown[0], float(t[0])
         at = np.append(np.arange(last + _STRIDE_S, t[-1], _STRIDE_S), t[-1])
         at = at[at > last]
         if not len(at):
             return
-        points = np.column_stack([np.interp(at, t, column) for column in flown.T])
+        points = straight(at, t, flown)
         strides = np.linalg.norm(np.diff(np.vstack([self._stride_from, points]), axis=0), axis=1)
-        run = self._odometer[-1][1] + np.cumsum(strides)
-        self._odometer.extend(zip(at.tolist(), run.tolist(), strict=True))
+        run = self._odometer[-1, 1] + np.cumsum(strides)
+        self._odometer = np.vstack([self._odometer, np.column_stack([at, run])])[-_STRIDES:]
         self._stride_from = points[-1]
-
-    def _flown(self, at: np.ndarray, t: np.ndarray, flown: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Give where it was at some times, (m, 3), and whether that is known, (m,)."""
-        right = np.clip(np.searchsorted(t, at), 1, max(len(t) - 1, 1))
-        right = np.minimum(right, len(t) - 1)
-        known = (t[right] - t[np.maximum(right - 1, 0)] <= _GAP_S) & (at >= t[0] - 1e-6)
-        return np.column_stack([np.interp(at, t, column) for column in flown.T]), known
-
-    def _score(self, r: np.ndarray, j: np.ndarray, flown: np.ndarray, known: np.ndarray) -> None:
-        """Enter scores and passages of rows and columns, in the order of their look-aheads."""
-        error = flown - self.path[r, j]
-        axes = np.abs(along_cross_down(self.along[r, j], error))
-        self.score[r[known], j[known]] = (axes / self.tube[r, j]).max(axis=1)[known]
-        times, run = np.array(self._odometer).T
-        fresh = r[np.isnan(self._begun[r])]
-        self._begun[fresh] = np.interp(self.t0[fresh], times, run)
-        length = np.interp(self.t0[r] + AHEAD[j], times, run) - self._begun[r]
-        relative = np.linalg.norm(error, axis=1) / np.maximum(length, self._least[r])
-        again = np.append(False, r[1:] == r[:-1])  # several of one prediction are taken one after the other
-        nth = np.arange(len(r)) - np.maximum.accumulate(np.where(again, 0, np.arange(len(r))))
-        for round_ in range(int(nth.max()) + 1):
-            now = nth == round_
-            self._pass(r[now], j[now], relative[now], known[now])
-
-    def _pass(self, r: np.ndarray, j: np.ndarray, relative: np.ndarray, known: np.ndarray) -> None:
-        """See whether predictions, each once, have passed 10 % at a look-ahead."""
-        self.watched[r[~known]] = False
-        seen = self.watched[r]
-        r, j, relative = r[seen], j[seen], relative[seen]
-        over = relative > LIMIT
-        before = self._before[r]
-        share = np.where(j > 0, (LIMIT - before) / np.maximum(relative - before, 1e-9), 0.0)
-        last = AHEAD[np.maximum(j - 1, 0)]
-        self.followed[r] = np.where(over, last + np.clip(share, 0.0, 1.0) * (AHEAD[j] - last), AHEAD[j])
-        self._before[r] = relative
-        self.passed[r[over]], self.watched[r[over]] = True, False
