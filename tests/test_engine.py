@@ -15,6 +15,7 @@ from twin_worker.engine.learner import Learner
 from twin_worker.engine.pace import Pace, Work, read_pace
 from twin_worker.engine.quota import Quota
 from twin_worker.engine.rates import OVER_S, Rates
+from twin_worker.horizon import AHEAD
 from twin_worker.predict import LEAST_AHEAD_S
 from twin_worker.renew import LATEST_S, renew
 from twin_worker.twin import Twin, advance
@@ -22,7 +23,8 @@ from twin_worker.twin import Twin, advance
 
 def test_a_pace_is_read_and_refused_in_a_sentence() -> None:
     assert read_pace("identify=5,renew=0.1") == Pace(identify=5.0, renew=0.1)
-    for odd in ("", "identify", "identify=0", "identify=x", "identify=nan", "speed=5", "predict=1e9"):
+    assert read_pace("members=50,span=60") == Pace(members=50, span=60.0)
+    for odd in ("", "identify", "identify=0", "identify=x", "identify=nan", "speed=5", "predict=1e9", "span=200"):
         with pytest.raises(argparse.ArgumentTypeError, match=r"found .*, expected one of predict, identify"):
             read_pace(odd)
 
@@ -165,3 +167,27 @@ def test_a_path_that_cannot_be_renewed_is_flown_anew_before_long(heard: tuple, t
     rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 3.0], 3.0, 1e9)
     made = [m for message in rest for m in advance(twin, (message,)) if isinstance(m, Prediction)]
     assert made and made[0].t < heard[-1].t + 1.5 and twin.base.coast_s == 0.0
+
+
+def test_an_ensemble_that_had_to_wait_is_flown_before_the_next_flight_and_keeps_the_beat(
+    heard: tuple, twin: Twin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    twin.pace = Pace(predict=2.0, identify=1000.0, ensemble=2.0, members=16, span=60.0)
+    twin.identify_t = twin.data_t
+    asked: list[Work] = []
+    flown: list[float] = []
+    twin.quota = Quota()
+
+    def grants(work: Work) -> bool:
+        asked.extend([work] if work is Work.ENSEMBLE else [])
+        return work is not Work.ENSEMBLE or len(asked) % 4 == 0  # three times in four others are preferred
+
+    monkeypatch.setattr(twin.quota, "grants", grants)
+    rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 12.0], 12.0, 1e9)
+    for message in rest:
+        advance(twin, (message,))
+        if not flown or flown[-1] != twin.spread_t:
+            flown.append(twin.spread_t)
+    assert twin.spread is not None and np.diff(flown[1:]) == pytest.approx(2.0, abs=0.3) and len(flown) > 5
+    beyond = AHEAD > 60.0
+    assert (np.diff(twin.spread[beyond], axis=0) > 0).all() and twin.spread.shape == (len(AHEAD), 3)

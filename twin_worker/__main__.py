@@ -164,7 +164,8 @@ def main(argv: list[str] | None = None) -> int:
         "--pace",
         type=read_pace,
         metavar="WORK=S,…",
-        help="between flights ahead, identifications, ensembles, renewals (predict=1,identify=1,ensemble=10; no renew)",
+        help="between flights ahead, identifications, ensembles, renewals (predict=1,identify=1,ensemble=10; no renew) "
+        "and of an ensemble how many fly, how far ahead (members=24,span=180)",
     )
     parser.add_argument("--no-adapt", action="store_true", help="diagnose, but predict as if nothing was found")
     parser.add_argument("--no-diagnosis", action="store_true", help="do not diagnose at all")

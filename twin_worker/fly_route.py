@@ -3,6 +3,7 @@
 import numpy as np
 
 from fleet.window import Window
+from twin_worker.calibration.table import law_of_growth
 from twin_worker.compiled.straight import straight
 from twin_worker.engine.pace import SOON, Work
 from twin_worker.horizon import AHEAD
@@ -78,10 +79,40 @@ def _spread(twin: Twin, begin: tuple[Situation, Start]) -> None:
     """Fly the ensemble where it is due."""
     t = float(begin[1].good.t[-1])
     known = twin.spread_t <= t < twin.spread_t + SOON * twin.pace.ensemble and twin.instead is None
-    if twin.hybrid is None or known or not twin.may(Work.ENSEMBLE):
+    twin.put_off = None
+    if twin.hybrid is None or known:
         return
+    if not twin.may(Work.ENSEMBLE):
+        twin.put_off = t
+        return
+    _fly_ensemble(twin, begin, t)
+
+
+def fly_put_off(twin: Twin, seconds: float) -> None:
+    """Fly the ensemble that was due with the last flight, from now, looking so far back; the next one keeps the beat.
+
+    It had to wait for others: the doubt it tells of counts for the next flight.
+    """
+    due, twin.put_off = twin.put_off, None
+    window = twin.window(seconds)
+    if due is None or twin.hybrid is None or window is None or not window.ok[-1] or twin.why_no_route():
+        return
+    now = twin.situation(window)
+    start = set_out(now)
+    if not isinstance(start, Flown):
+        _fly_ensemble(twin, (now, start), due)
+
+
+def _fly_ensemble(twin: Twin, begin: tuple[Situation, Start], t: float) -> None:
+    """Fly the ensemble of `t`; beyond its span the spread goes on as the law of growth does."""
+    assert twin.hybrid is not None
+    ahead = AHEAD[: AHEAD.searchsorted(twin.pace.span, side="right")]
     rng = np.random.default_rng((twin.uav, int(t)))
-    twin.spread, twin.spread_t = ensemble.spread(*begin, twin.hybrid, AHEAD, rng), t
+    found = ensemble.spread(*begin, twin.hybrid, ahead, rng, members=twin.pace.members)
+    if found is not None and len(ahead) < len(AHEAD):
+        law = law_of_growth(HYBRID, AHEAD[len(ahead) - 1 :])
+        found = np.vstack([found, found[-1] * law[1:] / law[0]])
+    twin.spread, twin.spread_t = found, t
 
 
 def in_force(twin: Twin, method: str, ahead: np.ndarray) -> np.ndarray | None:

@@ -136,6 +136,7 @@ class Twin:
     hybrid_t: float = -np.inf  # hybrid last identified
     checked_t: float = -np.inf  # hybrid last flown over what was held out
     spread_t: float = -np.inf  # ensemble last flown
+    put_off: float | None = None  # when an ensemble was due that others were preferred to [s since 1970]
     achievable_t: float = -np.inf  # mission last judged
     turning_t: float = np.inf  # since when predictions are a turn rate alone
     stood: Origin | None = None  # where it last stood disarmed

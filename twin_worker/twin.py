@@ -13,7 +13,8 @@ from twin_worker.conflict.watch import link, watch
 from twin_worker.engine.pace import SOON, Work
 from twin_worker.events.note import note
 from twin_worker.events.watch import watch as watch_events
-from twin_worker.foresee import foresee
+from twin_worker.fly_route import fly_put_off
+from twin_worker.foresee import LOOK_BACK_S, foresee
 from twin_worker.kinds import command_in_force
 from twin_worker.learn import learn
 from twin_worker.memory import Twin, hear
@@ -98,6 +99,8 @@ def _turn(twin: Twin, now: float) -> list[Message]:
         results += renew(twin)
         if not twin.lost and not renewable(twin, twin.history.newest):
             _again(twin, now)
+    if twin.put_off is not None and not twin.lost and twin.may(Work.ENSEMBLE):
+        fly_put_off(twin, LOOK_BACK_S)
     return results
 
 

@@ -18,23 +18,31 @@ class Work(StrEnum):
 
 @dataclass(frozen=True)
 class Pace:
-    """Periods.
+    """Periods, and how large an ensemble is.
 
     Attributes:
         predict: between flights ahead [s]
         identify: between identifications [s]
         ensemble: between ensembles [s]
         renew: between predictions that begin at the newest position without being flown anew; inf: none [s]
+        members: flights of an ensemble
+        span: how far ahead they fly; beyond, doubt grows as the method's law has it [s]
     """
 
     predict: float = 1.0
     identify: float = 1.0
     ensemble: float = 10.0
     renew: float = float("inf")
+    members: int = 24
+    span: float = 180.0
+
+
+_LIMITS = {"members": (12, 1000), "span": (10.0, 180.0)}  # of others: periods
+_PERIODS = (0.02, 3600.0)  # [s]
 
 
 def read_pace(text: str) -> Pace:
-    """Read `--pace predict=2,identify=5`.
+    """Read `--pace predict=2,identify=5,members=50`.
 
     Raises:
         argparse.ArgumentTypeError: when it names no such work, or no time; argparse shows the sentence.
@@ -47,7 +55,11 @@ def read_pace(text: str) -> Pace:
             found[name] = float(seconds)
         except ValueError:
             found[name] = float("nan")
-        if name not in names or not 0.02 <= found[name] <= 3600.0:
-            said = f"found {part!r}, expected one of {', '.join(names)} and seconds, e.g. identify=5; correct it"
+        low, high = _LIMITS.get(name, _PERIODS)
+        if name not in names or not low <= found[name] <= high:
+            said = (
+                f"found {part!r}, expected one of {', '.join(names)}, {low:g} to {high:g}, e.g. identify=5; correct it"
+            )
             raise argparse.ArgumentTypeError(said)
-    return Pace(**found)
+    members = int(found.pop("members", Pace.members))
+    return Pace(**found, members=members)  # type: ignore[arg-type]

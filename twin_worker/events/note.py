@@ -28,7 +28,7 @@ def note(twin: "Twin", event: Event, t: float, particulars: str = "") -> None:
 
 def void(twin: "Twin", event: Event | None, t: float, particulars: str = "") -> None:
     """End the running prediction: the aircraft flies by something else from `t` on; no event is told for None."""
-    twin.since, twin.predict_t, twin.spread_t, twin.base = t, -np.inf, -np.inf, None
+    twin.since, twin.predict_t, twin.spread_t, twin.base, twin.put_off = t, -np.inf, -np.inf, None, None
     twin.record.forget()
     twin.contest.forget()
     if event is not None:

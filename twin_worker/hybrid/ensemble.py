@@ -12,7 +12,7 @@ from twin_worker.hybrid.fly import begin, over_ground, rest
 from twin_worker.predict import Situation, Start
 
 MEMBERS = 24
-_LEAST = 12  # of them must stay in their envelope
+_LEAST = 0.5  # share of them that must stay in their envelope [-]
 _POSITION = 0.4  # standard deviation of the position at the start [m]
 _VELOCITY = 0.1  # of the ground velocity [m/s]
 _AIRSPEED = 0.35  # of the airspeed [m/s]
@@ -50,7 +50,7 @@ def draw(
 
 
 def spread(
-    now: Situation, start: Start, found: Hybrid, ahead: np.ndarray, rng: np.random.Generator
+    now: Situation, start: Start, found: Hybrid, ahead: np.ndarray, rng: np.random.Generator, *, members: int = MEMBERS
 ) -> np.ndarray | None:
     """Fly the bundle; give its standard deviations along, cross and vertical about the first member, (k, 3) [m].
 
@@ -60,14 +60,15 @@ def spread(
         now, start, found: as for `fly_hybrid`
         ahead: look-ahead times in whole steps of `fleet.hybrid.COARSE`, rising, (k,) [s]
         rng: source of chance
+        members: how many fly
     """
-    chance = rng.standard_normal((MEMBERS, int(ahead[-1]) + 1, 4))
+    chance = rng.standard_normal((members, int(ahead[-1]) + 1, 4))
     chance[0] = 0.0
-    out = np.empty((MEMBERS, len(ahead), 3))
+    out = np.empty((members, len(ahead), 3))
     at = np.rint(ahead / H.COARSE).astype(np.int64)
     H.bundle(start.control, *draw(now, start, found, chance, rng), chance, at, out)  # type: ignore[call-arg]
     stays = np.isfinite(out.reshape(len(out), -1).sum(axis=1))
-    if not stays[0] or stays.sum() < _LEAST:
+    if not stays[0] or stays.sum() < _LEAST * members:
         return None
     along, miss = track_frame(out[0]), out[1:][stays[1:]] - out[0]
     ahead_, across = (miss[..., :2] * along).sum(axis=-1), miss[..., 1] * along[:, 0] - miss[..., 0] * along[:, 1]

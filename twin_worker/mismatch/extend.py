@@ -74,7 +74,7 @@ def extend(twin: Twin, push: Push, names: str) -> Tried:
         return Tried(False, present, extended)
     for name in ("wind", "wind_t", "plant", "last", "pool", "hybrid", "near_hybrid", "in_force", "learn_from"):
         setattr(twin, name, getattr(other, name))
-    twin.near, twin.predict_t, twin.spread_t, twin.told_t = None, -np.inf, -np.inf, -np.inf
+    twin.near, twin.predict_t, twin.spread_t, twin.put_off, twin.told_t = None, -np.inf, -np.inf, None, -np.inf
     twin.grid.clear()
     twin.extended = Extension(names, push.onset)
     return Tried(True, present, extended)

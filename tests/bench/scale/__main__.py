@@ -4,8 +4,8 @@
     python -m tests.bench.scale --only hundred
     python -m tests.bench.scale --only curve --uavs 50 100 200 500 --pace predict=5,identify=10,ensemble=10
 
-hundred   identification every second, ensembles every two (24 members, 180 s ahead: 4,320 s flown, where 50 members of
-          60 s are 3,000 s), flights ahead with them: nothing may be late, nothing shed
+hundred   identification every second, ensembles of 50 members of 60 s every two, flights ahead with them: nothing may
+          be late, nothing shed
 most      500 aircraft, every sample kept, a flight ahead every second; identification and ensembles as often as fits
 curve     CPU of the workers over the number of aircraft at fixed rates; the slope of its logarithms
 
@@ -30,7 +30,7 @@ from tests.bench.referee.site import fly
 
 from .watched import Size, watch
 
-HUNDRED = "predict=2,identify=1,ensemble=2,renew=1"
+HUNDRED = "predict=2,identify=1,ensemble=2,renew=1,members=50,span=60"
 MOST = "predict=1,identify=30,ensemble=30"
 CURVE = "predict=5,identify=10,ensemble=10"
 KINDS = ("hundred", "most", "curve")
