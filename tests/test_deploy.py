@@ -139,6 +139,29 @@ def test_workers_scale_by_replicas_and_a_new_one_joins_before_an_old_one_goes() 
     assert worker["spec"]["strategy"]["rollingUpdate"] == {"maxSurge": 1, "maxUnavailable": 0}
 
 
+def test_a_router_in_a_container_is_not_process_1_which_would_not_hear_sigterm() -> None:
+    assert composed()["router"]["init"] is True
+    (pod,) = [pod for name, _, pod in containers() if name == "parauav-router"]
+    assert pod["shareProcessNamespace"] is True
+
+
+def test_secrets_that_are_made_are_those_that_are_mounted() -> None:
+    (made,) = re.findall(r"^#   for role in (.*); do$", (DEPLOY / "kustomization.yaml").read_text(), re.M)
+    mounted = {
+        volume["secret"]["secretName"] for *_, pod in containers() for volume in pod["volumes"] if "secret" in volume
+    }
+    assert {f"parauav-{role}" for role in made.split()} == mounted
+
+
+def test_keys_get_into_no_commit_and_no_image() -> None:
+    ignored = subprocess.run(["git", "check-ignore", "deploy/certificates/ca.key"], cwd=ROOT, check=False)
+    assert ignored.returncode == 0
+    kept = (ROOT / ".dockerignore").read_text().split("\n**\n")[1].splitlines()
+    copied = re.findall(r"^COPY (.*) \S+$", (DEPLOY / "Dockerfile").read_text(), re.M)
+    assert kept[-1] == "**/__pycache__"
+    assert {line.removeprefix("!") for line in kept[:-1]} == {name for names in copied for name in names.split()}
+
+
 def test_files_that_are_mounted_or_named_exist() -> None:
     for service in composed().values():
         for volume in service["volumes"]:

@@ -4,6 +4,7 @@ import contextlib
 import gzip
 import http
 import io
+import logging
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
@@ -48,6 +49,7 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
     """
     # A page may close while it is drawn: what was on its way to it then goes nowhere, which is no news.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
+    logging.getLogger("websockets.server").setLevel(logging.WARNING)  # to it each page fetched is a connection rejected
     _read_icons()
     with quiet(), _guarded({*HOME, host.strip("[]").lower(), *filter(None, [name.lower()])}, anyone=_is_any(host)):
         server = viser.ViserServer(host=host, port=port, verbose=False)
