@@ -1,8 +1,10 @@
 """What `fleet doctor` and `fleet status` say of a fleet: every finding is provoked, every bad one ends in a cure."""
 
+import contextlib
 import io
 import json
 import re
+import socket
 import time
 from collections.abc import Callable, Iterable
 from datetime import timedelta
@@ -14,10 +16,11 @@ from rich.console import Console
 
 from fleet import SOURCES, cli
 from fleet.access.entry import Entry
+from fleet.access.knock import _cure
 from fleet.bus import open_router
 from fleet.commands.status import machines, processes, spans
 from fleet.contract import Account, Claim, FleetRow, FleetState, LinkAccount, State, Status
-from fleet.examine import claims, door
+from fleet.examine import claims, door, machine
 from fleet.examine.finding import BAD, NOTE, OK
 from fleet.memory_bus import MemoryBus
 from tests.bench.security.bombs import ESCAPES
@@ -97,6 +100,20 @@ def test_what_is_wrong_is_found_with_its_cure(make: Callable[[], MemoryBus], gra
     assert any(re.search(sentence, line) for line in lines), lines
 
 
+def test_a_release_that_all_have_but_this_machine_is_not_taken_for_a_mixture() -> None:
+    bus = of(claim(ONE, FOUR, code="other"), code="other")
+    assert found(bus, NOTE) == ["versions: all 2 processes are of one release, this is another; install theirs"]
+
+
+def test_the_port_our_own_gateway_has_is_no_finding() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
+        with contextlib.suppress(OSError):  # some gateway of this machine may hold it just as well
+            held.bind(("0.0.0.0", machine.MAVLINK_PORT))
+        assert machine.mavlink_port(["udpin:0.0.0.0:14550"]).grade == OK
+        taken = machine.mavlink_port(["udpin:0.0.0.0:14551"])
+        assert taken.grade == NOTE and "--link udpin" in taken.sentence
+
+
 def test_the_clock_of_a_gateways_machine_counts_too() -> None:
     assert any("gs: 30.0 s behind" in line for line in found(of(claim(ONE, FOUR), now=time.time() - 30.0), BAD))
 
@@ -154,7 +171,24 @@ def test_certificates_are_judged_by_their_end_and_the_fleet_behind_them_is_seen(
     gone = [
         one for one in door.papers(Entry(at, "viewer", expired(site, "viewer", tmp_path / "old"))) if one.grade == BAD
     ]
-    assert "expired on" in gone[0].sentence and "renew it" in gone[0].sentence
+    assert "expired on" in gone[0].sentence and "renew it: certificates.sh role FOLDER viewer" in gone[0].sentence
+
+
+def test_a_routers_certificate_is_renewed_as_one(site: Path, tmp_path: Path) -> None:
+    for name, ended in (("past", timedelta(days=1)), ("soon", timedelta(days=-3))):
+        folder = expired(site, "router", tmp_path / name, ended=ended)
+        lines = [one.sentence for one in door.papers(Entry("tls/127.0.0.1:1", "tools", folder))]
+        assert any("renew it: certificates.sh router FOLDER NAME" in line for line in lines), name
+
+
+def test_why_a_router_is_not_believed_decides_what_helps(site: Path, tmp_path: Path) -> None:
+    named = tmp_path / "named"
+    make_papers(named, "router.example", authority=site)
+    at = f"tls/127.0.0.1:{unused_port()}"
+    with open_router(Entry(at, certificates=named)):
+        (bad,) = [one for one in door.router(Entry(at, "tools", site)) if one.grade == BAD]
+    assert "make one for this name too (certificates.sh router FOLDER NAME...)" in bad.sentence
+    assert "set the clock" in _cure("certificate is not yet valid") and "restart" in _cure("certificate has expired")
 
 
 def test_a_network_in_the_clear_is_noted(site: Path) -> None:

@@ -44,7 +44,7 @@ def answers(entry: Entry) -> bool:
     except ssl.SSLCertVerificationError as error:
         raise ConnectionError(
             f"router {entry.at}: found its certificate not to be believed ({error.verify_message}), expected one for "
-            "this name, by the authority in ca.pem; copy the site's ca.pem here, or renew the router's certificate"
+            f"this name, by the authority in ca.pem; {_cure(error.verify_message)}"
         ) from None
     except ssl.SSLError as error:
         raise ConnectionError(
@@ -83,6 +83,16 @@ def _refused(secure: ssl.SSLSocket) -> None:
             raise ConnectionError("it hung up")
     except TimeoutError:
         return
+
+
+def _cure(refusal: str) -> str:
+    if "not yet valid" in refusal:
+        return "set the clock of this machine, and let all follow one time server (chrony, systemd-timesyncd)"
+    if "expired" in refusal:
+        return "certificates.sh router FOLDER NAME... and restart the router, or set this clock if it is ahead"
+    if "mismatch" in refusal:
+        return "make one for this name too (certificates.sh router FOLDER NAME...), or call the router by another name"
+    return "copy the site's ca.pem here, or have the router's certificate made by its authority"
 
 
 def _said(error: ssl.SSLError) -> str:

@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 from cryptography import x509
 
+from fleet.access.roles import ROUTER_ROLE
+
 HOW = "make them with deploy/certificates.sh"
 MOST_PASSWORD = 1024
 
@@ -31,11 +33,12 @@ def papers_of(folder: Path, role: str) -> Papers:
         if not path.is_file():
             raise ValueError(f"certificates: found no {path}, expected it for the role {role}; {HOW}, or copy it here")
     private(papers.key)
-    ends = ending(papers.certificate)
-    if ends < datetime.now(UTC):
+    ends, now = ending(papers.certificate), datetime.now(UTC)
+    if ends < now:
+        names = "router FOLDER NAME..." if role == ROUTER_ROLE else f"role FOLDER {role}"
         raise ValueError(
-            f"certificates: found {papers.certificate} expired on {ends:%Y-%m-%d %H:%M} UTC; renew it: "
-            f"certificates.sh role {folder} {role}"
+            f"certificates: found {papers.certificate} expired on {ends:%Y-%m-%d %H:%M} UTC, this clock says "
+            f"{now:%Y-%m-%d %H:%M}; renew it: certificates.sh {names}, and copy it here"
         )
     return papers
 

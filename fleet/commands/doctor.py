@@ -6,12 +6,14 @@ clocks and sources of all machines, who writes for which aircraft, which have no
 
 import argparse
 import json
+import platform
 import sys
 from collections.abc import Iterator
 
 from fleet.access.entry import Entry
 from fleet.bus import connect
 from fleet.config import entry, router_arguments
+from fleet.contract import Account
 from fleet.examine import claims, door, machine
 from fleet.examine.finding import BAD, Finding
 from fleet.plain import plain
@@ -48,6 +50,7 @@ def _looked(at: Entry) -> Iterator[Finding]:
     yield from door.papers(at)
     there = yield from door.router(at)
     if not there:
+        yield machine.mavlink_port()
         return
     try:
         bus = connect(at)
@@ -55,4 +58,6 @@ def _looked(at: Entry) -> Iterator[Finding]:
         yield Finding(BAD, "router", str(error))
         return
     with bus:
+        here = [account for account, _ in bus.ask(Account) if account.machine == platform.node()]
+        yield machine.mavlink_port([link for account in here for link in account.links])
         yield from claims.look(bus)

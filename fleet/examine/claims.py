@@ -110,7 +110,11 @@ def _sources(seen: Seen) -> Iterator[Finding]:
     told: list[tuple[str, str, str]] = [("twin_worker", c.machine or w, c.code) for w, c in seen.claims.items()]
     told += [("gateway", account.machine, account.code) for account in seen.accounts]
     strange = sorted({f"{what} on {machine or 'a machine'}" for what, machine, code in told if code != SOURCES})
-    if strange:
+    if strange and len(strange) == len(told) and len({code for *_, code in told}) == 1:
+        yield Finding(
+            NOTE, "versions", f"all {len(told)} processes are of one release, this is another; install theirs"
+        )
+    elif strange:
         cure = "twins are not handed over between them; install the same release everywhere, and restart"
         yield Finding(NOTE, "versions", f"{', '.join(strange)}: other sources than here; {cure}")
     elif told:

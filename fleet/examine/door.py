@@ -34,7 +34,8 @@ def papers(at: Entry) -> Iterator[Finding]:
     for role in roles:
         try:
             papers_of(at.certificates, role)
-            yield _until(role, at.certificates / f"{role}.pem", f"certificates.sh role {at.certificates} {role}")
+            names = "router FOLDER NAME..." if role == ROUTER_ROLE else f"role FOLDER {role}"
+            yield _until(role, at.certificates / f"{role}.pem", f"certificates.sh {names}, and copy it here")
         except (ValueError, OSError) as error:
             yield Finding(BAD, "certificates", str(error).removeprefix("certificates: "))
     yield _authority(at.certificates)
@@ -42,7 +43,7 @@ def papers(at: Entry) -> Iterator[Finding]:
 
 def _authority(folder: Path) -> Finding:
     try:
-        found = _until("authority", folder / "ca.pem", f"certificates.sh next-ca {folder}")
+        found = _until("authority", folder / "ca.pem", "certificates.sh next-ca FOLDER: Renewal in deploy/README.md")
     except (ValueError, OSError) as error:
         return Finding(BAD, "certificates", str(error).removeprefix("certificates: "))
     if found.grade == OK and (folder / "ca.key").exists():
@@ -90,6 +91,8 @@ def _shown(at: Entry, folder: Path) -> Iterator[Finding]:
     context = ssl.create_default_context(cafile=str(folder / "ca.pem"))
     context.verify_flags &= ~ssl.VERIFY_X509_STRICT
     try:
+        if (own := at.papers()) is not None:  # or the router complains of us in its log
+            context.load_cert_chain(*own)
         with (
             socket.create_connection(endpoint(at.at), timeout=3.0) as plain,
             context.wrap_socket(plain, server_hostname=endpoint(at.at)[0]) as secure,

@@ -5,7 +5,7 @@ import os
 import shutil
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from fleet.examine.finding import Finding
@@ -18,7 +18,7 @@ def look() -> Iterator[Finding]:
     """Look at everything."""
     yield python()
     yield from packages()
-    yield from (compile_cache(), mavlink_port(), chromium(), recordings())
+    yield from (compile_cache(), chromium(), recordings())
 
 
 def python() -> Finding:
@@ -59,11 +59,14 @@ def compile_cache() -> Finding:
     return Finding("ok", "compile cache", f"{folder}: {state}")
 
 
-def mavlink_port() -> Finding:
-    """Check that aircraft could reach us at the usual UDP port."""
+def mavlink_port(links: Collection[str] = ()) -> Finding:
+    """Check that aircraft could reach us at the usual UDP port; links: those a gateway of this machine has open."""
+    if any(f":{MAVLINK_PORT}" in link for link in links):
+        return Finding("ok", "mavlink", f"udp port {MAVLINK_PORT} is our gateway's")
     if free(socket.SOCK_DGRAM, "0.0.0.0", MAVLINK_PORT):
         return Finding("ok", "mavlink", f"udp port {MAVLINK_PORT} is free")
-    return Finding("note", "mavlink", f"udp port {MAVLINK_PORT} is taken; name another: --link udpin:0.0.0.0:14551")
+    cure = "well where a gateway's container has it, else name another: --link udpin:0.0.0.0:14551"
+    return Finding("note", "mavlink", f"udp port {MAVLINK_PORT} is taken; {cure}")
 
 
 def free(kind: socket.SocketKind, host: str, port: int) -> bool:
