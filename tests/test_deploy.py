@@ -9,6 +9,7 @@ import re
 import shlex
 import shutil
 import subprocess
+import tomllib
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -151,6 +152,14 @@ def test_secrets_that_are_made_are_those_that_are_mounted() -> None:
         volume["secret"]["secretName"] for *_, pod in containers() for volume in pod["volumes"] if "secret" in volume
     }
     assert {f"parauav-{role}" for role in made.split()} == mounted
+
+
+def test_the_readme_makes_certificates_where_its_configuration_looks_for_them() -> None:
+    text = (ROOT / "README.md").read_text()
+    (folder,) = re.findall(r"certificates\.sh all (\S+) ", text)
+    (config,) = set(re.findall(r"--config (deploy/\S+)", text))
+    told = tomllib.loads((ROOT / config).read_text())["router"]
+    assert ROOT / folder == (ROOT / config).parent / told["certificates"]
 
 
 def test_keys_get_into_no_commit_and_no_image() -> None:
