@@ -25,9 +25,12 @@ from test_readme import MAINS, commands, understood
 from fleet.access.roles import ROLES, ROUTER_ROLE
 from fleet.bus import connect
 from fleet.codec import decode, encode
-from fleet.contract import Prediction
+from fleet.contract import Account, FleetState, Prediction, Status
+from fleet.memory_bus import MemoryBus
+from gateway import metrics as gateway
 from tests.bench.security.site import REAL, Site, make_papers, routed, zenohd
 from tests.bench.security.trying import until
+from twin_worker import metrics as twin_worker
 
 DEPLOY = ROOT / "deploy"
 README = (DEPLOY / "README.md").read_text()
@@ -189,6 +192,14 @@ def test_files_that_are_mounted_or_named_exist() -> None:
     assert all((DEPLOY / name).is_file() for name in named)
     for name in re.findall(r"`([\w./-]+\.(?:json5|toml|sh|yaml|py))`", README):
         assert (DEPLOY / name).is_file() or (ROOT / name).is_file(), name
+
+
+def test_metrics_worth_an_alarm_are_told_by_exactly_these_names() -> None:
+    worker = twin_worker.counters(lambda: EXAMPLES[FleetState], MemoryBus())
+    link = gateway.counters(lambda: (EXAMPLES[Account], [EXAMPLES[Status]]))
+    told = {sample.name for metric in (*worker(), *link()) for sample in metric.samples}
+    named = set(re.findall(r"`(parauav_\w+)`", README))
+    assert len(named) > 4 and named <= told, named - told
 
 
 def test_kubectl_takes_the_manifests() -> None:
