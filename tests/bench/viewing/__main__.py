@@ -8,8 +8,10 @@ A router, the feeder, the viewer as an operator starts it, one browser with soft
 clients, all on this machine: the browser takes the most of it. `server_cpu` is of one core, all threads of the viewer.
 `clients` are bytes received: of the browser, then of the three. `pose_to_screen` is from the publishing of a sample to
 the first frame with its place. `plain`: a scene with a node for each aircraft, on the same feed, without a browser in
-the way. `callback_floor`: what a process takes of one core that hears the same and does nothing in a Python callback
-for each message; `collect_floor`: the same where messages are put aside and taken out ten times a second.
+the way. `selection`: from the press on a row until the panel names that UAV; beside it the floor, a press that changes
+one number on the same page. `callback_floor`: what a process takes of one core that hears the same and does nothing in
+a Python callback for each message; `collect_floor`: the same where messages are put aside and taken out ten times a
+second.
 """
 
 import argparse
@@ -80,7 +82,7 @@ def without_page(args: argparse.Namespace, router: str, feeder: Any) -> dict[str
 def with_page(args: argparse.Namespace, router: str, feeder: Any) -> dict[str, Any]:
     """Watch with a browser and three clients; then click, then kill the server and start it again."""
     port = free_port()
-    command = "viewer", "--port", str(port), "--router", router
+    command = "tests.bench.viewing.echo", "--port", str(port), "--router", router
     viewer = start(*command)
     cable = Cable(port)
     with Page(args.chromium) as page:

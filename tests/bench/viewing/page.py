@@ -44,6 +44,13 @@ CLICK = """uav => new Promise((done, fail) => {
     : performance.now() - began > 5000 ? done(5000) : setTimeout(look, 2);
   look();
 })"""
+ECHO = """() => new Promise(done => {
+  const echo = () => document.querySelector('.echo'), before = echo().textContent, began = performance.now();
+  echo().dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}));
+  const look = () => echo().textContent !== before ? done(performance.now() - began)
+    : performance.now() - began > 5000 ? done(5000) : setTimeout(look, 2);
+  look();
+})"""
 ROWS = "[...document.querySelectorAll('tr.pick')].map(e => Number(e.dataset.uav))"
 
 
@@ -109,17 +116,19 @@ class Page:
         self.page.wait_for_function("window.__told.ages.length > 0", timeout=60_000, polling=10)
 
     def clicks(self, n: int) -> dict[str, float]:
-        """Select by row clicks; give how long until the panel shows the new one [ms]."""
-        took = []
+        """Select by row clicks; give how long until the panel shows the new one, and a press of the echo its answer."""
+        took, least = [], []
         for k in range(n):
             rows = self.page.evaluate(ROWS)
             ms = self.page.evaluate(CLICK, rows[(7 * k + 3) % len(rows)]) if rows else None
             took += [ms] if ms is not None and ms > 1.0 else []  # one that was selected already is no answer
+            least.append(self.page.evaluate(ECHO))
         found = np.array(took or [np.nan])
         return {
             "n": len(took),
             "ms_median": round(float(np.median(found)), 1),
             "ms_worst": round(float(found.max()), 1),
+            "floor_ms_median": round(float(np.median(least)), 1),
         }
 
     def picture(self, file: Path) -> None:
