@@ -201,7 +201,7 @@ def test_a_click_in_3d_selects_the_same_uav(page) -> None:
 
 def test_a_row_click_selects(page) -> None:
     for uav in (7, 12):
-        page.locator(f'tr[data-uav="{uav}"]').click()
+        page.locator(f'tr[data-uav="{uav}"]').dispatch_event("pointerdown")
         selected(page, f"UAV-{uav:03d}")
 
 
@@ -239,7 +239,7 @@ def test_hostile_words_stay_words(page, errors: list[str]) -> None:
 
 def test_letters_without_end_and_places_that_are_none_break_nothing(page, errors: list[str]) -> None:
     for uav, words in ((LONG, "y" * 400), (ABROAD, "km from the fleet's first"), (NOWHERE, "mean fit")):
-        page.locator(f'tr[data-uav="{uav}"]').click()
+        page.locator(f'tr[data-uav="{uav}"]').dispatch_event("pointerdown")
         selected(page, f"UAV-{uav:03d}")
         page.locator(".uav .say", has_text=words).first.wait_for(timeout=8_000)
     assert max(page.evaluate("[...document.querySelectorAll('.uav .say')].map(e => e.innerText.length)")) < 700

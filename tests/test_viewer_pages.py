@@ -20,6 +20,7 @@ from viewer.door import quiet, serve
 from viewer.palette import DARK, LIGHT
 from viewer.remembered import Remembered
 from viewer.view import View
+from viewer.words import table
 
 
 @pytest.fixture
@@ -102,6 +103,29 @@ def test_a_click_on_an_alert_selects_and_shows_its_time(site) -> None:
     for mischief in ("", "x", "7@", "9999999", "1@1e400", "1@nan", "1@-3", "²", "3@" + "9" * 100):
         view.panels._pick(mischief)
     assert view.timeline.player.t == pytest.approx(then, abs=2e-3)
+
+
+def test_who_is_selected_is_drawn_ahead_of_lists_and_charts(site, monkeypatch) -> None:
+    view = site.views[0]
+    view.choose(3)
+    monkeypatch.setattr(view.panels, "draw", told := MagicMock(wraps=view.panels.draw))
+    site.app.answer()
+    assert view.selection.tags[0].text.startswith("UAV-003") and not told.called
+    site.run(1)
+    assert told.called
+
+
+def test_nothing_is_held_back_while_lists_are_made(site, monkeypatch) -> None:
+    view, held = site.views[0], []
+    buffer = view.client._websock_connection.get_message_buffer()
+
+    def made(*given, **named) -> str:
+        held.append(buffer.atomic_counter)
+        return table(*given, **named)
+
+    monkeypatch.setattr("viewer.panels.table", made)
+    site.run()
+    assert held and not any(held)
 
 
 def test_a_click_is_written_as_it_is_read() -> None:

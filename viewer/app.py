@@ -110,15 +110,11 @@ class App:
             view.frame(self._cloud, self._news(), self._ground)
 
     def answer(self) -> None:
-        """Draw at once what was just selected."""
+        """Draw at once who was just selected; lists and charts follow at the next tick."""
         now = time.monotonic()
         for view in list(self.views.values()):
             if view.dirty:
-                guarded(view, partial(self._answer, view, now))
-
-    def _answer(self, view: View, now: float) -> None:
-        view.settle(self.flock, now, self._ground)
-        view.point(self.flock, now)
+                guarded(view, partial(view.turn, self.flock, now, self._ground))
 
     def _welcome(self) -> None:
         """Open a view for who has come, forget who has gone, draw anew who wants other colours."""
@@ -190,8 +186,7 @@ class App:
 def guarded(view: View, draw: Callable[[], None]) -> None:
     """Draw something on one page; a defect met there is said there and in the log, and ends no other page."""
     try:
-        with view.client.atomic():
-            draw()
+        draw()
     except Exception as error:
         if view.stumble(f"{type(error).__name__}: {error}"):
             _log.exception("page %d could not be drawn; the others go on", view.client.client_id)

@@ -109,29 +109,30 @@ class Panels:
 
     def draw(self, fleet: list[Vehicle], feed: Feed, now: float, selected: int | None) -> None:
         """Write everything anew; call it about once a second, and when the selection changes."""
-        self._beat = not self._beat
-        self._banner.content = f'<div class="stale {"a" if self._beat else "b"}">{STALE}</div>'
-        self._notices.content = notices(feed, self._router.say(feed.router, now), self.ground_said, self._palette)
+        self._beat, palette, pick = not self._beat, self._palette, self._handler()
         chosen = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
-        if not fleet:
-            self._summary.content, self._table.content = empty(feed, now), ""
-        else:
-            self._summary.content = summary(fleet, feed, self._palette, now)
-            kept = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
-            self._table.content = table(
-                kept, self._palette, now, total=len(fleet), pick=self._handler(), selected=selected
-            )
-            self._list(kept, now)
-        self._legend.content = legend(fleet, self._palette)
+        kept = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
         self._presence.here()
-        self._since.content = since(fleet, self._presence.away, self._palette, self._handler())
-        self._read.visible = bool(self._since.content)
-        self._alerts.content = alerts(fleet, feed, self._palette, self._handler())
-        self.show(chosen, now)
-        self._facts.content = facts(chosen, now) if chosen is not None else ""
-        told = listing(chosen.events, self._palette, self.seek) if chosen is not None else ""
-        if told != self._events.content:  # written anew, a list somebody scrolls would jump to its top
-            self._events.content = told
+        missed = since(fleet, self._presence.away, palette, pick)
+        said = (
+            (self._banner, f'<div class="stale {"a" if self._beat else "b"}">{STALE}</div>'),
+            (self._notices, notices(feed, self._router.say(feed.router, now), self.ground_said, palette)),
+            (self._summary, summary(fleet, feed, palette, now) if fleet else empty(feed, now)),
+            (self._table, table(kept, palette, now, total=len(fleet), pick=pick, selected=selected) if fleet else ""),
+            (self._legend, legend(fleet, palette)),
+            (self._since, missed),
+            (self._alerts, alerts(fleet, feed, palette, pick)),
+            (self._facts, facts(chosen, now) if chosen is not None else ""),
+        )
+        with self._browser.client.atomic():  # made first: while it lasts, nothing else is sent
+            for html, text in said:
+                html.content = text
+            self._list(kept, now)
+            self._read.visible = bool(missed)
+            self.show(chosen, now)
+            told = listing(chosen.events, palette, self.seek) if chosen is not None else ""
+            if told != self._events.content:  # written anew, a list somebody scrolls would jump to its top
+                self._events.content = told
         self._charts.draw(chosen, feed, now)
         self._commands.offer(fleet)
 

@@ -136,7 +136,10 @@ class View:
 
     def move(self, flock: Flock, now: float, tick: int) -> None:
         """Draw what moves: aircraft at the full rate, heads of trails, stems and the selected UAV more slowly."""
-        flock = self.timeline.flock(flock, self.selected, now)
+        with self.client.atomic():
+            self._move(self.timeline.flock(flock, self.selected, now), now, tick)
+
+    def _move(self, flock: Flock, now: float, tick: int) -> None:
         self.scene.glyphs.draw(flock)
         if tick % (10 if flock.crowd else 2) == 0:
             self.scene.draw_heads(flock, self.selected)
@@ -145,12 +148,18 @@ class View:
         if tick % 5 == 0 and not self.timeline.player.live:
             self.timeline.draw(self.selected)
         if tick % 2 == 0:
-            self.point(flock, now)
+            self._point(flock, now)
         self._follow(now)
 
-    def point(self, flock: Flock, now: float) -> None:
+    def turn(self, flock: Flock, now: float, ground: float) -> None:
+        """Draw at once whom one has turned to: path, route, tube, labels."""
+        with self.client.atomic():
+            self._draw_chosen(now, ground)
+            self._point(self.timeline.flock(flock, self.selected, now), now)
+        self.client.flush()
+
+    def _point(self, flock: Flock, now: float) -> None:
         """Draw the selected UAV, size everybody for where the camera is, and label."""
-        flock = self.timeline.flock(flock, self.selected, now)
         sight, scene = self.camera.sight(), self.scene
         scene.glyphs.draw(flock)  # at another time others may be there
         size = self.panels.glyph.value
@@ -170,9 +179,13 @@ class View:
         self._recall(flock)
         self.timeline.draw(self.selected)
         self.panels.draw(flock.fleet, self._feed, flock.now, self.selected)
-        place, options, scene = self._feed.place, self.panels, self.scene
-        if place is None or not flock.uavs:
-            return
+        if (place := self._feed.place) is not None and flock.uavs:
+            with self.client.atomic():
+                self._draw(flock, now, place, ground)
+        self._recover()
+
+    def _draw(self, flock: Flock, now: float, place: Place, ground: float) -> None:
+        options, scene = self.panels, self.scene
         scene.ground.raise_to(ground)
         scene.draw_trails(flock, self.selected)
         scene.draw_predicted(flock, now, self.selected if options.tube.value else None)
@@ -183,8 +196,7 @@ class View:
         others = [v for v in flock.fleet if v.uav != self.selected] if options.routes.value else []
         scene.draw_routes([route(v.mission, place, ground) for v in others])
         self.selection.tube = options.tube.value
-        self._draw_chosen(now, place, ground)
-        self._recover()
+        self._draw_chosen(now, ground)
 
     def _recall(self, flock: Flock) -> None:
         """Select whom this browser had selected, once it is there; without anybody selected, the first predicted."""
@@ -195,10 +207,10 @@ class View:
             self.selected = max(known, key=lambda v: (v.forecast is not None, -v.uav)).uav
         remembered.keep(self.selected)
 
-    def _draw_chosen(self, now: float, place: Place, ground: float) -> None:
+    def _draw_chosen(self, now: float, ground: float) -> None:
         """Draw the selected UAV's flown path and mission."""
-        chosen = self.chosen()
-        if chosen is None:
+        chosen, place = self.chosen(), self._feed.place
+        if chosen is None or place is None:
             return
         self.selection.draw_flight(chosen, self._feed.track(chosen), now, self.scene.glyphs.unit)
         own = route(chosen.mission, place, ground)
@@ -225,7 +237,8 @@ class View:
         self._framed = np.stack([cloud.min(axis=0), cloud.max(axis=0)])
         if grown:  # it will go on growing: make room, rather than move the picture every second
             cloud = cloud.mean(axis=0) + (cloud - cloud.mean(axis=0)) * [ROOM, ROOM, 1.0]
-        self.camera.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, ground]]), again=self._again)
+        with self.client.atomic():
+            self.camera.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, ground]]), again=self._again)
         self._again = False
 
     def _follow(self, now: float) -> None:
