@@ -11,6 +11,7 @@ IN_VIEW_M = 20_000.0  # what is farther from the middle of the fleet is not fram
 CLOSE = 1.3  # room round an aircraft one turns to, for its labels [-]
 BELOW = 0.12  # of the picture's height that the timeline takes [-]
 CLOSEST = 5.0  # no nearer, however little there is to see [10 m]
+NOBODY = 60.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)  # seen while nobody is there [10 m]
 VIEW = (np.radians(-125.0), np.radians(38.0))  # where the camera stands: azimuth from east, elevation [rad]
 
 
@@ -98,10 +99,8 @@ class Camera:
         camera.position, camera.look_at = camera.position + step, camera.look_at + step
 
 
-def start_at(server: Any, points: np.ndarray | None = None) -> None:
+def start_at(server: Any, points: np.ndarray = NOBODY) -> None:
     """Say where a page that opens from now on looks from; points (n, 3) [10 m] are framed."""
     start = server.initial_camera
-    if points is None:
-        start.fov, start.near, start.far = FOV, 0.1, 5000.0
-    else:
-        start.position, start.look_at = frame(points, 1.0)
+    start.fov, start.near, start.far = FOV, 0.1, 5000.0
+    start.position, start.look_at = frame(points, 1.0)
