@@ -2,7 +2,9 @@
 
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from pretend_feed import HOSTILE, STAMP, Clock, PretendUav, T, feed_of
 from test_gateway import flight
@@ -13,9 +15,13 @@ from gateway.pump import Pump
 from gateway.recorded import Replay
 from gateway.spec import read_spec
 from viewer import feed as feeds
+from viewer.camera import start_at
 from viewer.detail import about
 from viewer.feed import Feed
+from viewer.ground import RINGS_M
+from viewer.labels import Sight
 from viewer.palette import DARK
+from viewer.place import UNIT_M
 from viewer.states import LETTERS, Router, notices
 from viewer.words import empty, summary
 
@@ -107,3 +113,25 @@ def test_identifying_says_why_there_is_no_horizon_and_for_how_long(clock: Clock)
         bus.publish(uav.model(T + k), STAMP)
     page = about(feed.one(1), DARK, clock.now)
     assert "No horizon yet" in page and "window has 41 samples" in page and "heard for 45 s" in page
+
+
+def test_who_is_lost_is_not_said_to_have_a_slow_worker(clock: Clock) -> None:
+    feed, _, bus = feed_of(clock, 1)
+    bus.publish(PretendUav(0).prediction(T, 0.0), STAMP)
+    for k in range(1, 8):
+        clock.now += 1.0
+        bus.publish(PretendUav(0).sample(T + k - 1, T + k))
+    behind = about(feed.one(0), DARK, clock.now)
+    assert "has fallen behind; let fewer" in behind and "recording" not in behind
+    clock.now += 5.0
+    lost = about(feed.one(0), DARK, clock.now)
+    assert "12 s old." in lost and "No sample for 5 s" in lost and "fallen behind" not in lost
+
+
+def test_an_empty_page_looks_at_the_ground_and_its_first_ring() -> None:
+    server = SimpleNamespace(initial_camera=SimpleNamespace())
+    start_at(server)
+    start, turn = server.initial_camera, np.linspace(0.0, 2 * np.pi, 40)
+    ring = RINGS_M[0] / UNIT_M * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=-1)
+    spots, depth = Sight(start.position, start.look_at, start.fov, 1.0).project(ring)
+    assert (depth > 0).all() and (np.abs(spots) < 0.5).all() and np.ptp(spots[:, 0]) > 0.3

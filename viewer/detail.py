@@ -67,10 +67,9 @@ def why(vehicle: Vehicle, now: float) -> list[str]:
             f"No horizon yet, heard for {ago(_known_s(vehicle, now))}: nothing is claimed before a model is verified."
         )
     if late := vehicle.late(now):
-        said.append(
-            f"The newest prediction is {ago(late)} old: its worker has fallen behind; play the recording more slowly, "
-            "or let fewer UAVs share a worker."
-        )
+        slower = "play the recording more slowly, or " if vehicle.recorded else ""
+        behind = f": its worker has fallen behind; {slower}let fewer UAVs share a worker"
+        said.append(f"The newest prediction is {ago(late)} old{'' if state is State.LINK_LOST else behind}.")
     if vehicle.prediction is not None and vehicle.prediction.sentence:
         said.append(vehicle.prediction.sentence)
     if vehicle.status is not None and vehicle.status.sentence:
@@ -104,9 +103,10 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
     verdict = vehicle.model.verdict if vehicle.model is not None else None
     if verdict is not None:
         colour = palette.verified if verdict.outcome is Outcome.VERIFIED else palette.identifying
+        least = f", threshold {verdict.threshold:.0f} %" if verdict.threshold > 0 else ""  # some judge without one
         cards.append(
             f'<div class="say" style="border-color:{colour}"><b>{escape(verdict.outcome.value.replace("_", " "))}</b> '
-            f'<span class="soft">newest try, number {verdict.tries}, threshold {verdict.threshold:.0f} %</span><br>'
+            f'<span class="soft">newest try, number {verdict.tries}{least}</span><br>'
             f"{escape(clip(verdict.sentence))}</div>"
         )
     elif vehicle.row is not None and not any(vehicle.row.verdict in text for text in ("", *said)):
