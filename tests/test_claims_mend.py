@@ -3,7 +3,8 @@
 import flights as f
 import pytest
 
-from fleet.contract import Claim, Status
+import fleet
+from fleet.contract import Claim, Handover, Status
 from fleet.memory_bus import MemoryBus
 from fleet.presence import Present
 from twin_worker.worker import Worker
@@ -58,3 +59,23 @@ def test_one_that_announces_and_passes_for_dead_is_looked_for(worker: Worker) ->
     worker.bus.publish(Claim(t=f.T0, worker=OTHER.worker, held=((2, 7),)))
     worker.claiming.turn()
     assert list(claims.peers) == [OTHER.worker]
+
+
+def test_who_hands_over_many_is_waited_for_as_long_as_copies_come(
+    worker: Worker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, coming = [100.0], []
+    monkeypatch.setattr("twin_worker.claims.protocol.time.monotonic", lambda: now[0])
+    monkeypatch.setattr(worker.bus, "gather", lambda *_: iter(coming))
+    claiming = worker.claiming
+    claiming.tick()
+    claiming.claims.synced(1)
+    assert claiming._ask({OTHER.worker: [2, 3]}) == []
+    now[0] += 2.9
+    coming.append(Handover(t=f.T0, uav=2, epoch=5, code=fleet.SOURCES, load=b""))
+    assert claiming._ask({OTHER.worker: [2, 3]}) == [] and 2 not in claiming.claims.held, "paused for too long itself"
+    now[0] += 2.9
+    coming.clear()
+    assert claiming._ask({OTHER.worker: [3]}) == [], "one has come meanwhile"
+    now[0] += 0.2
+    assert claiming._ask({OTHER.worker: [3]}) == [3]

@@ -32,7 +32,12 @@ _TURN_S = 0.1  # between turns without news [s]
 _SETTLE_S = 0.03  # tokens come in bursts [s]
 _ANNOUNCE_S = 0.25  # several times in `SILENT_S` [s]
 _ASK_S = 0.5  # for everyone to say what they hold; a frozen worker never does [s]
-_HAND_S = 3.0  # for a copy of one that is held elsewhere; its holder writes meanwhile [s]
+_HAND_S = 3.0  # between copies from one that holds what should be ours; it writes meanwhile [s]
+_COPIES_S = 20.0  # for all that one worker is asked for at once [s]
+_BREATH_S, _BREATHS_S = (
+    0.02,
+    1.5,
+)  # between copies that are sent, and for all of them: others want the processor, too [s]
 _LEAVE_S = 5.0  # for the others to take everything over at the end [s]
 _MEND_S = 1.0  # between looks for what was left half done [s]
 _MOST_EPOCH = 1 << 62  # beyond is no epoch
@@ -90,7 +95,7 @@ class Claiming:
         self._news = threading.Event()
         self._said = float("-inf")
         self._told: tuple[object, ...] = ()  # what was announced last
-        self._asked_for: dict[int, float] = {}  # since when copies are asked for, by UAV id [s, monotonic]
+        self._asked_for: dict[int, float] = {}  # since when there is no copy, by UAV id asked for [s, monotonic]
         self._asking: dict[str, threading.Thread] = {}  # by worker
         self._recalling: list[threading.Thread] = []
         self._stranger = False  # somebody unknown announces: the news of a life may come before that of its last end
@@ -171,11 +176,13 @@ class Claiming:
 
     def _asked(self, payload: bytes) -> Iterator[tuple[Handover, None]]:
         """Send copies of what is held, one by one; who asked takes it, and is heard of when it does."""
-        for uav in _wanted(payload).uavs if payload else ():
+        wanted, pause = _wanted(payload).uavs if payload else (), threading.Event()
+        for uav in wanted:
             with self._lock:
                 epoch = self.claims.held.get(uav)
             if epoch is not None and (twin := self._keeper.copied(uav, epoch)) is not None:
                 yield twin, None
+                pause.wait(min(_BREATH_S, _BREATHS_S / len(wanted)) if self.threaded else 0.0)
 
     # --- one thread --------------------------------------------------------------------------------------------------
 
@@ -244,7 +251,7 @@ class Claiming:
             self._keeper.renew(uav, epoch)
 
     def _ask(self, wanted: dict[str, list[int]]) -> list[int]:
-        """Ask each holder for copies, all at the same time; give what has been asked for in vain for too long."""
+        """Ask each holder for copies, all at the same time; give what is asked for in vain."""
         now, uavs = time.monotonic(), {uav for mine in wanted.values() for uav in mine}
         self._asked_for = {uav: self._asked_for.get(uav, now) for uav in uavs}
         for worker, mine in wanted.items():
@@ -258,7 +265,10 @@ class Claiming:
         """Ask one holder, and take each as it comes."""
         self._keeper.expect(uavs)
         payload = msgspec.msgpack.encode(Wanted(uavs=tuple(uavs)))
-        for twin in self._bus.gather(Handover, worker, payload, _HAND_S):
+        for twin in self._bus.gather(Handover, worker, payload, _COPIES_S):
+            self._asked_for = self._asked_for | dict.fromkeys(
+                uavs, time.monotonic()
+            )  # it hands over: the rest will come
             with self._lock:
                 wanted = twin.uav in uavs and twin.uav not in self.claims.held and 0 <= twin.epoch < _MOST_EPOCH
                 if not wanted or not self.claims.may_write(time.monotonic()):
