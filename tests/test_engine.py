@@ -13,7 +13,7 @@ from fleet.frames import to_geodetic
 from twin_worker.engine import quota as clocked
 from twin_worker.engine.learner import Learner
 from twin_worker.engine.pace import Pace, Work, read_pace
-from twin_worker.engine.quota import Quota
+from twin_worker.engine.quota import LEAST_S, SWEEP_S, Quota
 from twin_worker.engine.rates import OVER_S, Rates
 from twin_worker.horizon import AHEAD
 from twin_worker.predict import LEAST_AHEAD_S
@@ -73,6 +73,14 @@ def test_what_is_old_already_is_not_foreseen_where_telemetry_waits(clock: list[f
     assert limited.grants(Work.RENEW) and limited.grants(Work.PREDICT)
     clock[0] += 2.0
     assert limited.grants(Work.RENEW) and not limited.grants(Work.PREDICT)
+
+
+def test_heavy_work_yields_to_late_telemetry_by_halves_and_comes_back() -> None:
+    quota, limits = Quota(), []
+    for late in (False, True, True, *[True] * 20, *[False] * 40):
+        quota.yield_to_telemetry(late)
+        limits.append(quota.limit)
+    assert limits[:3] == [SWEEP_S, SWEEP_S / 2, SWEEP_S / 4] and limits[22] == LEAST_S and limits[-1] == SWEEP_S
 
 
 def test_identification_yields_to_late_telemetry_and_never_starves() -> None:

@@ -34,7 +34,7 @@ from twin_worker.conflict.separation import Separation
 from twin_worker.conflict.traffic import Traffic
 from twin_worker.engine.learner import Learner
 from twin_worker.engine.pace import Pace, Work
-from twin_worker.engine.quota import LEAST_S, SWEEP_S, Quota
+from twin_worker.engine.quota import Quota
 from twin_worker.engine.rates import Rates
 from twin_worker.engine.stand_in import said_already, stand_in
 from twin_worker.memory import AUTO
@@ -198,12 +198,12 @@ class Worker:
         return [*new, *(held for held in found if held not in new)]
 
     def _watch_time(self) -> None:
-        """Let heavy work wait where telemetry does: after a sweep that was late one flight ahead is begun, no more."""
+        """Let heavy work wait where telemetry does: after a sweep that was late half as much of it is begun."""
         now = time.monotonic()
         late, self._swept = now - self._swept > _LATE_S, now
         self.learner.yield_to_telemetry(late)
         if self.claiming.threaded:
-            self.quota.limit = LEAST_S if late else SWEEP_S
+            self.quota.yield_to_telemetry(late)
         for work in (Work.PREDICT, Work.ENSEMBLE):
             if done := self.quota.done.pop(work, 0):
                 self.rates.note(work, now, done)

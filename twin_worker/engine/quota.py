@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from twin_worker.engine.pace import Work
 
 SWEEP_S = 0.05  # of heavy work in one sweep, CPU [s]
-LEAST_S = 1e-3  # the same where telemetry is late: as much as one piece of work [s]
+LEAST_S = 1e-3  # the same where telemetry stays late: as much as one piece of work [s]
+_GROWS = 1.2  # how it recovers with every sweep that was not late [-]
 _SHARE = {Work.PREDICT: 1.0, Work.IDENTIFY: 0.7, Work.ENSEMBLE: 0.5}  # of a sweep, up to which each kind may begin [-]
 
 
@@ -36,6 +37,11 @@ class Quota:
         """Begin another sweep."""
         self.settle()
         self._spent, self.hurry = 0.0, hurry and self.limit < float("inf")
+
+    def yield_to_telemetry(self, late: bool) -> None:
+        """Grant half as much in a sweep as in the last where telemetry is late, else a little more again."""
+        limit = min(self.limit, SWEEP_S)
+        self.limit = max(0.5 * limit, LEAST_S) if late else min(_GROWS * limit, SWEEP_S)
 
     def settle(self) -> None:
         """End the work in hand, if any."""
