@@ -16,6 +16,7 @@ from twin_worker.engine.pace import read_pace
 
 _MODELS = 0.95  # share of the aircraft that must have a model before anything is counted [-]
 _PATIENCE_S = 240.0  # with models [s]
+_RIPE_S = 60.0  # of flight before anything is counted: until then there is no hybrid, and without one no ensemble [s]
 _KINDS = ("predict", "identify", "ensemble")
 
 
@@ -67,6 +68,7 @@ def watch(size: Size, recording: Path, router: str) -> dict[str, Any]:
         begun = time.monotonic()
         ready = int(_MODELS * size.uavs)
         until(lambda: len(site.reader.fits) >= ready or time.monotonic() - begun > _PATIENCE_S, 1e6, "models")
+        until(lambda: time.monotonic() - begun > _RIPE_S, 1e6, "hybrids")
         ear, never = _Ear(site), threading.Event()
         before = _count(site, ear)
         gaps = _watch_gaps(site, size.seconds, never)
