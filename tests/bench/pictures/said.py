@@ -11,6 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
+
 from fleet.bus import connect, open_router
 from fleet.codec import Stamp
 from fleet.contract import Account, Found, Mismatch, Prediction, Sample, Status
@@ -26,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[3]
 STAMP = Stamp(1, 0xABCD)
 HASTE, SLOW = 40.0, 0.12  # times as fast as it was: until the moment, and from then on, for a browser takes its time
 SETTLED_S = 120.0  # so late a moment may be, at the earliest [s]
-NEAR_S, FAR_S, STEADY = 40.0, 90.0, 8  # a horizon for a picture, and for so many predictions in a row [s]
+NEAR_S, FAR_S, STEADY = 25.0, 90.0, 8  # a horizon for a picture, and for so many predictions in a row [s]
 
 Said = list[tuple[float, Any, Stamp | None]]
 """When [s since 1970], what, and by whose claim."""
@@ -70,14 +72,14 @@ def played(said: Said, name: str) -> Said:
 
 
 def moment(said: Said, since: float = SETTLED_S, uav: int | None = None) -> tuple[int, float]:
-    """Choose whom to show and when [s since 1970]: the last whose horizon is neither near nor open for a while.
+    """Choose whom to show and when [s since 1970]: whose horizon is neither near nor open for a while, tube narrowest.
 
     Args:
         said: all that was said
         since: of its time, from when on [s]
         uav: of whom alone; None: of anybody
     """
-    best = (0 if uav is None else uav, said[-1][0])
+    best, narrowest = (0 if uav is None else uav, said[-1][0]), np.inf
     runs: dict[int, list[float]] = defaultdict(list)
     for t, message, _ in said:
         if isinstance(message, Prediction) and t > said[0][0] + since and uav in (None, message.uav):
@@ -86,7 +88,9 @@ def moment(said: Said, since: float = SETTLED_S, uav: int | None = None) -> tupl
                 run.clear()
                 continue
             run.append(t)
-            best = (message.uav, run[0]) if len(run) == STEADY else best
+            width = float(np.interp(message.horizon_s, message.ahead.numpy(), message.tube.numpy()[:, 1]))
+            if len(run) >= STEADY and width < narrowest:
+                best, narrowest = (message.uav, t), width
     return best
 
 
