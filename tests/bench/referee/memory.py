@@ -75,7 +75,7 @@ def _over(rows: list[Row], *, by_age: bool = False) -> dict[str, Any]:
     minutes, mb = np.array([row.minutes for row in half]), np.array([row.mb for row in half])
     columns = [np.ones(len(half)), minutes - minutes.mean(), [row.aircraft for row in half]]
     if by_age:
-        columns.append([min(row.age_s, 180.0) for row in half])
+        columns.append([min(row.age_s, 60.0 * _FULL_MIN) for row in half])
     A = np.column_stack(columns).astype(float)
     fit = np.linalg.lstsq(A, mb, rcond=None)[0]
     variance = float(np.sum((mb - A @ fit) ** 2)) / (len(half) - A.shape[1])
