@@ -14,7 +14,7 @@
     parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; answers queries
     parauav/@fleet/prediction/{writer}   Predictions  worker   only answers: the newest of all it holds
     parauav/@gateway/{writer}            Account      gateway  counters of one gateway; answers queries
-    parauav/@claim/{writer}              Claim        worker   which aircraft it writes for; every 0.5 s; queries too
+    parauav/@claim/{writer}              Claim        worker   which aircraft it writes for; every 0.25 s; queries too
     parauav/@handover/{writer}           Handover     worker   answers a `Wanted` of another worker: twins to go on with
     parauav/@live/worker/{writer}/{lo-hi}/{incarnation}        a liveliness token: this worker lives, and may hold these
 
