@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[3]
 STAMP = Stamp(1, 0xABCD)
 HASTE, SLOW = 40.0, 0.12  # times as fast as it was: until the moment, and from then on, for a browser takes its time
 SETTLED_S = 120.0  # so late a moment may be, at the earliest [s]
-NEAR_S, FAR_S, STEADY = 25.0, 90.0, 8  # a horizon for a picture, and for so many predictions in a row [s]
+NEAR_S, FAR_S, STEADY = 45.0, 70.0, 8  # a horizon for a picture, and for so many predictions in a row [s]
 
 Said = list[tuple[float, Any, Stamp | None]]
 """When [s since 1970], what, and by whose claim."""
