@@ -7,11 +7,10 @@ import threading
 import time
 from collections import defaultdict
 from contextlib import nullcontext
+from math import inf
 from pathlib import Path
 from types import TracebackType
 from typing import Any
-
-import numpy as np
 
 from fleet.bus import connect, open_router
 from fleet.codec import Stamp
@@ -28,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[3]
 STAMP = Stamp(1, 0xABCD)
 HASTE, SLOW = 40.0, 0.12  # times as fast as it was: until the moment, and from then on, for a browser takes its time
 SETTLED_S = 120.0  # so late a moment may be, at the earliest [s]
-NEAR_S, FAR_S, STEADY = 45.0, 70.0, 8  # a horizon for a picture, and for so many predictions in a row [s]
+NEAR_S, BEST_S, FAR_S, STEADY = 25.0, 55.0, 90.0, 8  # a horizon for a picture, for so many predictions in a row [s]
 
 Said = list[tuple[float, Any, Stamp | None]]
 """When [s since 1970], what, and by whose claim."""
@@ -72,14 +71,14 @@ def played(said: Said, name: str) -> Said:
 
 
 def moment(said: Said, since: float = SETTLED_S, uav: int | None = None) -> tuple[int, float]:
-    """Choose whom to show and when [s since 1970]: whose horizon is neither near nor open for a while, tube narrowest.
+    """Choose whom to show and when [s since 1970]: whose horizon is neither near nor far for a while.
 
     Args:
         said: all that was said
         since: of its time, from when on [s]
         uav: of whom alone; None: of anybody
     """
-    best, narrowest = (0 if uav is None else uav, said[-1][0]), np.inf
+    best, least = (0 if uav is None else uav, said[-1][0]), inf
     runs: dict[int, list[float]] = defaultdict(list)
     for t, message, _ in said:
         if isinstance(message, Prediction) and t > said[0][0] + since and uav in (None, message.uav):
@@ -88,9 +87,8 @@ def moment(said: Said, since: float = SETTLED_S, uav: int | None = None) -> tupl
                 run.clear()
                 continue
             run.append(t)
-            width = float(np.interp(message.horizon_s, message.ahead.numpy(), message.tube.numpy()[:, 1]))
-            if len(run) >= STEADY and width < narrowest:
-                best, narrowest = (message.uav, t), width
+            if len(run) >= STEADY and (off := abs(message.horizon_s - BEST_S)) < least:
+                best, least = (message.uav, t), off
     return best
 
 
