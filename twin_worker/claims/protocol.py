@@ -176,13 +176,11 @@ class Claiming:
 
     def _asked(self, payload: bytes) -> Iterator[tuple[Handover, None]]:
         """Send copies of what is held, one by one; who asked takes it, and is heard of when it does."""
-        wanted, pause = _wanted(payload).uavs if payload else (), threading.Event()
-        for uav in wanted:
+        for uav in _wanted(payload).uavs if payload else ():
             with self._lock:
                 epoch = self.claims.held.get(uav)
             if epoch is not None and (twin := self._keeper.copied(uav, epoch)) is not None:
                 yield twin, None
-                pause.wait(min(_BREATH_S, _BREATHS_S / len(wanted)) if self.threaded else 0.0)
 
     # --- one thread --------------------------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from .site import Site, Worker, until
 
 _PATIENCE_S = 30.0
 _AFTER_S = 2.0  # looked at after it is over [s]
+_CALM_S = 4.0
 
 
 def _held(site: Site, worker: Worker) -> set[int]:
@@ -36,6 +37,13 @@ def _taken_over(site: Site, uavs: set[int], was: str, begun: float) -> dict[str,
     taken = site.reader.taken(uavs, begun, was)
     wait(_AFTER_S)
     return {"aircraft": len(uavs), "taken_s": taken, "gap_s": site.reader.gap(uavs, begun)}
+
+
+def calm(site: Site, worker: Worker) -> dict[str, Any]:
+    """Do nothing, for as long as a handover takes: what is no worse than this is no fault's."""
+    uavs, begun = _held(site, worker), time.monotonic()
+    wait(_CALM_S)
+    return {"aircraft": len(uavs), "gap_s": site.reader.gap(uavs, begun)}
 
 
 def kill(site: Site, worker: Worker) -> dict[str, Any]:
@@ -165,6 +173,6 @@ def blink(site: Site, worker: Worker) -> dict[str, Any]:
     return {"owners_changed": moved, "gap_s": site.reader.gap(set(before), begun)}
 
 
-ALL = {one.__name__: one for one in (kill, freeze, leave, join, restart_router, cut, stall, delay, blink)}
+ALL = {one.__name__: one for one in (calm, kill, freeze, leave, join, restart_router, cut, stall, delay, blink)}
 ON_THE_WAY = (cut, stall, delay)  # for a worker that has a way of its own
 ENDS = (kill, leave)  # for a worker that is not spared
