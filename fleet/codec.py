@@ -41,8 +41,8 @@ class Wire(NamedTuple):
 
 
 def encode(message: Any) -> bytes:
-    """Pack one message as a msgpack map."""
-    return _PACK.encode(message)
+    """Pack one message as a msgpack map; what is packed already stays as it is."""
+    return message.payload if isinstance(message, Wire) else _PACK.encode(message)
 
 
 def encoding(kind: type) -> str:

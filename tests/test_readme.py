@@ -22,6 +22,7 @@ from fleet.memory_bus import MemoryBus
 from fleet.talk import Answer
 from gateway import __main__ as gateway
 from twin_worker import __main__ as twin_worker
+from twin_worker.answers import Answers
 from twin_worker.worker import Worker
 from viewer import __main__ as viewer
 
@@ -80,14 +81,13 @@ def test_the_foreign_tool_prints_where_everyone_will_be(tmp_path: Path) -> None:
 
 
 def test_a_foreign_tool_asks_what_if(tmp_path: Path, holder: Worker) -> None:
-    seven = Worker(MemoryBus(), range(7, 8), omega=0.0)
     (held,) = holder.holding()
     held.twin.uav = 7
-    seven._held[7] = held
-    (line,) = run_tool(tools()[1], tmp_path, seven._predictions)
+    seven = Answers(MemoryBus().writer, lambda: [held])
+    (line,) = run_tool(tools()[1], tmp_path, seven.predictions)
     assert line.startswith("what if it flew at 18 m/s, the wind blew 3 m/s north and -1 east, NAVL1_PERIOD were 25")
     assert line.endswith("{'NAVL1_PERIOD': 25.0, 'AIRSPEED_CRUISE': 18.0}")
-    (refused,) = run_tool(tools()[1].replace("18.0", "-18.0"), tmp_path, seven._predictions)
+    (refused,) = run_tool(tools()[1].replace("18.0", "-18.0"), tmp_path, seven.predictions)
     assert refused == "what if: speed: found -18.0 m/s, expected above 0 to 300; correct it"
 
 

@@ -87,6 +87,34 @@ def test_a_copy_goes_on_elsewhere_and_is_written_for_here_until_a_higher_claim_i
     assert [held.twin.uav for held in worker.holding()] == [1, 3]
 
 
+def test_a_copy_that_was_long_on_its_way_says_nothing_older_than_what_was_said_meanwhile(
+    bus: MemoryBus, worker: Worker
+) -> None:
+    for message in f.messages(f.turn(4.0), uav=2):
+        bus.publish(message)
+    worker.turn()
+    (twin,) = handed(bus, 2)
+    late = f.messages(f.turn(9.0), uav=2)
+    for message in late:
+        bus.publish(message)
+    worker.turn()
+    (said,) = [made for made, _ in bus.ask(Prediction, 2)]
+
+    away = MemoryBus()
+    taker, told = Worker(away, range(1, 5), omega=0.0), []
+    away.subscribe(Prediction, lambda made, _: told.append(made.t))
+    assert taker._twins.overhear(said, Stamp(twin.epoch, 7))
+    taker._twins.adopt(2, twin.epoch + 1, twin)
+    for message in (m for m in late if m.t > f.T0 + 4.0):
+        taker._hear(message)
+        taker.turn()
+    assert not told
+    for message in (m for m in f.messages(f.turn(12.0), uav=2) if m.t > said.t):
+        taker._hear(message)
+        taker.turn()
+    assert told and min(told) > said.t
+
+
 @pytest.mark.parametrize("odd", [{"code": "another"}, {"load": b""}, {"load": b"\xc1"}, {"load": pack([1], {})}])
 def test_a_twin_that_cannot_be_read_is_taken_over_cold(bus: MemoryBus, worker: Worker, odd: dict) -> None:
     for message in f.messages(f.turn(2.0), uav=2):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flights import item
 
-from fleet.codec import Stamp, decode
+from fleet.codec import Stamp, decode, encode
 from fleet.contract import (
     Array,
     FleetState,
@@ -22,6 +22,7 @@ from fleet.contract import (
 )
 from fleet.memory_bus import MemoryBus
 from twin_worker import worker as live
+from twin_worker.answers import told as told_of
 from twin_worker.claims.keeper import INBOX
 from twin_worker.whatif.grid import resample, wanted
 from twin_worker.worker import Worker
@@ -33,7 +34,8 @@ class Bus(MemoryBus):
     """A bus in memory that also carries what a query asks for."""
 
     def query(self, kind: type, uav: int | None = None, **asked: str) -> list:
-        return [answer for reply in self._reply[kind] for answer in reply(uav, asked, b"")]
+        found = (answer for reply in self._reply[kind] for answer in reply(uav, asked, b""))
+        return [(decode(kind, encode(message)), stamp) for message, stamp in found]
 
 
 @pytest.fixture
@@ -139,6 +141,16 @@ def test_one_answer_has_them_all(bus, worker):
     ((batch, _),) = bus.ask(Predictions)
     assert [decode(Prediction, bytes(raw)) for raw in batch.predictions] == [made for made, _ in each]
     assert list(batch.epochs) == [stamp.epoch for _, stamp in each]
+
+
+def test_an_answer_is_packed_once_and_anew_when_there_is_another_prediction(bus, worker):
+    fly(bus, 2)
+    worker.turn()
+    (held,) = worker.holding()
+    first = told_of(held)
+    assert told_of(held) is first and first.message().controller == held.twin.control.wire()
+    held.twin.prediction = msgspec.structs.replace(held.twin.prediction, t=held.twin.prediction.t + 1.0)
+    assert told_of(held).message().t == first.message().t + 1.0
 
 
 def test_a_query_chooses_horizon_and_step(bus, worker):

@@ -2,11 +2,9 @@
 
 import argparse
 import contextlib
-import ctypes
 import gc
 import logging
 import os
-import platform
 import sys
 import threading
 from pathlib import Path
@@ -18,6 +16,7 @@ from fleet.bus import connect
 from fleet.cli import guarded, id_range, parser_for, stop_on_signal
 from fleet.config import entry, router_arguments
 from fleet.contract import FleetState
+from fleet.heap import give_back
 from fleet.logs import log_arguments, say
 from fleet.metrics import address, served
 from twin_worker.engine.many import run_many
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
 SWITCH_S = 5e-4  # how long a thread of the bus waits for the interpreter while another holds it [s]
 END_S = 10.0  # after which a worker that was told to end does so in any case [s]
 GARBAGE = 50_000  # objects made before cycles are looked for
-M_MMAP_THRESHOLD, LARGE = -3, 256 * 1024  # mallopt(3): from how many bytes on a block is one of its own [bytes]
 EXAMPLES = """
   twin_worker --uavs 0-49
   twin_worker --uavs 0-199 --pace identify=5,predict=5,ensemble=5,renew=0.1       many aircraft, ten times a second
@@ -68,15 +66,11 @@ def _bases(given: list[str]) -> "dict[int, Baseline]":
 
 
 def _share() -> None:
-    """Let whoever hears wait less for who works out, and look for cycles rarely: twins make none, messages neither.
-
-    Blocks as large as a twin on its way go back to the system once they are free: kept in between, they leave holes.
-    """
+    """Let whoever hears wait less for who works out, and look for cycles rarely: twins make none, messages neither."""
     sys.setswitchinterval(SWITCH_S)
     gc.freeze()
     gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
-    if platform.libc_ver()[0] == "glibc":
-        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGE)
+    give_back()
 
 
 def _end_in_any_case(stop: threading.Event) -> None:

@@ -1,17 +1,12 @@
 """The live driver: messages from the bus to the twins this worker holds, results back, one line per UAV."""
 
-import copy
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any
-
-import msgspec
-from msgspec import Raw
+from collections.abc import Callable, Iterator
 
 from fleet.airframes import GENERIC, Airframe, load
-from fleet.codec import Stamp, decode_from, encode
+from fleet.codec import Stamp, decode_from
 from fleet.contract import (
     Alert,
     FleetState,
@@ -22,9 +17,9 @@ from fleet.contract import (
     Predictions,
     Sample,
     Status,
-    WhatIf,
 )
 from fleet.talk import Bus, Letter
+from twin_worker.answers import Answers
 from twin_worker.claims.carry import Load
 from twin_worker.claims.keeper import Held, Twins
 from twin_worker.claims.past import SELDOM
@@ -41,9 +36,6 @@ from twin_worker.memory import AUTO
 from twin_worker.mismatch.live import Live
 from twin_worker.mismatch.told import word
 from twin_worker.twin import Twin, advance, fleet_row
-from twin_worker.whatif import question
-from twin_worker.whatif.answer import answer
-from twin_worker.whatif.grid import resample, wanted
 
 _log = logging.getLogger(__name__)
 _SILENT_S = 1.0  # wall time without news after which data time runs on by the wall clock [s]
@@ -86,17 +78,18 @@ class Worker:
 
     def listen(self) -> None:
         """Subscribe, answer queries, and ask for what was said before this worker came."""
+        told = Answers(self.bus.writer, self.holding)
         self.claiming.join()
         self.bus.subscribe(Sample, lambda message, _: self._hear(message), self._wants)
         for kind in SELDOM:
             self.bus.subscribe(kind, lambda message, _: self._hear(message), self._may_want)
         self.bus.collect(Prediction, self._overhear_all)
         self.bus.subscribe(Model, self._overhear, lambda uav: uav in self.uavs and uav not in self._held)
-        self.bus.answer(Prediction, self._predictions)
-        self.bus.answer(Predictions, lambda *_: [(self._at_once(), None)])
-        self.bus.answer(Alert, lambda uav, *_: self._stamped((h, a) for h in self._asked(uav) for a in self.active(h)))
-        self.bus.answer(Model, lambda uav, *_: self._stamped((h, h.twin.model) for h in self._asked(uav)))
-        self.bus.answer(Mismatch, lambda uav, *_: self._stamped((h, self._found(h)) for h in self._asked(uav)))
+        self.bus.answer(Prediction, told.predictions)
+        self.bus.answer(Predictions, lambda *_: [(told.at_once(), None)])
+        self.bus.answer(Alert, lambda uav, *_: told.stamped((h, a) for h in told.of(uav) for a in self.active(h)))
+        self.bus.answer(Model, lambda uav, *_: told.stamped((h, h.twin.model) for h in told.of(uav)))
+        self.bus.answer(Mismatch, lambda uav, *_: told.stamped((h, self._found(h)) for h in told.of(uav)))
         self.bus.answer(FleetState, lambda *_: [(self.state(), None)])
         for status, _ in self.bus.ask(Status):
             self.claiming.hear_of(status.uav)
@@ -273,63 +266,6 @@ class Worker:
             if time.monotonic() >= due:
                 due = time.monotonic() + _STATE_S
                 self.bus.publish(self.state())
-
-    def _predictions(self, uav: int | None, asked: dict[str, str], payload: bytes) -> Iterator[tuple[Any, Stamp]]:
-        grid = wanted(asked)
-        if payload:
-            supposed = self._supposed(uav, question.read(payload))
-            return self._stamped((held, resample(made, grid)) for held, made in supposed)
-        found = ((held, told(held)) for held in self._asked(uav))
-        return self._stamped((held, made and resample(made, grid)) for held, made in found)
-
-    def _at_once(self) -> Predictions:
-        """Give the newest prediction of every aircraft held."""
-        found = [(Raw(encode(made)), held.epoch) for held in self.holding() if (made := told(held)) is not None]
-        predictions, epochs = (tuple(each) for each in zip(*found, strict=True)) if found else ((), ())
-        return Predictions(t=time.time(), predictions=predictions, epochs=epochs)
-
-    def _supposed(self, uav: int | None, asked: WhatIf) -> list[tuple[Held, Prediction]]:
-        """Let a copy of one twin fly what a query supposes.
-
-        Raises:
-            ValueError: when it names no single aircraft, or this one cannot be flown so.
-        """
-        if uav is None:
-            raise ValueError("what if: found a query for every aircraft, expected one; ask e.g. parauav/7/prediction")
-        return [(held, suppose(held, asked)) for held in self._asked(uav)]
-
-    def _asked(self, uav: int | None) -> list[Held]:
-        return [held for held in self.holding() if uav in (None, held.twin.uav)]
-
-    def _stamped(self, pairs: Iterable[tuple[Held, Any]]) -> Iterator[tuple[Any, Stamp]]:
-        return ((message, Stamp(held.epoch, self.bus.writer)) for held, message in pairs if message is not None)
-
-
-def suppose(held: Held, asked: WhatIf) -> Prediction:
-    """Copy the twin between two messages and let the copy answer, on the asker's thread.
-
-    Raises:
-        ValueError: when it cannot answer; the sentence says why.
-    """
-    with held.lock:
-        twin = copy.deepcopy(held.twin)
-    try:
-        return answer(twin, asked)
-    except ValueError:
-        raise
-    except Exception as error:  # a defect met by a question must not stop the answers
-        _log.exception("%s: a what-if failed", twin.name)
-        raise ValueError(f"what if: {twin.name} met a defect ({error}), expected a prediction; report it") from None
-
-
-def told(held: Held) -> Prediction | None:
-    """Give the newest prediction with the law and parameters it was flown by; None before any."""
-    made, control = held.twin.prediction, held.twin.control
-    if made is None or control is None or made.controller is not None:
-        return made
-    if held.told is None or held.told[0] is not made:
-        held.told = made, msgspec.structs.replace(made, controller=control.wire())
-    return held.told[1]
 
 
 def data_time(held: Held) -> float:

@@ -10,7 +10,7 @@ from math import isfinite
 from typing import Protocol
 
 import fleet
-from fleet.codec import Stamp
+from fleet.codec import Stamp, Wire
 from fleet.contract import Handover, Message, Mismatch, Model, Prediction, Rows, Sample
 from fleet.fence import Fence
 from fleet.talk import Bus
@@ -35,7 +35,7 @@ class Held:
     inbox: deque[Message] = field(default_factory=lambda: deque(maxlen=INBOX))
     arrived: float = float("nan")  # wall time of the newest sample [s, monotonic]
     placed: Rows | None = None  # positions heard last
-    stood: float = float("-inf")  # data time of what was said while the twin was worked on [s since 1970]
+    stood: float = float("-inf")  # data time of what was said without the twin, here or elsewhere [s since 1970]
     shed: int = 0
     failed: str = ""  # what went wrong last, a defect of ours
     lock: threading.Lock = field(default_factory=threading.Lock)  # held while the twin changes, or is copied
@@ -43,7 +43,7 @@ class Held:
     bare: bool = False  # without the telemetry of before
     since: float = float("-inf")  # when its twin came [s, monotonic]
     written: bool = False  # a prediction was published, or nobody else publishes any
-    told: tuple[Prediction, Prediction] | None = None  # one that was asked for, and the same with law and parameters
+    told: tuple[Prediction, Wire] | None = None  # one that was asked for, and the same with law and parameters, packed
 
 
 class Extras(Protocol):
@@ -134,7 +134,9 @@ class Twins:
         self._extras.take(uav, load)
         fresh = self._make(uav)
         load.twin.pace, load.twin.quota = fresh.pace, fresh.quota
-        for kept in (self._models, self._predictions, self._said):
+        if (said := self._predictions.pop(uav, None)) is not None:
+            held.stood = max(held.stood, said.t)  # a copy that was long on its way has nothing to add to that
+        for kept in (self._models, self._said):
             kept.pop(uav, None)  # type: ignore[attr-defined]
         self._begin(held, load.twin, load.inbox)
 

@@ -34,10 +34,6 @@ _ANNOUNCE_S = 0.25  # several times in `SILENT_S` [s]
 _ASK_S = 0.5  # for everyone to say what they hold; a frozen worker never does [s]
 _HAND_S = 3.0  # between copies from one that holds what should be ours; it writes meanwhile [s]
 _COPIES_S = 20.0  # for all that one worker is asked for at once [s]
-_BREATH_S, _BREATHS_S = (
-    0.02,
-    1.5,
-)  # between copies that are sent, and for all of them: others want the processor, too [s]
 _LEAVE_S = 5.0  # for the others to take everything over at the end [s]
 _MEND_S = 1.0  # between looks for what was left half done [s]
 _MOST_EPOCH = 1 << 62  # beyond is no epoch
@@ -264,9 +260,8 @@ class Claiming:
         self._keeper.expect(uavs)
         payload = msgspec.msgpack.encode(Wanted(uavs=tuple(uavs)))
         for twin in self._bus.gather(Handover, worker, payload, _COPIES_S):
-            self._asked_for = self._asked_for | dict.fromkeys(
-                uavs, time.monotonic()
-            )  # it hands over: the rest will come
+            now = time.monotonic()  # it hands over: the rest will come
+            self._asked_for = self._asked_for | dict.fromkeys(uavs, now)
             with self._lock:
                 wanted = twin.uav in uavs and twin.uav not in self.claims.held and 0 <= twin.epoch < _MOST_EPOCH
                 if not wanted or not self.claims.may_write(time.monotonic()):
