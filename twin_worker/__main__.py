@@ -7,6 +7,7 @@ import logging
 import os
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 SWITCH_S = 5e-4  # how long a thread of the bus waits for the interpreter while another holds it [s]
 END_S = 10.0  # after which a worker that was told to end does so in any case [s]
+BEHIND = 5  # niceness of the thread that gets ready
 GARBAGE = 50_000  # objects made before cycles are looked for
 EXAMPLES = """
   twin_worker --uavs 0-49
@@ -81,20 +83,30 @@ def _end_in_any_case(stop: threading.Event) -> None:
     os._exit(1)
 
 
+def _get_ready() -> None:
+    """Import and compile behind everyone else: workers that hold aircraft want the processor while another begins."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), BEHIND)
+    from twin_worker.warm import warm_up  # numba is slow to import: say what happens first
+
+    warm_up()  # before anything is claimed: who compiles cannot take over
+
+
 def _run(args: argparse.Namespace) -> int:
     airframe, bases = load(args.airframe), _bases(args.baseline)
     stop = stop_on_signal()
     threading.Thread(target=_end_in_any_case, args=(stop,), daemon=True).start()
     with connect(entry(args, WORKER)) as bus:
         bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
+        with ThreadPoolExecutor(1) as hand:  # a thread may give its priority away, and never has it back
+            hand.submit(_get_ready).result()
         from twin_worker.conflict.separation import Separation
         from twin_worker.metrics import counters
         from twin_worker.mismatch.background import Background
         from twin_worker.mismatch.live import Live
-        from twin_worker.warm import warm_up  # numba is slow to import: say what happens first
         from twin_worker.worker import Worker
 
-        hand = Background()
+        aside = Background()
         worker = Worker(
             bus,
             args.uavs,
@@ -103,13 +115,12 @@ def _run(args: argparse.Namespace) -> int:
             airframe=airframe,
             separation=Separation(*args.separation),
             pace=args.pace,
-            diagnosis=None if args.no_diagnosis else Live(hand, bases, adapt=not args.no_adapt),
+            diagnosis=None if args.no_diagnosis else Live(aside, bases, adapt=not args.no_adapt),
         )
-        warm_up()  # before anything is claimed: who compiles cannot take over
         _share()
         say(f"twin_worker {bus.writer:016x}", f"may hold UAVs {args.uavs.start}-{args.uavs.stop - 1}")
         with contextlib.ExitStack() as held:
-            held.callback(hand.close)
+            held.callback(aside.close)
             if args.metrics:
                 where = held.enter_context(served(args.metrics, counters(worker.state, bus)))
                 say("twin_worker", f"counters at {where}")

@@ -1,4 +1,4 @@
-"""A worker of the bench: our `Worker` as it answers, holding aircraft whose prediction is there already."""
+"""A worker of the bench: our `Worker` as it answers, whose aircraft are predicted anew once a second."""
 
 import sys
 import time
@@ -14,6 +14,7 @@ from twin_worker.horizon import AHEAD
 from twin_worker.twin import Twin
 from twin_worker.worker import Worker
 
+_EVERY_S = 1.0  # between predictions of an aircraft [s]
 _SAID = "hybrid/arduplane/fixed_wing/known, adapted by 24 of its own"
 
 
@@ -42,7 +43,9 @@ def main(router: str, low: int, high: int) -> None:
         worker.listen()
         size = len(msgspec.msgpack.encode(worker._held[low].twin.prediction))
         print(f"{size} bytes a prediction", flush=True)
-        stop.wait()
+        while not stop.wait(_EVERY_S):
+            for held in worker.holding():
+                held.twin.prediction = msgspec.structs.replace(held.twin.prediction, t=time.time())
 
 
 if __name__ == "__main__":
