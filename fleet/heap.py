@@ -1,20 +1,29 @@
-"""What is freed goes back to the system: a process that makes and forgets much would only ever grow."""
+"""The heap of a process that lives for days: what is free goes back to the system."""
 
 import ctypes
 import platform
 import threading
 
-_MMAP_THRESHOLD, _LARGE = -3, 256 * 1024  # mallopt(3): from how many bytes on a block is one of its own [bytes]
+_M_MMAP_THRESHOLD = -3  # of mallopt(3)
 _EVERY_S = 20.0
 
 
-def give_back() -> None:
-    """Give back large blocks as they are freed, and whole free pages a few times a minute; only glibc keeps them."""
+def give_back(large: int) -> None:
+    """Give what is freed back to the system, where the C library is glibc; elsewhere nothing is done.
+
+    Left alone, glibc learns from every large block that is freed: blocks up to that size then lie among the small ones
+    and leave holes, and twice that size may lie free at the end of the heap of every thread. What is set is not learnt;
+    whole free pages between blocks in use go back a few times a minute, on a thread of its own.
+
+    Args:
+        large: from how many bytes on a block is one of its own, which goes back when it is freed [bytes]
+    Source: mallopt(3), M_MMAP_THRESHOLD; malloc_trim(3).
+    """
     if platform.libc_ver()[0] != "glibc":
         return
     libc = ctypes.CDLL(None)
-    libc.mallopt(_MMAP_THRESHOLD, _LARGE)
-    threading.Thread(target=_trim, args=(libc,), daemon=True, name="heap").start()
+    libc.mallopt(_M_MMAP_THRESHOLD, large)
+    threading.Thread(target=_trim, args=(libc,), name="heap", daemon=True).start()
 
 
 def _trim(libc: ctypes.CDLL) -> None:

@@ -30,6 +30,7 @@ SWITCH_S = 5e-4  # how long a thread of the bus waits for the interpreter while 
 END_S = 10.0  # after which a worker that was told to end does so in any case [s]
 BEHIND = 5  # niceness of the thread that gets ready
 GARBAGE = 50_000  # objects made before cycles are looked for
+LARGE = 256 * 1024  # what a twin on its way takes; kept in between, such blocks leave holes [bytes]
 EXAMPLES = """
   twin_worker --uavs 0-49
   twin_worker --uavs 0-199 --pace identify=5,predict=5,ensemble=5,renew=0.1       many aircraft, ten times a second
@@ -72,7 +73,7 @@ def _share() -> None:
     sys.setswitchinterval(SWITCH_S)
     gc.freeze()
     gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
-    give_back()
+    give_back(LARGE)
 
 
 def _end_in_any_case(stop: threading.Event) -> None:

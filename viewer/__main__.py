@@ -8,6 +8,7 @@ from fleet.access.roles import VIEWER
 from fleet.bus import connect
 from fleet.cli import guarded, parser_for, stop_on_signal
 from fleet.config import entry, router_arguments
+from fleet.heap import give_back
 from fleet.logs import log_arguments, say
 from viewer.app import App
 from viewer.door import quiet, serve
@@ -15,6 +16,7 @@ from viewer.terrain.land import Land
 from viewer.terrain.raster import read
 
 RARELY = 50_000, 10, 10  # of a crowd some ten thousand objects come and go every second, and next to none in circles
+LARGE = 48 * 1024  # less than the bus receives into: one message that waits keeps all of such a block [bytes]
 EXAMPLES = """
   viewer
   viewer --port 8081 --light
@@ -59,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"--port: found {args.port}, expected 1 to 65535; name another")
     stop = stop_on_signal()
     gc.set_threshold(*RARELY)
+    give_back(LARGE)
     terrain = read(args.terrain, colours=False) if args.terrain else None
     land = Land(terrain, read(args.imagery, colours=True) if args.imagery else None)
     with connect(entry(args, VIEWER), patient=True) as bus:  # no router yet is said on the page
