@@ -15,6 +15,7 @@ TOLD_S = 5.0  # between two predictions kept [s]
 THIN_S, NEAR_S, FAR_S = 1.0, 20.0, 2.5  # look-ahead between points kept, so far ahead, and beyond: drawn as cubics [s]
 AFTER_S = 20.0  # of a prediction, how far past its horizon it is kept [s]
 GAP_S, SPARE_S, MOST_FILLED = 1.6, 0.4, 100  # a longer gap is filled in, to so near its ends, by so many rows [s]
+ROOM = 64  # rows that there is room for at first, and between two looks at what is too old
 MAX_ROWS = 8_000  # of one UAV: a longer recording keeps every second of them
 MAX_STOOD = 500  # changes of how one UAV stood; the oldest go first
 MAX_TOLD = 1_500  # predictions of one UAV: a longer recording keeps every second of them
@@ -30,7 +31,7 @@ class Tape:
         self.told: list[Forecast] = []  # oldest first, without what nobody asks of an old one
         self.stood: list[Stood] = []
         self.events: tuple[Event, ...] = ()
-        self._t, self._x = np.empty(64), np.empty((64, COLUMNS), np.float32)
+        self._t, self._x = np.empty(ROOM), np.empty((ROOM, COLUMNS), np.float32)
         self._n, self._step = 0, 0.0
         self._asked: Forecast | None = None
 
@@ -81,17 +82,22 @@ class Tape:
             self._append(float(row[0]), [*row[1:4], 0.0, 0.0, psi, row[4]], vehicle.recorded)
 
     def _append(self, t: float, row: list[float], recorded: bool) -> None:
+        if self._n and self._n % ROOM == 0:
+            self._let_go(recorded)
         if self._n == len(self._t):
-            self._make_room(recorded)
+            self._make_room()
         self._t[self._n], self._x[self._n] = t, row
         self._n += 1
 
-    def _make_room(self, recorded: bool) -> None:
-        """Let go what is too old of a live flight, else grow, else keep every second row."""
+    def _let_go(self, recorded: bool) -> None:
+        """Let go what is too old of a live flight, once that is an eighth of it: the rest is copied."""
         old = 0 if recorded else int(np.searchsorted(self.t, self._t[self._n - 1] - KEPT_S))
         if old > self._n // 8:
             self._keep(slice(old, self._n))
-        elif self._n >= MAX_ROWS:
+
+    def _make_room(self) -> None:
+        """Grow, or keep every second row."""
+        if self._n >= MAX_ROWS:
             self._step = 2 * float(np.median(np.diff(self.t)))
             self._keep(slice(self._n % 2, self._n, 2))
         else:
@@ -115,10 +121,17 @@ class Tape:
         if not self.stood or how[1:] != self.stood[-1][1:]:
             self.stood.append(how)
         del self.stood[:-MAX_STOOD]
-        if not vehicle.recorded and self.told and self.told[0].t < at - KEPT_S:
-            del self.told[0]
+        if not vehicle.recorded:
+            self._forget(at - KEPT_S)
         if len(self.told) > MAX_TOLD:
             self.told = self.told[::2]
+
+    def _forget(self, before: float) -> None:
+        """Let go the oldest prediction, and how it stood, of before a time [s since 1970]."""
+        if self.told and self.told[0].t < before:
+            del self.told[0]
+        if len(self.stood) > 1 and self.stood[1].t < before:  # the first tells how it stands until the second
+            del self.stood[0]
 
     def row(self, t: float) -> np.ndarray:
         """Interpolate how it flew at a time: (7,); angles the short way round. Held beyond both ends."""
