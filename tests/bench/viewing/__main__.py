@@ -2,7 +2,7 @@
 
     python -m tests.bench.viewing --uavs 1000 --json viewing.json
     python -m tests.bench.viewing --uavs 200 --seconds 60 --picture fleet.png
-    python -m tests.bench.viewing --uavs 1000 --seconds 1200 --plain 0     is memory flat once ten minutes are kept?
+    python -m tests.bench.viewing --uavs 200 --seconds 1300 --plain 0      is memory flat once ten minutes are kept?
 
 A router, the feeder, the viewer as an operator starts it, one browser with software rendering and three websocket
 clients, all on this machine: the browser takes the most of it. `server_cpu` is of one core, all threads of the viewer.
@@ -11,7 +11,8 @@ the first frame with its place. `plain`: a scene with a node for each aircraft, 
 the way. `selection`: from the press on a row until the panel names that UAV; beside it the floor, a press that changes
 one number on the same page. `callback_floor`: what a process takes of one core that hears the same and does nothing in
 a Python callback for each message; `collect_floor`: the same where messages are put aside and taken out ten times a
-second.
+second. `memory`: of its own, without libraries; whether it grows is said of a run of 15 minutes or more, for ten are
+kept of everyone.
 """
 
 import argparse
@@ -23,16 +24,16 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from tests.bench.growth import Row, grown, own_mb
 from tests.cable import Cable
 
 from .page import Page
-from .process import cpu_s, free_port, rss_mb, start, tell
+from .process import cpu_s, free_port, start, tell
 from .watcher import Watcher
 
 SETTLE_S = 15.0  # until chunks of trail are full enough to count [s]
 SAMPLES_S = 5.0  # between two looks at the memory [s]
+FULL_MIN = 12.0  # after which ten minutes are kept of everyone, and the eighth more that waits to go [min]
 
 
 def main() -> int:
@@ -73,7 +74,7 @@ def without_page(args: argparse.Namespace, router: str, feeder: Any) -> dict[str
     watchers = [Watcher(port) for _ in range(4)]
     try:
         wait(SETTLE_S)
-        return watched(viewer.pid, watchers, args.seconds)
+        return watched(viewer.pid, watchers, args.seconds, args.uavs)
     finally:
         viewer.terminate()
         viewer.wait(30)
@@ -96,7 +97,7 @@ def with_page(args: argparse.Namespace, router: str, feeder: Any) -> dict[str, A
         watchers = [Watcher(port) for _ in range(3)]
         wait(SAMPLES_S)
         page.watch("/fleet/vehicles", began)
-        found |= watched(viewer.pid, [cable, *watchers], args.seconds)
+        found |= watched(viewer.pid, [cable, *watchers], args.seconds, args.uavs)
         found["page"] = page.seen()
         for watcher in watchers:
             watcher.close()
@@ -117,28 +118,22 @@ def with_page(args: argparse.Namespace, router: str, feeder: Any) -> dict[str, A
     return found
 
 
-def watched(pid: int, watchers: list[Any], seconds: float) -> dict[str, Any]:
+def watched(pid: int, watchers: list[Any], seconds: float, uavs: int = 0) -> dict[str, Any]:
     """Let time pass; give what the server and each client took, the browser first where there is one."""
-    before, memory = [watcher.received for watcher in watchers], []
+    before, memory = [watcher.received for watcher in watchers], list[Row]()
     cpu, begin = cpu_s(pid), time.time()
     while (passed := time.time() - begin) < seconds:
-        memory.append((passed / 60, rss_mb(pid)))
+        memory.append(Row(passed / 60.0, "viewer", passed, uavs, own_mb(pid)))
         wait(min(SAMPLES_S, seconds - passed))
     spent = time.time() - begin
-    minutes, held = np.array(memory).T
     return {
         "seconds": round(spent, 1),
         "server_cpu": share(pid, cpu, begin),
         "clients_kB_s": [round((w.received - b) / spent / 1e3, 1) for w, b in zip(watchers, before, strict=True)],
         "clients_first_s": [round(one.first_s, 2) for one in watchers if isinstance(one, Watcher)],
-        "memory_MB": [round(mb, 1) for mb in held[:: max(len(held) // 20, 1)]],
-        "memory_MB_min_late": _slope(minutes[-len(held) // 3 :], held[-len(held) // 3 :]),
+        "memory_MB": [round(row.mb, 1) for row in memory[:: max(len(memory) // 20, 1)]],
+        "memory": grown(memory, FULL_MIN),
     }
-
-
-def _slope(minutes: np.ndarray, held: np.ndarray) -> float | None:
-    """Give how fast memory grows in the last third, when what is kept of everyone is full [MB/min]."""
-    return round(float(np.polyfit(minutes, held, 1)[0]), 2) if len(held) > 5 else None
 
 
 def plain(router: str, seconds: float) -> dict[str, Any]:

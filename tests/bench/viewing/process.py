@@ -1,7 +1,6 @@
 """What a process takes, and the processes of the bench."""
 
 import os
-import re
 import socket
 import subprocess
 import sys
@@ -21,12 +20,6 @@ def cpu_s(pid: int) -> float:
     """Give the CPU time a process has taken, all threads [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
-
-
-def rss_mb(pid: int) -> float:
-    """Give the memory a process holds [MB]."""
-    found = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
-    return int(found[1]) / 1024 if found else float("nan")
 
 
 def start(*module: str) -> subprocess.Popen:
