@@ -2,6 +2,9 @@
 
 import argparse
 import copy
+import os
+import sys
+import threading
 
 import flights as f
 import msgspec
@@ -10,6 +13,7 @@ import pytest
 
 from fleet.contract import Array, Prediction, Sample
 from fleet.frames import to_geodetic
+from twin_worker.__main__ import BEHIND, _get_ready
 from twin_worker.engine import quota as clocked
 from twin_worker.engine.learner import Learner
 from twin_worker.engine.pace import Pace, Work, read_pace
@@ -199,3 +203,19 @@ def test_an_ensemble_that_had_to_wait_is_flown_before_the_next_flight_and_keeps_
     assert twin.spread is not None and np.diff(flown[1:]) == pytest.approx(2.0, abs=0.3) and len(flown) > 5
     beyond = AHEAD > 60.0
     assert (np.diff(twin.spread[beyond], axis=0) > 0).all() and twin.spread.shape == (len(AHEAD), 3)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere threads have no priority of their own")
+def test_who_gets_ready_gives_way_to_those_that_hold_aircraft(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a thread of its own: nobody gets a priority back that was given away."""
+    nice, before = [], os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    def found() -> None:
+        nice.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+
+    monkeypatch.setattr("twin_worker.warm.warm_up", found)
+    thread = threading.Thread(target=_get_ready)
+    thread.start()
+    thread.join()
+    found()
+    assert nice == [min(before + BEHIND, 19), before]

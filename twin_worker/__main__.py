@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 SWITCH_S = 5e-4  # how long a thread of the bus waits for the interpreter while another holds it [s]
 END_S = 10.0  # after which a worker that was told to end does so in any case [s]
-BEHIND = 5  # niceness of the thread that gets ready
+BEHIND = 5  # how much nicer the thread is that gets ready
 GARBAGE = 50_000  # objects made before cycles are looked for
 LARGE = 256 * 1024  # what a twin on its way takes; kept in between, such blocks leave holes [bytes]
 EXAMPLES = """
@@ -87,7 +87,8 @@ def _end_in_any_case(stop: threading.Event) -> None:
 def _get_ready() -> None:
     """Import and compile behind everyone else: workers that hold aircraft want the processor while another begins."""
     if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), BEHIND)
+        me = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) + BEHIND)
     from twin_worker.warm import warm_up  # numba is slow to import: say what happens first
 
     warm_up()  # before anything is claimed: who compiles cannot take over
