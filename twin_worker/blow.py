@@ -1,6 +1,7 @@
 """Feed the wind filter from telemetry as it came."""
 
-import numpy as np
+from bisect import bisect_left
+from math import inf
 
 from twin_worker.history import History
 from twin_worker.wind import WindFilter
@@ -9,7 +10,7 @@ _EVERY_S = 0.199  # between rows taken [s]
 _STALE_S = 0.5  # airspeed and heading older than this say nothing of a velocity [s]
 
 
-def blow(wind: WindFilter, history: History, last: float, since: float, until: float = np.inf) -> float:
+def blow(wind: WindFilter, history: History, last: float, since: float, until: float = inf) -> float:
     """Take ground velocities, five a second; give the time of the newest taken [s since 1970].
 
     Args:
@@ -18,16 +19,17 @@ def blow(wind: WindFilter, history: History, last: float, since: float, until: f
         last: newest row taken before [s since 1970]
         since, until: rows before and after are left out [s since 1970]
     """
-    t_v, v = history.rows("velocity", since)
-    t_air, air = history.rows("air", since - 1.0)
-    t_att, attitude = history.rows("attitude", since - 1.0)
-    if not (len(t_air) and len(t_att)):
+    times, v = history.look("velocity", since)
+    air_times, air = history.look("air", since - 1.0)
+    att_times, attitude = history.look("attitude", since - 1.0)
+    t_air, t_att = air_times.tolist(), att_times.tolist()  # a few numbers are looked at faster than an array
+    if not (t_air and t_att):
         return last
-    for k in range(len(t_v)):
-        if t_v[k] - last < _EVERY_S or t_v[k] >= until:
+    for t, ground in zip(times.tolist(), v.tolist(), strict=True):
+        if t - last < _EVERY_S or t >= until:
             continue
-        i, j = np.searchsorted(t_air, t_v[k]) - 1, np.searchsorted(t_att, t_v[k]) - 1
-        if i >= 0 and j >= 0 and t_v[k] - t_air[i] < _STALE_S and t_v[k] - t_att[j] < _STALE_S:
-            last = float(t_v[k])
-            wind.update(last, v[k], float(air[i, 0]), float(attitude[j, 2]))
+        i, j = bisect_left(t_air, t) - 1, bisect_left(t_att, t) - 1
+        if i >= 0 and j >= 0 and t - t_air[i] < _STALE_S and t - t_att[j] < _STALE_S:
+            last = t
+            wind.update(t, ground, float(air[i, 0]), float(attitude[j, 2]))
     return last

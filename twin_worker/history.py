@@ -1,52 +1,18 @@
 """The last minutes of one aircraft's telemetry, as it came."""
 
+from struct import Struct
+
 import numpy as np
 
-from fleet.contract import COLUMNS, UNTOLD, Rows, Sample
+from fleet.contract import COLUMNS, DTYPES, UNTOLD, Array, Rows, Sample
+from twin_worker.kept import Kept
 
 _AHEAD_S = 1.0  # rows newer than their message by more are refused [s]
-_SPARE = 40  # rows of one kind that there is always place for
 _MOST = 1e5  # values beyond are noise [m/s, rad, us, ...]
 _MOST_OF = {"position": 2e9, "target": 2e9, "gnss": 2e9, "pressure": 1e6}  # the same [1e-7 deg, mm, Pa]
-
-
-class Kept:
-    """Rows of one kind: times (n,) and values (n, k) float, with place for more; what came last is not sorted yet."""
-
-    def __init__(self, t: np.ndarray, x: np.ndarray) -> None:
-        self.t, self.x = t, x
-        self.n, self.settled = len(t), 0  # rows, and how many of them are sorted
-
-    def add(self, t: np.ndarray, x: np.ndarray, since: float) -> None:
-        """Take rows; where there is no place left, those of before `since` are forgotten."""
-        end = self.n + len(t)
-        if end > len(self.t):
-            self._make_place(len(t), since)
-            end = self.n + len(t)
-        self.t[self.n : end], self.x[self.n : end] = t, x
-        self.n = end
-
-    def _make_place(self, more: int, since: float) -> None:
-        young = self.t[: self.n] >= since
-        t, x = self.t[: self.n][young], self.x[: self.n][young]
-        self.settled = int(young[: self.settled].sum())
-        self.n = len(t)
-        size = self.n + more + max(self.n // 4, _SPARE)
-        self.t, self.x = np.empty(size), np.empty((size, self.x.shape[1]))
-        self.t[: self.n], self.x[: self.n] = t, x
-
-    def settle(self, most: float, told: int | None) -> None:
-        """Sort what is new in: rising in time, each time once, as it came first, and only what can be believed."""
-        new = slice(self.settled, self.n)
-        good = (np.abs(self.x[new, :told]) < most).all(axis=1)  # nan is not
-        rising = np.diff(self.t[max(self.settled - 1, 0) : self.n]) > 0
-        if not (good.all() and rising.all()):
-            keep = np.concatenate([np.ones(self.settled, bool), good])
-            t, first = np.unique(self.t[: self.n][keep], return_index=True)
-            self.x[: len(t)] = self.x[: self.n][keep][first]
-            self.t[: len(t)] = t
-            self.n = len(t)
-        self.settled = self.n
+_WIDTHS = tuple((name, len(columns)) for name, columns in COLUMNS.items())
+_SIZES = {name: np.dtype(name).itemsize for name in DTYPES}
+_TIMES = tuple(Struct(f"<{n}d").unpack for n in range(17))  # of so many rows: few numbers need no array
 
 
 class History:
@@ -60,45 +26,55 @@ class History:
     def add(self, sample: Sample) -> int:
         """Take one message; give how many of its kinds did not fit the contract."""
         bad, latest = 0, sample.t + _AHEAD_S
-        for name, columns in COLUMNS.items():
+        for name, width in _WIDTHS:
             rows: Rows | None = getattr(sample, name)
             if rows is None:
                 continue
-            try:
-                t, x = rows.t.numpy(), rows.x.numpy()
-            except ValueError:
-                bad += 1
-                continue
-            n = len(t)
-            if x.ndim != 2 or t.shape != x.shape[:1] or x.shape[1] != len(columns) or not n:
-                bad += 1
-                continue
-            times = t.tolist() if n < 9 else [t.min(), t.max()]  # a few numbers are looked at faster than an array
-            if not all(0 < at <= latest for at in times):  # a message that dates its rows later contradicts itself
-                timed = (t <= latest) & (t > 0)  # false for nan
-                bad, t, x = bad + 1, t[timed], x[timed]
-                times = t.tolist()
-            if times:
-                self._keep(name, t, x, float(max(times)))
+            newest = _newest(rows.t, rows.x, width, latest)
+            if newest:
+                self._of(name, newest).hear(rows.t.data, rows.x.data, rows.x.dtype, self.newest - self.keep_s)
+            else:
+                bad += self._doubt(name, rows, latest)
         return bad
 
-    def _keep(self, name: str, t: np.ndarray, x: np.ndarray, newest: float) -> None:
+    def _doubt(self, name: str, rows: Rows, latest: float) -> bool:
+        """Take of many rows, or of odd ones, those that fit; tell whether some do not."""
+        try:
+            t, x = rows.t.numpy(), rows.x.numpy()
+        except ValueError:
+            return True
+        if x.ndim != 2 or t.shape != x.shape[:1] or x.shape[1] != len(COLUMNS[name]) or not len(t):
+            return True
+        timed = (t <= latest) & (t > 0)  # false for nan; a message that dates its rows later contradicts itself
+        if timed.any():
+            t, x = t[timed], x[timed]
+            self._of(name, float(t.max())).add(t, x, self.newest - self.keep_s)
+        return not timed.all()
+
+    def _of(self, name: str, newest: float) -> Kept:
+        """Give what is kept of a kind of which rows up to `newest` came."""
         self.newest = max(self.newest, newest)
         kept = self._kept.get(name)
         if kept is None:
-            kept = self._kept[name] = Kept(np.empty(0), np.empty((0, x.shape[1])))
-        kept.add(t, x, self.newest - self.keep_s)
+            kept = self._kept[name] = Kept(np.empty(0), np.empty((0, len(COLUMNS[name]))))
+        return kept
 
     def rows(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
         """Give times (n,) and values (n, k) of one kind from `since` on, rising in time, believable, once each."""
+        t, x = self.look(name, since)
+        return t.copy(), x.copy()
+
+    def look(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
+        """Give the same where it lies: only to read, and not beyond the next message."""
         kept = self._kept.get(name)
         if kept is None:
             return np.empty(0), np.empty((0, len(COLUMNS[name])))
+        kept.lay(self.newest - self.keep_s)
         if kept.settled < kept.n:
             kept.settle(_MOST_OF.get(name, _MOST), UNTOLD.get(name))
         t = kept.t[: kept.n]
         first = 0 if since == -np.inf else int(t.searchsorted(since))
-        return t[first:].copy(), kept.x[first : kept.n].copy()
+        return t[first:], kept.x[first : kept.n]
 
     def put(self, name: str, t: np.ndarray, x: np.ndarray) -> None:
         """Have these rows, (n,) and (n, k), instead of all of their kind."""
@@ -108,3 +84,17 @@ class History:
         """Forget everything, as after a jump of the clock."""
         self._kept.clear()
         self.newest = -np.inf
+
+
+def _newest(t: Array, x: Array, width: int, latest: float) -> float:
+    """Give the newest time of rows as they mostly are: few, sound, none later than `latest`; 0 where they are not."""
+    n = len(t.data) >> 3
+    if not 0 < n < len(_TIMES) or t.dtype != "<f8" or t.shape != (n,) or x.shape != (n, width):
+        return 0.0
+    if len(t.data) != 8 * n or len(x.data) != n * width * _SIZES.get(x.dtype, 0):
+        return 0.0
+    times: tuple[float, ...] = _TIMES[n](t.data)
+    for at in times:
+        if not 0 < at <= latest:  # true for nan
+            return 0.0
+    return max(times)

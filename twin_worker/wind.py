@@ -1,5 +1,6 @@
 """Wind and airspeed scale from ground velocity, airspeed and heading: a Kalman filter on the wind triangle."""
 
+from collections.abc import Iterable
 from math import atan2, cos, exp, hypot, inf, isfinite, sin, sqrt
 
 import numpy as np
@@ -92,18 +93,18 @@ class WindFilter:
         self._surprise = 1.0
         self.t = -np.inf
 
-    def update(self, t: float, ground: np.ndarray, Va: float, psi: float) -> None:
+    def update(self, t: float, ground: Iterable[float], Va: float, psi: float) -> None:
         """Take one row: ground velocity NED (3,) [m/s], reported airspeed [m/s], heading [rad]."""
         dt = min(t - self.t, 5.0) if isfinite(self.t) else 0.2
         if dt <= 0 or Va < 3.0:
             return
         self.t = t
-        level = Va * sqrt(max(1 - (ground[2] / Va) ** 2, 0.25))
+        north, east, down = map(float, ground)
+        level = Va * sqrt(max(1 - (down / Va) ** 2, 0.25))
         self._rows += 1
         gate = inf if self._rows < 50 else _GATE
         along, across = level * cos(psi), level * sin(psi)
-        told = float(ground[0]), float(ground[1])
-        surprise = _take(self.x, self.P, dt, along, across, *told, gate)  # type: ignore[call-arg]
+        surprise = _take(self.x, self.P, dt, along, across, north, east, gate)  # type: ignore[call-arg]
         self._surprise += dt / _SURPRISE_S * (min(surprise, _GATE) / 2 - self._surprise)
 
     def blow(self, t: float, wind: np.ndarray) -> None:

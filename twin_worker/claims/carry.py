@@ -26,11 +26,12 @@ from twin_worker.engine.quota import Quota
 from twin_worker.events.note import Note
 from twin_worker.events.watch import Ground
 from twin_worker.greybox import Grey
-from twin_worker.history import History, Kept
+from twin_worker.history import History
 from twin_worker.horizon import Made, Record, Trust
 from twin_worker.hybrid.energy import Ridge
 from twin_worker.hybrid.fit import Hybrid
 from twin_worker.identify import Axis
+from twin_worker.kept import Kept
 from twin_worker.learn_law import Learnt
 from twin_worker.memory import Believed, Twin
 from twin_worker.mismatch.marks import Extension, Mark
@@ -80,7 +81,7 @@ _OURS = (
 CARRIED: Known = {
     **{one.__name__: one for one in (*_WIRE, *_NAMED, *_OURS) if one is not Book},
     "Book": Book,
-    "Kept": (Kept, Special(lambda one: (one.t[: one.n], one.x[: one.n]), _kept)),
+    "Kept": (Kept, Special(Kept.whole, _kept)),
     "CubicSpline": (CubicSpline, Special(lambda one: (one.x, one.c), _spline)),
     "Quota": (Quota, Special(lambda _: None, lambda _: None)),  # the next driver has its own
     "Tables": (Tables, Special(lambda _: None, lambda _: load_tables())),  # everyone has them
