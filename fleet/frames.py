@@ -17,6 +17,7 @@ The letters of Beard & McLain, "Small Unmanned Aircraft" (2012), used everywhere
 Positive aileron rolls right, positive elevator pitches up, positive rudder yaws right.
 """
 
+from functools import lru_cache
 from math import cos, pi, radians, sin, sqrt
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ import numpy as np
 
 G = 9.80665  # standard gravity [m/s2]
 _A = 6378137.0  # WGS-84 equatorial radius [m]
+_DEGREE = pi / 180.0  # [rad]
 _E2 = 6.69437999014e-3  # WGS-84 first eccentricity squared [-]
 
 
@@ -36,6 +38,7 @@ class Origin(NamedTuple):
     alt_mm: int  # height above mean sea level [mm]
 
 
+@lru_cache(maxsize=4096)
 def _radii(origin: Origin) -> tuple[float, float]:
     lat = radians(origin.lat_e7 * 1e-7)
     s = sin(lat)
@@ -54,12 +57,20 @@ def to_ned(origin: Origin, lat_e7: np.ndarray, lon_e7: np.ndarray, alt_mm: np.nd
     Returns:
         position, NED, (n, 3) [m]
     """
-    m, n = _radii(origin)
-    d_lon = (np.asarray(lon_e7, float) - origin.lon_e7 + 1.8e9) % 3.6e9 - 1.8e9  # shortest way round the date line
-    north = np.radians((np.asarray(lat_e7, float) - origin.lat_e7) * 1e-7) * m
-    east = np.radians(d_lon * 1e-7) * n
-    down = (origin.alt_mm - np.asarray(alt_mm, float)) * 1e-3
-    return np.stack([north, east, down], axis=-1)
+    out = np.empty((*np.shape(lat_e7), 3))
+    out[..., 0], out[..., 1], out[..., 2] = lat_e7, lon_e7, alt_mm
+    _place(out.reshape(-1, 3), float(origin[0]), float(origin[1]), float(origin[2]), _radii(origin))
+    return out
+
+
+@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: as numpy does it
+def _place(at: np.ndarray, lat_e7: float, lon_e7: float, alt_mm: float, radii: tuple[float, float]) -> None:
+    """Put NED of an origin in the place of geodetic positions, (n, 3)."""
+    for k in range(len(at)):
+        d_lon = (at[k, 1] - lon_e7 + 1.8e9) % 3.6e9 - 1.8e9  # shortest way round the date line
+        at[k, 0] = (at[k, 0] - lat_e7) * 1e-7 * _DEGREE * radii[0]
+        at[k, 1] = d_lon * 1e-7 * _DEGREE * radii[1]
+        at[k, 2] = (alt_mm - at[k, 2]) * 1e-3
 
 
 def to_geodetic(origin: Origin, ned: np.ndarray) -> np.ndarray:

@@ -3,8 +3,12 @@
 import numpy as np
 import pytest
 
+from fleet.contract import Mission
+from fleet.frames import Origin, _radii, to_ned
 from twin_worker.calibration.miss import AHEAD, track_frame
 from twin_worker.compiled.straight import straight
+from twin_worker.events.watch import moves
+from twin_worker.rotor import item_in_force, items_in_force
 
 
 @pytest.mark.parametrize("beyond", [None, np.nan])
@@ -28,3 +32,32 @@ def test_a_track_frame_is_the_slope_of_second_order() -> None:
     assert np.allclose(found[length > 1e-6], (slope / np.maximum(length, 1e-9)[..., None])[length > 1e-6], atol=1e-12)
     assert (found[length <= 1e-6] == [1.0, 0.0]).all() and (length <= 1e-6).sum() == 4
     assert np.array_equal(track_frame(path[2, :40]), track_frame(path[:, :40])[2])
+
+
+def test_places_are_those_of_numpy() -> None:
+    rng, origin = np.random.default_rng(2), Origin(470_000_000, -1_790_000_000, 500_000)
+    place = rng.integers([-900_000_000, -1_800_000_000, -1_000_000], [900_000_000, 1_800_000_000, 9_000_000], (5000, 3))
+    m, n = _radii(origin)
+    turn = (place[:, 1].astype(float) - origin.lon_e7 + 1.8e9) % 3.6e9 - 1.8e9
+    north, east = np.radians((place[:, 0].astype(float) - origin.lat_e7) * 1e-7) * m, np.radians(turn * 1e-7) * n
+    found = to_ned(origin, *place.T)
+    assert np.array_equal(found, np.column_stack([north, east, (origin.alt_mm - place[:, 2].astype(float)) * 1e-3]))
+    assert (turn < 0).any() and (turn > 1.7e9).any(), "both ways round the date line"
+    assert np.array_equal(found[7], to_ned(origin, *place[7])) and to_ned(origin, *place[:0].T).shape == (0, 3)
+
+
+@pytest.mark.parametrize("n", [1, 2, 30])
+def test_how_it_moves_is_what_numpy_sees(n: int) -> None:
+    v = 9.0 * np.random.default_rng(n).standard_normal((n, 3))
+    level = np.hypot(*v[:, :2].T)
+    wanted = level.min(), level.max(), np.abs(v[:, 2]).max(), np.linalg.norm(v, axis=1).max()
+    assert moves(v) == wanted
+
+
+@pytest.mark.parametrize("seq", [None, -1, 0, 5])
+@pytest.mark.parametrize("ages", [[], [1.0], [14.9, 15.0], [15.1], [30.0, 20.0], [3.0, -2.0], [-1.0]])
+def test_the_item_in_force_now_is_that_of_any_time(ages: list[float], seq: int | None) -> None:
+    leg = 1e9 - np.array(ages), np.arange(1.0, len(ages) + 1)[:, None]
+    mission = None if seq is None else Mission(uav=1, t=1e9, seq=seq)
+    want = items_in_force(np.array([1e9]), leg, mission)
+    assert np.array_equal([item_in_force(1e9, leg, mission)], want, equal_nan=True)

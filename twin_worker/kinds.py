@@ -1,6 +1,7 @@
 """Which kind of twin an aircraft has now, and the route flown by those that need no identified model."""
 
 from dataclasses import dataclass, replace
+from math import isfinite
 
 import numpy as np
 
@@ -70,9 +71,9 @@ def hangs(twin: Twin) -> bool:
 
 def command_in_force(twin: Twin) -> int:
     """Give the command of the mission item in force; 0 unknown."""
-    seq = rotor.items_in_force(np.array([twin.history.newest]), twin.history.rows("leg"), twin.mission)[0]
+    seq = rotor.item_in_force(twin.history.newest, twin.history.look("leg"), twin.mission)
     items = twin.mission.items if twin.mission else ()
-    return next((item.command for item in items if item.seq == seq), 0)
+    return next((item.command for item in items if item.seq == seq), 0) if isfinite(seq) else 0
 
 
 def _board(twin: Twin, flown: Track, instead: Instead | None = None) -> rotor.Onboard:

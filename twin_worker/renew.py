@@ -42,7 +42,7 @@ def renew(twin: Twin) -> list[Message]:
     """Give the last path that was flown ahead, from the newest position on; nothing where there is neither."""
     if twin.base is None:
         return []
-    t, rows = twin.history.rows("position", max(twin.base.t, twin.history.newest - 1.0))
+    t, rows = twin.history.look("position", max(twin.base.t, twin.history.newest - 1.0))
     made = renewed(twin, float(t[-1]), rows[-1]) if len(t) else None
     if made is None:
         return []

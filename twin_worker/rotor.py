@@ -22,6 +22,7 @@ HOLD_MODES = ("LOITER", "POSHOLD", "BRAKE", "AUTO.LOITER", "QLOITER", "HOLD", "P
 RETURN_MODES = ("RTL", "AUTO.RTL", "SMART_RTL")
 _ZETA = 0.9
 _TRANSITION = 4.0  # acceleration of a quadplane between hovering and flying [m/s2]
+_TOLD_S = 15.0  # an item that was reported is in force for so long [s]
 _STILL = 0.8  # slower than this it waits [m/s]
 
 
@@ -208,10 +209,19 @@ def _waited(track: Track, b: np.ndarray) -> float:
 
 def items_in_force(t: np.ndarray, leg: tuple[np.ndarray, np.ndarray], mission: Mission | None) -> np.ndarray:
     """Give the mission item in force at times `t`, nan unknown, (n,): as reported, else as it came with the mission."""
-    seq = held(*leg, t, 15.0)[:, 0]
+    seq = held(*leg, t, _TOLD_S)[:, 0]
     if mission is not None and mission.seq >= 0:
         seq = np.where(np.isfinite(seq), seq, float(mission.seq))
     return seq
+
+
+def item_in_force(now: float, leg: tuple[np.ndarray, np.ndarray], mission: Mission | None) -> float:
+    """Give the same at one time."""
+    t, seq = leg
+    k = int(t.searchsorted(now, side="right")) - 1
+    if k >= 0 and not now - t[k] > _TOLD_S:
+        return float(seq[k, 0])
+    return float(mission.seq) if mission is not None and mission.seq >= 0 else float("nan")
 
 
 def said(board: Onboard, rotor: Rotor) -> str:

@@ -154,12 +154,12 @@ def _remember(twin: Twin) -> None:
 def _score(twin: Twin) -> None:
     if twin.contest.waiting and twin.history.newest >= twin.contest.waiting[0][0] + contest.AT[-1]:
         assert twin.origin is not None
-        t, position = twin.history.rows("position", twin.contest.waiting[0][0] - _BEFORE_S)
+        t, position = twin.history.look("position", twin.contest.waiting[0][0] - _BEFORE_S)
         twin.contest.answer(t, to_ned(twin.origin, *position.T))
     if not twin.record.waiting:
         return
     assert twin.origin is not None
-    t, position = twin.history.rows("position", twin.record.answered - _BEFORE_S)
+    t, position = twin.history.look("position", twin.record.answered - _BEFORE_S)
     twin.record.answer(t, to_ned(twin.origin, *position.T))
 
 

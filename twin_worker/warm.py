@@ -18,6 +18,7 @@ from twin_worker.calibration.miss import AHEAD
 from twin_worker.claims.tape import read
 from twin_worker.conflict.traffic import Traffic
 from twin_worker.coupled import identify
+from twin_worker.events.watch import moves
 from twin_worker.history import History as Telemetry
 from twin_worker.hybrid import lags
 from twin_worker.identify import AXES, identify_axis
@@ -99,9 +100,10 @@ def _meet() -> None:
 
 
 def _go_on() -> None:
-    """Renew a prediction, and feed the wind filter."""
+    """Renew a prediction, feed the wind filter, and see whether it flies."""
     ahead, path = (Array.of(values).numpy() for values in (np.arange(5.0), np.zeros((5, 3))))
     shifted(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
+    moves(np.zeros((3, 3)))  # type: ignore[call-arg]
     WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, 0.0)
 
 

@@ -60,7 +60,7 @@ def _remember_ground(twin: Twin) -> None:
     if twin.status is None or twin.status.armed:
         return
     twin.peak = -np.inf
-    _, position = twin.history.rows("position", twin.history.newest - 2.0)
+    _, position = twin.history.look("position", twin.history.newest - 2.0)
     if len(position):
         twin.stood = Origin(*map(int, position[-1]))
 
@@ -125,7 +125,7 @@ def _trust(made: Prediction | None) -> Finding:
 def _mission(twin: Twin, now: float) -> Finding:
     """Judge the legs ahead of a fixed wing that follows its mission."""
     nothing = Finding(AlertKind.NOT_ACHIEVABLE, 0.0, "", "the mission is achievable")
-    _, position = twin.history.rows("position", twin.history.newest - 3.0)
+    _, position = twin.history.look("position", twin.history.newest - 3.0)
     if twin.vehicle not in WINGS or twin.why_no_route() or hangs(twin) or not len(position):
         return nothing
     assert twin.origin is not None and twin.mission is not None

@@ -1,8 +1,10 @@
 """Events that only the flight shows: take-off, landing, touch-down, and a local frame left far behind."""
 
 from dataclasses import dataclass
+from math import hypot, inf, sqrt
 from typing import TYPE_CHECKING
 
+import numba as nb
 import numpy as np
 
 from fleet.contract import Event
@@ -64,33 +66,46 @@ def watch(twin: "Twin", command: int) -> None:
 def _flies(twin: "Twin") -> bool | None:
     """Judge by the last seconds of flight; None: cannot tell."""
     assert twin.origin is not None
-    t, v = twin.history.rows("velocity", twin.history.newest - _OVER_S)
-    _, place = twin.history.rows("position", twin.history.newest - _OVER_S)
+    t, v = twin.history.look("velocity", twin.history.newest - _OVER_S)
+    _, place = twin.history.look("position", twin.history.newest - _OVER_S)
     if len(t) < 3 or not len(place) or t[-1] - t[0] < 0.6 * _OVER_S:
         return None
+    slowest, level, steepest, speed = moves(v)
+    if twin.vehicle not in ROTORS and slowest > _FLIES:  # as it mostly is
+        return True
     down = to_ned(twin.origin, *place.T)[:, 2]
-    level, speed = np.hypot(*v[:, :2].T), np.linalg.norm(v, axis=1)
     if twin.vehicle in ROTORS:
         high = twin.ground.height - down.max() > _LOW_M  # false for nan
-        stands = speed.max() < _HOVERS and not high and (not twin.ground.armed or not np.isnan(twin.ground.height))
-        flies = bool(high) or level.min() > 2.0
+        stands = speed < _HOVERS and not high and (not twin.ground.armed or not np.isnan(twin.ground.height))
+        flies = bool(high) or slowest > 2.0
     else:
-        _, air = twin.history.rows("air", twin.history.newest - _OVER_S)
+        _, air = twin.history.look("air", twin.history.newest - _OVER_S)
         still = not len(air) or air[:, 0].max() < _FLIES  # into the wind it may hang in the air
-        stands = level.max() < _STANDS and np.abs(v[:, 2]).max() < 0.5 and still
-        flies = level.min() > _FLIES
+        stands, flies = level < _STANDS and steepest < 0.5 and still, False
     if stands:
         twin.ground.height = float(down.mean())
     return True if flies else False if stands else None
 
 
+@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath
+def moves(v: np.ndarray) -> tuple[float, float, float, float]:
+    """Give of velocities, (n, 3) [m/s], least and greatest level speed, and the greatest up or down and in all."""
+    least, level, steepest, most = inf, 0.0, 0.0, 0.0
+    for k in range(len(v)):
+        over = hypot(v[k, 0], v[k, 1])
+        least, level = min(least, over), max(level, over)
+        steepest, most = max(steepest, abs(v[k, 2])), max(most, sqrt(v[k, 0] ** 2 + v[k, 1] ** 2 + v[k, 2] ** 2))
+    return least, level, steepest, most
+
+
 def _frame(twin: "Twin") -> None:
     """Move the origin of the local frame to an aircraft that has flown far from it."""
     assert twin.origin is not None
-    _, place = twin.history.rows("position", twin.history.newest - 1.0)
+    _, place = twin.history.look("position", twin.history.newest - 1.0)
     if not len(place):
         return
-    away = float(np.linalg.norm(to_ned(twin.origin, *place[-1:].T)[0, :2]))
+    north, east, _ = to_ned(twin.origin, *place[-1]).tolist()
+    away = hypot(north, east)
     if away > _FAR_M and abs(place[-1, 0]) <= 9e8 and abs(place[-1, 1]) <= 1.8e9:
         twin.origin = Origin(*(int(x) for x in place[-1]))
         twin.ground.height = float("nan")
