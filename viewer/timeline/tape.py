@@ -33,6 +33,7 @@ class Tape:
         self.events: tuple[Event, ...] = ()
         self._t, self._x = np.empty(ROOM), np.empty((ROOM, COLUMNS), np.float32)
         self._n, self._step = 0, 0.0
+        self._told_bytes = 0
         self._asked: Forecast | None = None
 
     def __len__(self) -> int:
@@ -50,8 +51,7 @@ class Tape:
 
     def nbytes(self) -> int:
         """Count the bytes of all arrays kept."""
-        told = sum(len(one.message.path.data) + len(one.message.tube.data) + BARE_BYTES for one in self.told)
-        return self._t.nbytes + self._x.nbytes + told
+        return self._t.nbytes + self._x.nbytes + self._told_bytes
 
     def take(self, vehicle: Vehicle, trail: np.ndarray, now: float, apart_s: float = TOLD_S) -> None:
         """Keep how a UAV is now.
@@ -117,6 +117,7 @@ class Tape:
         told, self.events = vehicle.forecast, vehicle.events
         if told is not None and (not self.told or told.t >= self.told[-1].t + apart_s):
             self.told.append(_slim(told, self.told[-1] if self.told else None))
+            self._told_bytes += _size(self.told[-1])
         how = stood(vehicle, at, now)
         if not self.stood or how[1:] != self.stood[-1][1:]:
             self.stood.append(how)
@@ -125,11 +126,12 @@ class Tape:
             self._forget(at - KEPT_S)
         if len(self.told) > MAX_TOLD:
             self.told = self.told[::2]
+            self._told_bytes = sum(map(_size, self.told))
 
     def _forget(self, before: float) -> None:
         """Let go the oldest prediction, and how it stood, of before a time [s since 1970]."""
         if self.told and self.told[0].t < before:
-            del self.told[0]
+            self._told_bytes -= _size(self.told.pop(0))
         if len(self.stood) > 1 and self.stood[1].t < before:  # the first tells how it stands until the second
             del self.stood[0]
 
@@ -168,6 +170,11 @@ class Tape:
     def stood_at(self, t: float) -> Stood | None:
         """Tell how it stood at a time; None before it was known."""
         return next((one for one in reversed(self.stood) if one.t <= t), None)
+
+
+def _size(told: Forecast) -> int:
+    """Count the bytes of a prediction that is kept, about."""
+    return len(told.message.path.data) + len(told.message.tube.data) + BARE_BYTES
 
 
 def _slim(told: Forecast, before: Forecast | None) -> Forecast:
