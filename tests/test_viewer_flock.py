@@ -8,6 +8,7 @@ from fleet.codec import encode, encoding
 from fleet.contract import Array, Mission, Rows, Sample, Status
 from fleet.frames import Origin
 from fleet.memory_bus import MemoryBus
+from viewer.bygone import Bygone
 from viewer.errors import AHEADS_S, by_ahead, errors
 from viewer.events import Kind
 from viewer.feed import WAIT_S, Feed
@@ -119,6 +120,14 @@ def test_in_a_crowd_the_newest_sample_and_news_of_the_mission_are_read() -> None
     assert len(list(box.take((3,)))) == 4 and list(box.take()) == []
     box.put([(None, b"\xc1", "", None)], 0.0)
     assert box.lost == 1
+
+
+def test_to_ask_for_the_past_of_some_of_a_crowd_nobody_is_read(clock: Clock) -> None:
+    feed, _, bus = crowd_of(clock, CROWD + 1)
+    for message in fixes(CROWD + 1, T + 1, 900):
+        bus.publish(message)
+    Bygone(bus, feed).ask()
+    assert len(feed.inbox.waiting(clock.now)) == CROWD + 1
 
 
 def test_who_has_waited_longest_is_named_first() -> None:

@@ -26,7 +26,7 @@ class Bygone:
         """Ask for the past of those it was not asked of yet, one by one; a gateway gives no more at once."""
         if self._feed.place is None:
             return
-        known = set(self._feed.vehicles)
+        known = self._feed.known
         wanted = known if len(known) <= FEW else known & self._feed.inbox.keen
         for uav in sorted(wanted - self._asked):
             self._asked.add(uav)

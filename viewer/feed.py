@@ -83,6 +83,12 @@ class Feed:
             return self._vehicles
 
     @property
+    def known(self) -> set[int]:
+        """Name everyone heard of, but for letters that are not read yet."""
+        with self.lock:
+            return set(self._vehicles)
+
+    @property
     def place(self) -> Place | None:
         """Give the frame of the scene; None before anybody was anywhere."""
         with self.lock:
