@@ -4,7 +4,8 @@ import ctypes
 import platform
 import threading
 
-_M_MMAP_THRESHOLD = -3  # of mallopt(3)
+_M_MMAP_THRESHOLD, _M_MMAP_MAX = -3, -4  # of mallopt(3)
+_MOST = 32_768  # blocks of their own; Linux gives a process 65,530 mappings, and threads and files need some, too
 _EVERY_S = 20.0
 
 
@@ -17,12 +18,13 @@ def give_back(large: int) -> None:
 
     Args:
         large: from how many bytes on a block is one of its own, which goes back when it is freed [bytes]
-    Source: mallopt(3), M_MMAP_THRESHOLD; malloc_trim(3).
+    Source: mallopt(3), M_MMAP_THRESHOLD and M_MMAP_MAX; malloc_trim(3).
     """
     if platform.libc_ver()[0] != "glibc":
         return
     libc = ctypes.CDLL(None)
     libc.mallopt(_M_MMAP_THRESHOLD, large)
+    libc.mallopt(_M_MMAP_MAX, _MOST)
     threading.Thread(target=_trim, args=(libc,), name="heap", daemon=True).start()
 
 
