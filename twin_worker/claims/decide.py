@@ -19,7 +19,7 @@ from typing import NamedTuple
 from twin_worker.claims.owner import owners
 
 PAUSE_S = 0.8  # a worker that stood still for longer may have been replaced [s]
-SETTLE_S = 1.5  # after the router came back, before anything is claimed [s]
+SETTLE_S = 2.5  # after the router came back, before anything is claimed: on a busy machine tokens come late [s]
 SILENT_S = 0.9  # without a word of a worker, while others are heard; longer than `PAUSE_S`, so that it knows, too [s]
 _STEP_S = 0.3  # of silence counted between two ticks at most: what was late itself hears no silence [s]
 
