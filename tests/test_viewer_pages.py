@@ -1,6 +1,7 @@
 """Pages beside each other: a defect of one ends no other, each has its colours, a click shows whose and when."""
 
 import contextlib
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from viewer.app import App
 from viewer.clicks import click, clicked
 from viewer.door import quiet, serve
 from viewer.palette import DARK, LIGHT
+from viewer.panels import NOBODY
 from viewer.remembered import Remembered
 from viewer.view import View
 from viewer.words import table
@@ -171,3 +173,17 @@ def test_who_was_selected_is_not_forgotten_before_it_is_there_again() -> None:
     with contextlib.suppress(IndexError):
         assert one._client.local_storage.set_item.call_args.args[1] == '{"uav": 40, "light": null}'
     assert one.uav == 40 and remembered(None, error=TimeoutError).uav is None
+
+
+def test_the_menu_offers_the_rows_of_the_table_and_both_those_that_pass_the_search(site) -> None:
+    panels = site.views[0].panels
+
+    def rows() -> tuple[str, ...]:
+        return tuple(f"UAV-{int(uav):03d}" for uav in re.findall(r'data-uav="(\d+)"', panels._table.content))
+
+    site.run()
+    assert sorted(rows()) == [f"UAV-{uav:03d}" for uav in range(5)] and panels._menu.options == (NOBODY, *rows())
+    assert list(rows()) != sorted(rows())  # the worst first
+    panels._search.value = "uav-003"
+    site.run()
+    assert rows() == ("UAV-003",) and panels._menu.options == (NOBODY, "UAV-003")

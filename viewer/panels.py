@@ -112,6 +112,7 @@ class Panels:
         self._beat, palette, pick = not self._beat, self._palette, self._handler()
         chosen = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
         kept = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
+        kept = sorted(kept, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
         self._presence.here()
         missed = since(fleet, self._presence.away, palette, pick)
         said = (
@@ -127,7 +128,7 @@ class Panels:
         with self._browser.client.atomic():  # made first: while it lasts, nothing else is sent
             for html, text in said:
                 html.content = text
-            self._list(kept, now)
+            self._list(kept)
             self._read.visible = bool(missed)
             self.show(chosen, now)
             told = listing(chosen.events, palette, self.seek) if chosen is not None else ""
@@ -148,17 +149,19 @@ class Panels:
             return False
         if self._filter == "Selected" and vehicle.uav != selected:
             return False
+        if not (wanted := self._search.value.lower().split()):
+            return True
         mode = vehicle.status.mode if vehicle.status is not None else ""
         text = f"{vehicle.name} {vehicle.uav} {WORD[vehicle.state(now)]} {mode}".lower()
-        return all(word in text for word in self._search.value.lower().split())
+        return all(word in text for word in wanted)
 
     def _handler(self) -> str:
         """Give the handler of a table row: it sets the hidden input, as if someone had typed the id there."""
         message = f"{{{{type:'GuiUpdateMessage',uuid:'{self._picked._impl.uuid}',updates:{{{{value:'{{}}'}}}}}}}}"
         return f"var m=window.__viserMutable;m&&m.sendMessage({message})"
 
-    def _list(self, kept: list[Vehicle], now: float) -> None:
+    def _list(self, kept: list[Vehicle]) -> None:
         """Offer the rows of the table in the menu, too."""
-        names = tuple(v.name for v in sorted(kept, key=lambda v: severity(v, now))[:MAX_ROWS])
-        if self._menu.options != (NOBODY, *names):
-            self._menu.options = (NOBODY, *names)
+        names = NOBODY, *(vehicle.name for vehicle in kept)
+        if self._menu.options != names:
+            self._menu.options = names
