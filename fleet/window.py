@@ -60,6 +60,8 @@ class Window:
 
     def columns(self, names: tuple[str, ...]) -> np.ndarray:
         """Pick states or inputs by name, (n, k)."""
+        if all(name in STATES for name in names):
+            return self.x[:, [STATES.index(name) for name in names]]
         phi = np.clip(self.x[:, STATES.index("phi")], -1.3, 1.3)
         bank = np.tan(phi) * np.sin(phi)  # what a turn asks of pitch rate and lift: q = g / V tan(phi) sin(phi)
         both, rows = (*STATES, *INPUTS, "bank"), np.column_stack([self.x, self.u, bank])

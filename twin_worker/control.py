@@ -6,7 +6,7 @@ learnt from flight, where one was, and else the autopilot's default, which is sa
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -62,7 +62,12 @@ class Control:
 
     def par(self, altitude_m: float) -> np.ndarray:
         """Give the vector the law's kernels read, at a height above mean sea level [m]."""
-        return laws.parameters(self.name, self.values, altitude_m)[0]
+        return laws.vector(self.name, self._found, altitude_m)
+
+    @cached_property
+    def _found(self) -> dict[str, float]:
+        """Give what the law reads of the values: they do not change, and every flight begins with them."""
+        return laws.read(self.name, self.values)[0]
 
     @property
     def absent(self) -> tuple[str, ...]:

@@ -53,7 +53,8 @@ class History:
 
     def _of(self, name: str, newest: float) -> Kept:
         """Give what is kept of a kind of which rows up to `newest` came."""
-        self.newest = max(self.newest, newest)
+        if newest > self.newest:
+            self.newest = newest
         kept = self._kept.get(name)
         if kept is None:
             kept = self._kept[name] = Kept(np.empty(0), np.empty((0, len(COLUMNS[name]))))

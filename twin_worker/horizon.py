@@ -177,6 +177,11 @@ class Record:
         return self._ledger.until
 
     @property
+    def waits(self) -> bool:
+        """Tell whether any prediction waits for answers."""
+        return bool(self._ledger.live.any())
+
+    @property
     def waiting(self) -> tuple[float, ...]:
         """Give when the predictions that wait for answers were made [s since 1970]."""
         return tuple(self._ledger.t0[self._ledger.live].tolist())

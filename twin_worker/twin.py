@@ -156,7 +156,7 @@ def _score(twin: Twin) -> None:
         assert twin.origin is not None
         t, position = twin.history.look("position", twin.contest.waiting[0][0] - _BEFORE_S)
         twin.contest.answer(t, to_ned(twin.origin, *position.T))
-    if not twin.record.waiting:
+    if not twin.record.waits:
         return
     assert twin.origin is not None
     t, position = twin.history.look("position", twin.record.answered - _BEFORE_S)

@@ -54,11 +54,21 @@ def fit_percent(y: np.ndarray, y_hat: np.ndarray) -> np.ndarray:
 
 def fits_at(unseen: Unseen, horizon_s: float) -> tuple[dict[str, float], dict[str, float]]:
     """Give the fit of the model's free runs, and of holding the last value, per state [%]; an odd end is left out."""
+    y, ok, length = _whole(unseen, horizon_s)
+    return fit_at(unseen, horizon_s), _named(fit_percent(y, hold(y, ok, length)))
+
+
+def fit_at(unseen: Unseen, horizon_s: float) -> dict[str, float]:
+    """Give the first of both alone."""
+    y, ok, length = _whole(unseen, horizon_s)
+    return _named(fit_percent(y, np.where(ok[:, None], unseen.runs(length)[: len(y)], np.nan)))
+
+
+def _whole(unseen: Unseen, horizon_s: float) -> tuple[np.ndarray, np.ndarray, int]:
+    """Give states and mask without the odd end, and the length of a run in rows."""
     length = max(int(horizon_s / unseen.dt), 2)
     n = max(len(unseen.y) // length, 1) * length
-    y, ok = unseen.y[:n], unseen.ok[:n]
-    made = np.where(ok[:, None], unseen.runs(length)[:n], np.nan)
-    return _named(fit_percent(y, made)), _named(fit_percent(y, hold(y, ok, length)))
+    return unseen.y[:n], unseen.ok[:n], length
 
 
 def _named(fit: np.ndarray) -> dict[str, float]:
@@ -67,7 +77,7 @@ def _named(fit: np.ndarray) -> dict[str, float]:
 
 def mean(fit: dict[str, float], states: tuple[str, ...] = STATES) -> float:
     """Give the mean fit over states, the paper's Fit_value [%]."""
-    return float(np.mean([fit[name] for name in states]))
+    return float(np.add.reduce([fit[name] for name in states])) / len(states)
 
 
 def by_axis(fit: dict[str, float], horizon_s: float) -> dict[str, float]:
@@ -100,7 +110,7 @@ def verify(plant: Plant, window: Window, start: int, omega: float = OMEGA, last:
             break
     outcome, said = _judge(fit, _missing(fit, still, omega), window.part(0, start))
     if last is not None:
-        before = mean(fits_at(Unseen(last, window, start), horizon)[0])
+        before = mean(fit_at(Unseen(last, window, start), horizon))
         if outcome is Outcome.VERIFIED and mean(fit) < before - _NO_WORSE:
             outcome, said = Outcome.WORSE_THAN_LAST, f"the model in force has {before:.0f} % and stays"
         elif outcome in (Outcome.BELOW_THRESHOLD, Outcome.DIVERGED) and before <= omega:
@@ -121,7 +131,7 @@ def told(verdict: Verdict, plant: Plant, window: Window, start: int) -> Verdict:
     """Add what is told of a model beside its verdict: the fit at other horizons, and how white its residuals are."""
     unseen = Unseen(plant, window, start)
     seconds = unseen.dt * (len(unseen.y) - 1)
-    fits = {h: fits_at(unseen, h)[0] for h in TOLD_S if h <= seconds + unseen.dt}
+    fits = {h: fit_at(unseen, h) for h in TOLD_S if h <= seconds + unseen.dt}
     at = {name: value for h, fit in fits.items() for name, value in by_axis(fit, h).items()}
     white = _named(whiteness(unseen.y, unseen.one_step()))
     return msgspec.structs.replace(verdict, fit_at=at, whiteness=white)
@@ -141,9 +151,9 @@ def _missing(fit: dict[str, float], still: dict[str, float], omega: float) -> st
 def _steady(known: Window) -> str:
     """Say how little moved where that was too little to identify by; nothing where no row was measured."""
     rows = known.columns(tuple(_QUIET))[known.ok]
-    if not len(rows) or (rows.std(axis=0) >= list(_QUIET.values())).any():
+    if not len(rows) or ((moved := rows.std(axis=0)) >= list(_QUIET.values())).any():
         return ""
-    phi, theta, q = np.degrees(rows.std(axis=0))
+    phi, theta, q = np.degrees(moved)
     return f"steady flight (phi {phi:.1f} deg, theta {theta:.1f} deg, q {q:.1f} deg/s)"
 
 

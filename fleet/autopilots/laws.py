@@ -67,6 +67,13 @@ def parameters(law: str, values: Mapping[str, float], altitude_m: float = 0.0) -
     return (padded(par, ARDUPLANE) if law == "arduplane" else par), absent
 
 
+def vector(law: str, found: Mapping[str, float], altitude_m: float = 0.0) -> np.ndarray:
+    """Turn what `read` found into the vector of one law, in calm air, (N_PAR,); altitude as for `parameters`."""
+    if law == "arduplane":
+        return padded(arduplane.vector(found, altitude_m), ARDUPLANE)
+    return LAWS[law].parameters(found, altitude_m)[0]
+
+
 def read(law: str, values: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
     """Give every parameter of a law under its current name, in the autopilot's units, and which are defaults."""
     if law == "arduplane":

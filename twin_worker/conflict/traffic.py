@@ -1,6 +1,7 @@
 """Loss of separation: each pair is judged once, by whoever holds the aircraft with the lower id."""
 
 from dataclasses import dataclass, field
+from math import inf, isfinite
 
 import numpy as np
 
@@ -38,8 +39,8 @@ class Traffic:
 
     def judge(self, uav: int, now: float) -> list[Alert]:
         """Judge one held aircraft against all with a higher id, at most once a second of data time `now`."""
-        last = self._judged.get(uav, -np.inf)
-        if not np.isfinite(now) or last <= now < last + _EVERY_S:
+        last = self._judged.get(uav, -inf)
+        if last <= now < last + _EVERY_S or not isfinite(now):
             return []
         self._judged[uav] = now
         ledger = self._ledgers.setdefault(uav, Ledger())
