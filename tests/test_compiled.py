@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
+from fleet.autopilots import laws
 from fleet.contract import Mission
 from fleet.frames import Origin, _radii, to_ned
+from twin_worker.calibration import adapt
+from twin_worker.calibration.ledger import ROWS, Ledger
 from twin_worker.calibration.miss import AHEAD, track_frame
+from twin_worker.compiled.answer import run_on
 from twin_worker.compiled.straight import straight
 from twin_worker.events.watch import moves
 from twin_worker.rotor import item_in_force, items_in_force
@@ -61,3 +65,60 @@ def test_the_item_in_force_now_is_that_of_any_time(ages: list[float], seq: int |
     mission = None if seq is None else Mission(uav=1, t=1e9, seq=seq)
     want = items_in_force(np.array([1e9]), leg, mission)
     assert np.array_equal([item_in_force(1e9, leg, mission)], want, equal_nan=True)
+
+
+def book(rng: np.random.Generator) -> Ledger:
+    """A ledger in the middle of things."""
+    made, n = Ledger(), len(AHEAD)
+    made.group[:] = rng.choice(["a", "b", ""], ROWS)
+    made.score[:] = np.where(rng.random((ROWS, n)) < 0.2, np.nan, rng.uniform(0.0, 2.0, (ROWS, n)))
+    made.claimed, made.passed = rng.random(ROWS) < 0.8, rng.random(ROWS) < 0.3
+    made.followed, made.horizon = np.round(rng.uniform(0, 9, (2, ROWS)))
+    return made
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_levels_learn_what_numpy_would_have_learnt(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    found, tube, horizon = adapt.Levels(), np.full(len(adapt.KNOTS), adapt.QUANTILE), adapt.QUANTILE
+    ends = np.zeros(2)
+    for _ in range(30):
+        made, n = book(rng), int(rng.integers(0, 60))
+        r, j = rng.integers(ROWS, size=n), rng.integers(len(AHEAD), size=n)
+        mine, claimed = made.group == "a", made.claimed.copy()
+        knot, score = adapt._COLUMN_OF[j], made.score[r, j]
+        new = mine[r] & (knot >= 0) & np.isfinite(score)
+        step = adapt._TUBE_STEP * adapt._SHARE[knot[new]] * ((score[new] > 1.0) - (1.0 - adapt.QUANTILE))
+        np.add.at(tube, knot[new], step)
+        np.clip(tube, adapt._LEAST_LEVEL, adapt._MOST_LEVEL, out=tube)
+        held = mine & claimed & (made.followed >= made.horizon)
+        failed = mine & claimed & made.passed & ~held
+        moved = failed.sum() * adapt.QUANTILE - held.sum() * (1.0 - adapt.QUANTILE)
+        horizon = float(np.clip(horizon + adapt._HORIZON_STEP * moved, adapt.QUANTILE, adapt._MOST_LEVEL))
+        found.learn(made, r, j, mine)
+        assert np.array_equal(found.tube, tube) and found.horizon == horizon
+        assert np.array_equal(made.claimed, claimed & ~(held | failed))
+        ends += held.sum(), failed.sum()
+    assert len(set(tube.tolist())) > 5 and ends.all(), "or nothing was learnt"
+
+
+@pytest.mark.parametrize("n", [1, 2, 40])
+def test_the_odometer_runs_as_numpy_lets_it(n: int) -> None:
+    rng = np.random.default_rng(n)
+    at, points, begin, out = np.cumsum(rng.random(n)), 1e3 * rng.random((n, 3)), rng.random(3), np.empty((n, 2))
+    run_on(at, points, begin, 123.4, out)
+    strides = np.linalg.norm(np.diff(np.vstack([begin, points]), axis=0), axis=1)
+    assert np.array_equal(out, np.column_stack([at, 123.4 + np.cumsum(strides)]))
+
+
+@pytest.mark.parametrize("law", laws.LAWS)
+def test_what_a_law_has_read_need_not_be_read_again(law: str) -> None:
+    rng, table = np.random.default_rng(3), laws.LAWS[law].table
+    for _ in range(50):
+        few = rng.choice(len(table), len(table) // 2, replace=False)
+        values = {table[k].name: float(rng.uniform(0.5, 1.5) * (table[k].default or 1.0)) for k in few}
+        values[table[few[0]].name] = float(rng.choice([np.nan, np.inf, -1e9]))
+        par, height = laws.parameters(law, values, 300.0)[0], float(rng.uniform(0, 3000))
+        assert not np.array_equal(par, laws.parameters(law, values, height)[0], equal_nan=True)
+        found = laws.vector(law, laws.read(law, values)[0], height)
+        assert np.array_equal(found, laws.parameters(law, values, height)[0], equal_nan=True)

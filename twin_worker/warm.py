@@ -13,6 +13,7 @@ from fleet.frames import Origin, to_geodetic, wrap
 from fleet.mission import route
 from fleet.simulate import N_STATE, coupled_plant, linear_plant, simulate
 from fleet.window import Window
+from twin_worker.calibration.adapt import Levels
 from twin_worker.calibration.ledger import Ledger
 from twin_worker.calibration.miss import AHEAD
 from twin_worker.claims.tape import read
@@ -124,7 +125,7 @@ def _remember(window: Window) -> None:
     held(window.t, window.v, window.t, 1.0)
     book = Ledger()
     book.add(0.0, "", "", np.outer(AHEAD, [_SPEED, 0.0, 0.0]), _SPEED)
-    book.answer(window.t, window.p)
+    Levels().learn(book, *book.answer(window.t, window.p), book.live)
 
 
 def _learn() -> None:

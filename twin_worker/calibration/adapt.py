@@ -9,6 +9,7 @@ Source: Gibbs & Candes 2021, "Adaptive conformal inference under distribution sh
 
 from dataclasses import dataclass, field
 
+import numba as nb
 import numpy as np
 
 from twin_worker.calibration.ledger import EVERY_S, Ledger
@@ -26,6 +27,7 @@ _LEAST_LEVEL, _MOST_LEVEL = 0.5, 0.99
 _COLUMN_OF = np.full(len(AHEAD), -1)
 _COLUMN_OF[COLUMN] = np.arange(len(KNOTS))
 _LEAST_FACTOR, _MOST_FACTOR = 0.1, 20.0
+_exact = nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: as numpy does it
 
 
 @dataclass
@@ -37,17 +39,36 @@ class Levels:
 
     def learn(self, ledger: Ledger, r: np.ndarray, j: np.ndarray, mine: np.ndarray) -> None:
         """Take new answers: rows and columns of the ledger, and which rows are of this group, bool."""
-        knot, score = _COLUMN_OF[j], ledger.score[r, j]
-        new = mine[r] & (knot >= 0) & np.isfinite(score)
-        step = _TUBE_STEP * _SHARE[knot[new]] * ((score[new] > 1.0) - (1.0 - QUANTILE))
-        np.add.at(self.tube, knot[new], step)
-        np.clip(self.tube, _LEAST_LEVEL, _MOST_LEVEL, out=self.tube)
-        held = mine & ledger.claimed & (ledger.followed >= ledger.horizon)
-        failed = mine & ledger.claimed & ledger.passed & ~held
-        ledger.claimed[held | failed] = False
-        moved = failed.sum() * QUANTILE - held.sum() * (1.0 - QUANTILE)
+        _learn_tube(self.tube, ledger.score, r, j, mine)
+        held, failed = _settle_claims(ledger.claimed, ledger.followed, ledger.horizon, ledger.passed, mine)
+        moved = failed * QUANTILE - held * (1.0 - QUANTILE)
         # never below: easy minutes, which hold whatever is claimed, must not pay for hard ones
-        self.horizon = float(np.clip(self.horizon + _HORIZON_STEP * moved, QUANTILE, _MOST_LEVEL))
+        self.horizon = min(max(self.horizon + _HORIZON_STEP * moved, QUANTILE), _MOST_LEVEL)
+
+
+@_exact
+def _learn_tube(level: np.ndarray, score: np.ndarray, r: np.ndarray, j: np.ndarray, mine: np.ndarray) -> None:
+    """Move the levels at the knots, (13,), by new answers of this group."""
+    for k in range(len(r)):
+        knot, value = _COLUMN_OF[j[k]], score[r[k], j[k]]
+        if mine[r[k]] and knot >= 0 and np.isfinite(value):
+            level[knot] += _TUBE_STEP * _SHARE[knot] * ((1.0 if value > 1.0 else 0.0) - (1.0 - QUANTILE))
+    for knot in range(len(level)):
+        level[knot] = min(max(level[knot], _LEAST_LEVEL), _MOST_LEVEL)
+
+
+@_exact
+def _settle_claims(
+    claimed: np.ndarray, followed: np.ndarray, horizon: np.ndarray, passed: np.ndarray, mine: np.ndarray
+) -> tuple[int, int]:
+    """Give how many horizons of this group have held and how many have failed since, and claim them no longer."""
+    held = failed = 0
+    for r in range(len(claimed)):
+        if mine[r] and claimed[r]:
+            holds = followed[r] >= horizon[r]
+            held, failed = held + holds, failed + (passed[r] and not holds)
+            claimed[r] = not (holds or passed[r])
+    return held, failed
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from twin_worker.calibration.miss import AHEAD, least_length, track_frame
 from twin_worker.calibration.table import KNOTS
-from twin_worker.compiled.answer import Known, Said, answer_each
+from twin_worker.compiled.answer import Known, Said, answer_each, run_on
 from twin_worker.compiled.straight import straight
 
 ROWS = 96  # predictions remembered
@@ -102,8 +102,7 @@ class Ledger:
         at = at[at > last]
         if not len(at):
             return
-        points = straight(at, t, flown)
-        strides = np.linalg.norm(np.diff(np.vstack([self._stride_from, points]), axis=0), axis=1)
-        run = self._odometer[-1, 1] + np.cumsum(strides)
-        self._odometer = np.vstack([self._odometer, np.column_stack([at, run])])[-_STRIDES:]
+        points, more = straight(at, t, flown), np.empty((len(at), 2))
+        run_on(at, points, self._stride_from, float(self._odometer[-1, 1]), more)
+        self._odometer = np.concatenate([self._odometer, more])[-_STRIDES:]
         self._stride_from = points[-1]

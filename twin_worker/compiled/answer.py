@@ -113,3 +113,20 @@ def answer_each(said: Said, known: Known, happened: tuple, answered: np.ndarray)
                 _watch(r, j, sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2) / length, known)
         known.live[r] = known.next[r] < said.size[r]
     return n
+
+
+@_exact
+def run_on(at: np.ndarray, points: np.ndarray, begin: np.ndarray, before: float, out: np.ndarray) -> None:
+    """Fill in times and lengths flown until then, (n, 2) [s since 1970, m].
+
+    Args:
+        at, points: times and positions, NED, (n,) and (n, 3) [s since 1970, m]
+        begin: where the first stride begins, (3,) [m]
+        before: length flown until there [m]
+    """
+    run, north, east, down = 0.0, begin[0], begin[1], begin[2]
+    for k in range(len(at)):
+        n, e, d = points[k, 0] - north, points[k, 1] - east, points[k, 2] - down
+        run += sqrt(n * n + e * e + d * d)
+        out[k, 0], out[k, 1] = at[k], before + run
+        north, east, down = points[k, 0], points[k, 1], points[k, 2]

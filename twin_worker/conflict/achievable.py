@@ -73,20 +73,23 @@ def ability(params: Mapping[str, float], altitude_m: float) -> Ability:
 def achievable(now: Now, able: Ability) -> Finding:
     """Judge the legs ahead; give the one that is least achievable. A leg of unknown airspeed ends the judgement."""
     at, from_p = now.t, now.way.start if np.isfinite(now.way.start).all() else now.p
-    found = Finding(AlertKind.NOT_ACHIEVABLE, 0.0, "", _OVER)
+    worst: tuple[float, str, np.ndarray, float] | None = None
     for leg in now.way.legs[:_LEGS]:
         to = leg[m.P_N : m.P_D + 1]
         Va = leg[m.VA_C] * P.eas2tas(now.origin.alt_mm * 1e-3 - to[2]) if leg[m.VA_C] > 0 else able.Va
         if not isfinite(Va):
             break
         speed, (p, why) = _worst(leg, from_p, Va, able, now.wind)
-        if p > found.probability:
-            place = Origin(*map(int, to_geodetic(now.origin, to)))
-            item = f"mission item {int(leg[m.SEQ])}" if leg[m.SEQ] >= 0 else "the return to launch"
-            found = Finding(AlertKind.NOT_ACHIEVABLE, p, f"{item} is not achievable: {why}", _OVER, -1, at, place)
+        if p > (worst[0] if worst is not None else 0.0):
+            worst = p, why, leg, at
         at += float(np.hypot(*(to - from_p)[:2])) / max(speed, _SLOWEST)
         from_p = to
-    return found
+    if worst is None:
+        return Finding(AlertKind.NOT_ACHIEVABLE, 0.0, "", _OVER)
+    p, why, leg, at = worst
+    place = Origin(*map(int, to_geodetic(now.origin, leg[m.P_N : m.P_D + 1])))
+    item = f"mission item {int(leg[m.SEQ])}" if leg[m.SEQ] >= 0 else "the return to launch"
+    return Finding(AlertKind.NOT_ACHIEVABLE, p, f"{item} is not achievable: {why}", _OVER, -1, at, place)
 
 
 def _worst(

@@ -9,6 +9,7 @@ from twin_worker.conflict.forecast import Forecast
 from twin_worker.conflict.ledger import Finding
 
 WINGS_M, ROTORS_M = 30.0, 5.0  # least height above home where it does not land, on wings and on rotors [m]
+_SLIGHT = 0.02  # what is less probable is warned of by nobody, and not described [-]
 _OVER = "height is kept"
 
 
@@ -28,6 +29,8 @@ def sinks(flight: Forecast, home: Origin, margin: float, until: float = np.inf) 
     height, sigma = above(flight, home)[:k], flight.sigma[:k, 2]
     z = (margin - height) / sigma
     p = float(ndtr(z.max()))
+    if p < _SLIGHT:
+        return Finding(AlertKind.GROUND, p, "", _OVER)
     first = int(np.flatnonzero(z >= min(z.max(), 0.0))[0])  # where the mean goes below, else where it comes nearest
     at = float(flight.t[first])
     danger = (
