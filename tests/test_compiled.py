@@ -13,6 +13,7 @@ from twin_worker.compiled.answer import run_on
 from twin_worker.compiled.straight import straight
 from twin_worker.events.watch import moves
 from twin_worker.rotor import item_in_force, items_in_force
+from twin_worker.speed import _middle
 
 
 @pytest.mark.parametrize("beyond", [None, np.nan])
@@ -122,3 +123,11 @@ def test_what_a_law_has_read_need_not_be_read_again(law: str) -> None:
         assert not np.array_equal(par, laws.parameters(law, values, height)[0], equal_nan=True)
         found = laws.vector(law, laws.read(law, values)[0], height)
         assert np.array_equal(found, laws.parameters(law, values, height)[0], equal_nan=True)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 10, 31])
+def test_the_middle_is_numpy_s_median(n: int) -> None:
+    x = np.random.default_rng(n).standard_normal(n)
+    assert _middle(x) == np.median(x)
+    x[n // 2] = np.nan
+    assert np.isnan(_middle(x))

@@ -103,7 +103,7 @@ def compare_with_flight(twin: Twin) -> None:
     flown = seen(twin)
     if flown is None or len(flown) < 100:
         return
-    seq = rotor.items_in_force(flown.t, twin.history.rows("leg"), twin.mission)
+    seq = rotor.items_in_force(flown.t, twin.history.look("leg"), twin.mission)
     if twin.vehicle in NO_WINGS:
         twin.rotor = rotor_fit.compare(flown, seq, _board(twin, flown), twin.rotor)
     elif not hangs(twin):
@@ -124,7 +124,7 @@ def fly_kind(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
     if twin.vehicle == QUADPLANE:
         hung = np.flatnonzero(lifted(whole.t, twin.history, twin.received, twin.modes))
         whole = whole.part(int(hung[-1]) + 1 if len(hung) else 0, len(whole))
-    seq = rotor.items_in_force(whole.t, twin.history.rows("leg"), twin.mission)
+    seq = rotor.items_in_force(whole.t, twin.history.look("leg"), twin.mission)
     made = wing.fly(whole, seq, _wing_board(twin), twin.grey, ahead)
     if made.path is None:
         return nothing(made.sentence, made.seq)
@@ -161,7 +161,7 @@ def _fly_rotor(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
         return Flight(path, "copter", copter.LAW, -1, said, control)
     if why := twin.why_no_route():
         return nothing(why)
-    seq = rotor.items_in_force(flown.t, twin.history.rows("leg"), twin.mission)
+    seq = rotor.items_in_force(flown.t, twin.history.look("leg"), twin.mission)
     if twin.instead is not None:
         seq[-1], flown = twin.instead.seq, _at_speed(flown, twin.instead)
     path, wrong = rotor.fly_route(flown, seq, board, twin.rotor, ahead)

@@ -10,7 +10,7 @@ _OVER_S = 20.0  # rates are taken over as much [s]
 
 def rate_hz(history: History, kind: str) -> float:
     """Give the rate of one kind of row of late [Hz]; 0 where none came."""
-    t, _ = history.rows(kind, history.newest - _OVER_S)
+    t, _ = history.look(kind, history.newest - _OVER_S)
     if not len(t):
         return 0.0
     gaps = np.diff(t)
@@ -19,7 +19,7 @@ def rate_hz(history: History, kind: str) -> float:
 
 def lacking(history: History) -> str:
     """Say which kinds of row never came and which come too seldom; empty where everything is there."""
-    none = [kind for kind in (*_NEEDS_HZ, "air") if not len(history.rows(kind)[0])]
+    none = [kind for kind in (*_NEEDS_HZ, "air") if not len(history.look(kind)[0])]
     slow = {kind: rate_hz(history, kind) for kind in _NEEDS_HZ if kind not in none}
     said = [f"no {', '.join(none)} rows yet"] if none else []
     said += [

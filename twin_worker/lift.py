@@ -40,7 +40,7 @@ def lifted(
         if mode.startswith("Q"):
             out |= (t >= since) & (t < until)
     channels = lift_channels(params)
-    t_s, pulses = history.rows("servo", t[0] - 5.0)
+    t_s, pulses = history.look("servo", t[0] - 5.0)
     if channels and len(t_s):
         turning = np.any([pulses[:, column] > above for column, above in channels], axis=0)
         out |= turning[np.clip(np.searchsorted(t_s, t, side="right") - 1, 0, None)]

@@ -171,7 +171,7 @@ def _hold(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float, out: np.
 
 def _reported(history: History, name: str, at: np.ndarray, longest: float) -> np.ndarray:
     """Give what was reported last at each time, nan after `longest` seconds, (len(at), k)."""
-    return held(*history.rows(name, at[0] - longest - 1.0), at, longest)
+    return held(*history.look(name, at[0] - longest - 1.0), at, longest)
 
 
 def fly_ahead(now: Situation, plant: Plant, ahead: np.ndarray) -> Flown:
@@ -365,7 +365,7 @@ def _start(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray, np.nda
 
 def _gust(now: Situation, good: Window) -> float:
     """Give the airspeed beyond what the mean wind explains [m/s]; 0 without an airspeed sensor."""
-    t, air = now.history.rows("air", good.t[-1] - 1.0)
+    t, air = now.history.look("air", good.t[-1] - 1.0)
     recent = air[t <= good.t[-1], 0]
     if not len(recent) or recent.min() < 3.0:
         return 0.0

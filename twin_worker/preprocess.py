@@ -153,7 +153,7 @@ class Grid:
         """Lay the tail anew from where rows may still have come; tell whether every kind is there."""
         begun = self._stop > self._first
         settled = self._k[self._stop - 1] * DT - _SETTLED_S if begun else max(until - self.keep_s, 0.0)
-        rows = {name: history.rows(name, settled - _BEFORE_S) for name in LONGEST_GAP}
+        rows = {name: history.look(name, settled - _BEFORE_S) for name in LONGEST_GAP}
         if any(len(t) < _LEAST_ROWS[not begun] for t, _ in rows.values()):
             return begun
         start = settled if begun else max(settled, *(float(t[0]) for t, _ in rows.values()))

@@ -19,26 +19,34 @@ _APART = 0.5  # a smaller difference is rounding and noise [m/s]
 
 def aimed_at(history: History, t: float) -> float:
     """Give the airspeed aimed at just before `t`, as reported; nan where it is not [m/s]."""
-    t_c, command = history.rows("command", t - _OVER_S)
-    t_air, air = history.rows("air", t - _OVER_S - 2.0)
+    t_c, command = history.look("command", t - _OVER_S)
+    t_air, air = history.look("air", t - _OVER_S - 2.0)
     if len(t_c) < _LEAST or len(t_air) < _LEAST or air[:, 0].max() < 3.0:
         return float("nan")
     wanted = command[:, 4] + np.interp(t_c, t_air, air[:, 0])
-    return float(np.median(wanted[t_c <= t])) if (t_c <= t).any() else float("nan")
+    return _middle(wanted[t_c <= t]) if (t_c <= t).any() else float("nan")
 
 
 def held_to(history: History, t: float, speeds: np.ndarray) -> float:
     """Give the one of `speeds` [m/s] that was held just before `t`; nan where the airspeed keeps to none of them."""
-    t_air, air = history.rows("air", t - _STEADY_S)
+    t_air, air = history.look("air", t - _STEADY_S)
     Va = air[t_air <= t, 0]
     if len(Va) < 2 * _LEAST or not len(speeds) or Va.min() < 3.0:
         return float("nan")
     half = len(Va) // 2
-    off = np.sort(np.abs(speeds - np.median(Va)))
-    steady = abs(float(np.median(Va[:half]) - np.median(Va[half:]))) < _STEADY * float(np.median(Va))
-    if not steady or off[0] > _STRAYS * float(np.median(Va)) or (len(off) > 1 and off[0] > 0.5 * off[1]):
+    usual = _middle(Va)
+    off = np.sort(np.abs(speeds - usual))
+    steady = abs(_middle(Va[:half]) - _middle(Va[half:])) < _STEADY * usual
+    if not steady or off[0] > _STRAYS * usual or (len(off) > 1 and off[0] > 0.5 * off[1]):
         return float("nan")
-    return float(speeds[np.argmin(np.abs(speeds - np.median(Va)))])
+    return float(speeds[np.argmin(np.abs(speeds - usual))])
+
+
+def _middle(x: np.ndarray) -> float:
+    """Give the median; nan where any is."""
+    ranked = np.sort(x)
+    n = len(ranked)
+    return 0.5 * float(ranked[(n - 1) // 2] + ranked[n // 2]) if ranked[-1] == ranked[-1] else float("nan")
 
 
 def as_told(legs: np.ndarray, seq: float, cruise: float, told: float) -> np.ndarray:

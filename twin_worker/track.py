@@ -61,10 +61,10 @@ def track(history: History, origin: Origin, *, until: float, seconds: float, tur
     Returns:
         the track, or None before a second and a half of positions
     """
-    t_p, position = history.rows("position", until - seconds - 2.0)
+    t_p, position = history.look("position", until - seconds - 2.0)
     if len(t_p) < 3:
         return None
-    t_v, velocity = history.rows("velocity", until - seconds - 2.0)
+    t_v, velocity = history.look("velocity", until - seconds - 2.0)
     moving = len(t_v) >= 4 and t_v[-1] > t_p[-1] - _OLD_S
     stop = min(until, float(t_p[-1]), float(t_v[-1]) if moving else np.inf)
     start = max(until - seconds, float(t_p[0]), float(t_v[0]) if moving else -np.inf)
@@ -99,7 +99,7 @@ def _slope(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 def _attitude(history: History, grid: np.ndarray) -> np.ndarray:
     """Give phi theta psi on the grid; nan where the nearest row is too far."""
-    t, x = history.rows("attitude", grid[0] - 2.0)
+    t, x = history.look("attitude", grid[0] - 2.0)
     if len(t) < 2 or t[-1] < grid[-1] - _OLD_S:
         return np.full((len(grid), 3), np.nan)
     euler = np.column_stack([np.interp(grid, t, np.unwrap(x[:, i])) for i in range(3)])

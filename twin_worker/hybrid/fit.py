@@ -56,7 +56,7 @@ def flight_of(good: Window, history: History, scale: float) -> Flight:
 def airspeed_of(good: Window, history: History, scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Give rows of `lags.STEP`, newest last, (n,) [s], and the true airspeed at each, (n,) [m/s]; as `flight_of`."""
     at = good.t[-1] - lags.STEP * np.arange(int(good.seconds / lags.STEP) + 1)[::-1]
-    t_air, air = history.rows("air", at[0] - 2.0)
+    t_air, air = history.look("air", at[0] - 2.0)
     if len(t_air) > 1 and float(air[:, 0].max()) > 3.0:
         return at, np.interp(at, t_air, air[:, 0]) * scale
     return at, np.interp(at, good.t, np.linalg.norm(good.x[:, :3], axis=1))
@@ -72,7 +72,7 @@ def _climb(h_c: np.ndarray) -> np.ndarray:
 
 def _commands(history: History, at: np.ndarray) -> np.ndarray:
     """Give what the autopilot reports to aim at, held for at most a second, nan where missing, (n, 5)."""
-    t, x = history.rows("command", at[0] - 2.0)
+    t, x = history.look("command", at[0] - 2.0)
     if not len(t):
         return np.full((len(at), 5), np.nan)
     k = np.searchsorted(t, at, side="right") - 1
