@@ -298,3 +298,20 @@ def test_garbled_bytes_on_the_bus_are_counted(bus, worker):
     bus.deliver(Sample, b"\xc1 no msgpack", "application/msgpack;parauav.sample.1")
     bus.deliver(Sample, b"\x80", "application/msgpack;parauav.sample.99")
     assert bus.bad == 2 and worker.turn() == 0
+
+
+def test_who_has_no_news_is_left_alone_until_it_falls_silent(bus, worker, clock, monkeypatch):
+    fly(bus, 2)
+    fly(bus, 3)
+    worker.turn()
+    turned, really = [], live._advance_all
+    monkeypatch.setattr(live, "_advance_all", lambda held, *more: turned.append(held.twin.uav) or really(held, *more))
+    assert worker.turn() == 0 and turned == []
+    bus.publish(f.messages(f.turn(7.0), uav=3)[-1])
+    assert worker.turn() == 1 and turned == [3]
+    clock[0] += 1.5
+    worker.turn()
+    assert sorted(turned) == [2, 3, 3]
+    with worker.holding()[0].lock:  # it is worked on, which must not be waited for
+        bus.publish(f.messages(f.turn(7.0), uav=2)[-1])
+        assert worker.turn() == 1 and turned.count(2) == 1

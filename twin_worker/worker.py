@@ -161,10 +161,12 @@ class Worker:
 
     def turn(self) -> int:
         """Advance every twin once; give how many messages were taken in."""
-        taken = 0
+        taken, begun = 0, time.monotonic()
         for held in self._in_turn():
             waiting = len(held.inbox)
             taken += waiting
+            if not waiting and not begun - held.arrived > _SILENT_S and not held.lock.locked():
+                continue  # as it is with most in most sweeps
             if held.lock.locked():  # it is identified just now, or copied
                 if (made := stand_in(held)) is not None:
                     self._publish(made, held)
