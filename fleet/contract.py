@@ -43,7 +43,7 @@ _SIZES = {name: np.dtype(name).itemsize for name in DTYPES}
 MAX_ITEMS = 1_000  # mission items accepted from outside
 
 
-class Array(msgspec.Struct, frozen=True):
+class Array(msgspec.Struct, frozen=True, gc=False):  # no cycle goes through numbers
     """A numpy array on the wire: `numpy.frombuffer(data, dtype).reshape(shape)`."""
 
     dtype: Annotated[str, Meta(description="numpy dtype string, little endian: " + " ".join(DTYPES))]
@@ -71,7 +71,7 @@ class Array(msgspec.Struct, frozen=True):
         return np.frombuffer(self.data, self.dtype).reshape(self.shape)
 
 
-class Rows(msgspec.Struct, frozen=True):
+class Rows(msgspec.Struct, frozen=True, gc=False):
     """Measurements of one kind, each row with its own time."""
 
     t: Annotated[Array, Meta(description="fleet time of each row, (n,) <f8 [s since 1970]")]
@@ -114,7 +114,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True):
     t: Annotated[float, Meta(description="fleet time of the newest content [s since 1970]")]
 
 
-class Sample(Message, frozen=True, kw_only=True):
+class Sample(Message, frozen=True, kw_only=True, gc=False):
     """Telemetry rows of one aircraft since the message before; a kind without news is absent."""
 
     topic: ClassVar[str] = "sample"
