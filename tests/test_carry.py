@@ -4,6 +4,7 @@ import copy
 
 import flights as f
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -57,6 +58,13 @@ def test_another_aircraft_s_twin_is_refused(twin: Twin) -> None:
         unpacked(packed(Load(twin)), 2)
     with pytest.raises(ValueError, match="found another thing"):
         unpacked(pack([1, 2], CARRIED), 1)
+
+
+def test_telemetry_of_other_columns_is_refused(twin: Twin) -> None:
+    narrow = copy.deepcopy(twin)
+    narrow.history.put("velocity", np.array([1e9]), np.zeros((1, 2)))
+    with pytest.raises(ValueError, match="uav-1: found telemetry of other columns, expected ours; it is taken over"):
+        unpacked(packed(Load(narrow)), 1)
 
 
 HOSTILE = (

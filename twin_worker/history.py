@@ -81,6 +81,12 @@ class History:
         """Have these rows, (n,) and (n, k), instead of all of their kind."""
         self._kept[name] = Kept(np.array(t, float), np.array(x, float))
 
+    def sound(self) -> bool:
+        """Tell whether every kind has its columns: compiled code does not look."""
+        widths = dict(_WIDTHS)
+        kinds = self._kept.items() if isinstance(self._kept, dict) else [("", None)]
+        return all(isinstance(kept, Kept) and kept.x.shape[1] == widths.get(name) for name, kept in kinds)
+
     def clear(self) -> None:
         """Forget everything, as after a jump of the clock."""
         self._kept.clear()

@@ -102,4 +102,6 @@ def unpacked(data: bytes, uav: int) -> Load:
     load = unpack(data, CARRIED)
     if not isinstance(load, Load) or not isinstance(load.twin, Twin) or load.twin.uav != uav:
         raise ValueError(f"uav-{uav}: found another thing carried, expected its twin; it is taken over cold")
+    if not isinstance(load.twin.history, History) or not load.twin.history.sound():
+        raise ValueError(f"uav-{uav}: found telemetry of other columns, expected ours; it is taken over cold")
     return load
