@@ -87,7 +87,8 @@ class Ledger:
         )
         happened = np.ascontiguousarray(t, float), np.ascontiguousarray(flown, float), self._odometer
         n = answer_each(said, known, happened, answered)  # type: ignore[call-arg]
-        return answered[:n, 0], answered[:n, 1]
+        rows, columns = np.ascontiguousarray(answered[:n].T)  # as one answer alone would lie
+        return rows, columns
 
     def _measure(self, t: np.ndarray, flown: np.ndarray) -> None:
         """Let the odometer run on."""

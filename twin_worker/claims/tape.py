@@ -250,7 +250,7 @@ def read(payload: bytes) -> Sample | None:
 def _rows(b: np.ndarray, found: np.ndarray) -> Rows:
     """Put those together that are of the newest one's kind of number."""
     kind, dtype = found[-1, 0], found[-1, 5]
-    rows, t_at, x_at, x_size = found[found[:, 5] == dtype, 1:5].T
+    rows, t_at, x_at, x_size = np.ascontiguousarray(found[found[:, 5] == dtype, 1:5].T)  # one find lies so by itself
     n = int(rows.sum())
     t, x = np.empty(8 * n, np.uint8), np.empty(int(x_size.sum()), np.uint8)
     put_together(b, t_at, 8 * rows, t)  # type: ignore[call-arg]
