@@ -28,8 +28,9 @@ from twin_worker.claims.carry import Load, packed, unpacked
 from twin_worker.claims.tape import read
 from twin_worker.memory import hear
 
-kernels = {f"{name}.{key}": one for name, module in list(sys.modules.items()) if name.startswith(("twin_worker", "fleet"))
-           for key, one in vars(module).items() if isinstance(one, Dispatcher)}
+ours = [name for name in sys.modules if name.startswith(("twin_worker", "fleet"))]
+kernels = {f"{name}.{key}": one for name in ours for key, one in vars(sys.modules[name]).items()
+           if isinstance(one, Dispatcher)}
 before = {name: len(one.signatures) for name, one in kernels.items()}
 twin, _ = flights.learnt(folder)
 twin = unpacked(packed(Load(twin)), twin.uav).twin
