@@ -42,7 +42,7 @@ _SILENT_S = 1.0  # wall time without news after which data time runs on by the w
 _STATE_S = 1.0  # between fleet tables [s]
 _OTHERS_S = 0.4  # between looks at what others predict [s]
 _SWEEP_S = 0.015  # of telemetry is taken in at once [s]
-_LATE_S = 0.2  # between sweeps, from which telemetry counts as late [s]
+_LATE_S = 0.12  # between sweeps, from which telemetry counts as late [s]
 _END_S = 1.0  # for a thread to end what it has begun; one that is late is left behind [s]
 _NEW_S = 2.0  # an aircraft that came so lately is predicted before any other work begins [s]
 

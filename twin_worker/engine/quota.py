@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from twin_worker.engine.pace import Work
 
-SWEEP_S = 0.05  # of heavy work in one sweep, CPU [s]
+SWEEP_S = 0.03  # of heavy work in one sweep, CPU [s]
 LEAST_S = 1e-3  # the same where telemetry stays late: as much as one piece of work [s]
 _GROWS = 1.2  # how it recovers with every sweep that was not late [-]
 _SHARE = {Work.PREDICT: 1.0, Work.IDENTIFY: 0.7, Work.ENSEMBLE: 0.5}  # of a sweep, up to which each kind may begin [-]
