@@ -13,6 +13,7 @@ import pytest
 
 from fleet.contract import Array, Prediction, Sample
 from fleet.frames import to_geodetic
+from fleet.memory_bus import MemoryBus
 from twin_worker.__main__ import BEHIND, _get_ready
 from twin_worker.engine import quota as clocked
 from twin_worker.engine.learner import Learner
@@ -23,6 +24,7 @@ from twin_worker.horizon import AHEAD
 from twin_worker.predict import LEAST_AHEAD_S
 from twin_worker.renew import LATEST_S, renew
 from twin_worker.twin import Twin, advance
+from twin_worker.worker import Worker
 
 
 def test_a_pace_is_read_and_refused_in_a_sentence() -> None:
@@ -203,6 +205,12 @@ def test_an_ensemble_that_had_to_wait_is_flown_before_the_next_flight_and_keeps_
     assert twin.spread is not None and np.diff(flown[1:]) == pytest.approx(2.0, abs=0.3) and len(flown) > 5
     beyond = AHEAD > 60.0
     assert (np.diff(twin.spread[beyond], axis=0) > 0).all() and twin.spread.shape == (len(AHEAD), 3)
+
+
+def test_who_renews_often_does_less_heavy_work_in_one_sweep() -> None:
+    most = [Worker(MemoryBus(), range(1), omega=0.0, pace=Pace(renew=renew)).quota.most for renew in (1e-3, 0.1, 0.15, 9)]
+    assert most == pytest.approx([0.03, 0.03, 0.045, SWEEP_S])
+    assert Worker(MemoryBus(), range(1), omega=0.0).quota.most == SWEEP_S
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere threads have no priority of their own")

@@ -42,7 +42,8 @@ _SILENT_S = 1.0  # wall time without news after which data time runs on by the w
 _STATE_S = 1.0  # between fleet tables [s]
 _OTHERS_S = 0.4  # between looks at what others predict [s]
 _SWEEP_S = 0.015  # of telemetry is taken in at once [s]
-_LATE_S = 0.12  # between sweeps, from which telemetry counts as late [s]
+_LATE_S = 0.12, 0.2  # between sweeps, from which telemetry counts as late: least and most [s]
+_LATE, _HEAVY = 1.2, 0.25  # that in periods of renewal; what heavy work may take of it, CPU [-]
 _END_S = 1.0  # for a thread to end what it has begun; one that is late is left behind [s]
 _NEW_S = 2.0  # an aircraft that came so lately is predicted before any other work begins [s]
 
@@ -64,7 +65,9 @@ class Worker:
     ) -> None:
         self.bus, self.uavs, self.diagnosis = bus, uavs, diagnosis
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
-        self.pace, self.quota = pace or Pace(), Quota()
+        self.pace = pace or Pace()
+        self._late = min(max(_LATE * self.pace.renew, _LATE_S[0]), _LATE_S[1])  # who renews often wants short sweeps
+        self.quota = Quota(most=_HEAVY * self._late)
         self.sentence = ""
         self.rates = Rates()
         self.learner = Learner(self._whole, self._publish, self.rates)
@@ -195,7 +198,7 @@ class Worker:
     def _watch_time(self) -> None:
         """Let heavy work wait where telemetry does: after a sweep that was late half as much of it is begun."""
         now = time.monotonic()
-        late, self._swept = now - self._swept > _LATE_S, now
+        late, self._swept = now - self._swept > self._late, now
         self.learner.yield_to_telemetry(late)
         if self.claiming.threaded:
             self.quota.yield_to_telemetry(late)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from twin_worker.engine.pace import Work
 
-SWEEP_S = 0.03  # of heavy work in one sweep, CPU [s]
+SWEEP_S = 0.05  # of heavy work in one sweep, CPU [s]
 LEAST_S = 1e-3  # the same where telemetry stays late: as much as one piece of work [s]
 _GROWS = 1.2  # how it recovers with every sweep that was not late [-]
 _SHARE = {Work.PREDICT: 1.0, Work.IDENTIFY: 0.7, Work.ENSEMBLE: 0.5}  # of a sweep, up to which each kind may begin [-]
@@ -18,6 +18,7 @@ class Quota:
 
     Attributes:
         limit: of heavy work in one sweep, CPU [s]
+        most: the same where there is one, while telemetry is in time
         hurry: an aircraft waits for its first prediction, so that nothing else is begun
         behind: telemetry of this aircraft waits: what would be foreseen now is old already
         aside: kinds that are done by another hand
@@ -25,6 +26,7 @@ class Quota:
     """
 
     limit: float = float("inf")
+    most: float = SWEEP_S
     hurry: bool = False
     behind: bool = False
     aside: frozenset[Work] = frozenset()
@@ -40,8 +42,8 @@ class Quota:
 
     def yield_to_telemetry(self, late: bool) -> None:
         """Grant half as much in a sweep as in the last where telemetry is late, else a little more again."""
-        limit = min(self.limit, SWEEP_S)
-        self.limit = max(0.5 * limit, LEAST_S) if late else min(_GROWS * limit, SWEEP_S)
+        limit = min(self.limit, self.most)
+        self.limit = max(0.5 * limit, LEAST_S) if late else min(_GROWS * limit, self.most)
 
     def settle(self) -> None:
         """End the work in hand, if any."""
