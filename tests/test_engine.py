@@ -208,7 +208,8 @@ def test_an_ensemble_that_had_to_wait_is_flown_before_the_next_flight_and_keeps_
 
 
 def test_who_renews_often_does_less_heavy_work_in_one_sweep() -> None:
-    most = [Worker(MemoryBus(), range(1), omega=0.0, pace=Pace(renew=renew)).quota.most for renew in (1e-3, 0.1, 0.15, 9)]
+    paces = [Pace(renew=renew) for renew in (1e-3, 0.1, 0.15, 9.0)]
+    most = [Worker(MemoryBus(), range(1), omega=0.0, pace=pace).quota.most for pace in paces]
     assert most == pytest.approx([0.03, 0.03, 0.045, SWEEP_S])
     assert Worker(MemoryBus(), range(1), omega=0.0).quota.most == SWEEP_S
 
