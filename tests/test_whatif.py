@@ -194,6 +194,6 @@ def test_a_defect_is_one_sentence_and_the_next_question_is_answered(holder, monk
         raise ZeroDivisionError("a defect")
 
     with monkeypatch.context() as m, pytest.raises(ValueError, match=r"uav-1 met a defect \(a defect\).*report it"):
-        m.setattr("twin_worker.worker.answer", broken)
+        m.setattr("twin_worker.answers.answer", broken)
         holder.bus.inquire(Prediction, 1, msgspec.msgpack.encode(WhatIf()))
     assert holder.bus.inquire(Prediction, 1, msgspec.msgpack.encode(WhatIf())) is not None

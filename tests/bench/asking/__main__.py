@@ -7,7 +7,7 @@
 the first time. `wildcard`: `parauav/*/prediction`, an answer each, unpacked;
 `batch`: `parauav/@fleet/prediction/*`, an answer of each worker, whose predictions are unpacked by who reads them. Both
 are asked of all, without consolidation. `frozen`: the same while one worker is stopped, as a suspended machine is; the
-others' answers count.
+others' answers count. `plain`: the same bytes and as many answers by Zenoh alone, not unpacked.
 """
 
 import argparse
@@ -26,11 +26,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from fleet.bus import connect
+from fleet.bus import ZenohBus, connect
 from fleet.cli import guarded, parser_for
 from fleet.contract import Prediction, Predictions
 from fleet.talk import Bus
 from tests.bench.referee.site import Site
+
+from . import plain
 
 KINDS = {"wildcard": Prediction, "batch": Predictions}
 LIMITS = {"wildcard": 10.0, "batch": 3.0}  # of the median [ms]
@@ -45,6 +47,11 @@ def once(bus: Bus, kind: type, wanted: int, timeout_s: float = 5.0) -> float | N
         if came == wanted:
             break
     return last if came >= wanted else None
+
+
+def beside(bus: ZenohBus, wanted: dict[str, int], times: int) -> dict[str, dict[str, Any]]:
+    """Measure Zenoh alone."""
+    return {name: _summary([plain.once(bus, name, wanted[name]) for _ in range(times)]) for name in KINDS}
 
 
 def measured(bus: Bus, wanted: dict[str, int], times: int, timeout_s: float = 5.0) -> dict[str, dict[str, Any]]:
@@ -67,13 +74,15 @@ def _summary(took: list[float | None]) -> dict[str, Any]:
 
 
 @contextmanager
-def answering(router: str, uavs: int, workers: int) -> Iterator[tuple[list[subprocess.Popen[str]], int]]:
-    """Start the workers; give them and the bytes of one prediction."""
+def answering(
+    router: str, uavs: int, workers: int, module: str, *more: str
+) -> Iterator[tuple[list[subprocess.Popen[str]], int]]:
+    """Start who answers; give them and the number that they say first."""
     bounds = [uavs * k // workers for k in range(workers + 1)]
     with ExitStack() as stack:
         running = []
         for low, high in pairwise(bounds):
-            command = [sys.executable, "-m", "tests.bench.asking.answerer", router, str(low), str(high)]
+            command = [sys.executable, "-m", f"tests.bench.asking.{module}", router, str(low), str(high), *more]
             child = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
             stack.callback(child.kill)
             running.append(child)
@@ -84,8 +93,9 @@ def answering(router: str, uavs: int, workers: int) -> Iterator[tuple[list[subpr
 def _run(args: argparse.Namespace) -> int:
     with Site(args.uavs, args.router, zenohd=args.zenohd) as site:
         site.open_router()
-        with answering(args.router, args.uavs, args.workers) as (running, size), connect(args.router) as bus:
-            wanted = {"wildcard": args.uavs, "batch": args.workers}
+        sizes = args.router, args.uavs, args.workers
+        wanted = {"wildcard": args.uavs, "batch": args.workers}
+        with answering(*sizes, "answerer") as (running, size), connect(args.router) as bus:
             measured(bus, wanted, 3)
             found = {"all": measured(bus, wanted, args.times)}
             running[-1].send_signal(signal.SIGSTOP)
@@ -94,9 +104,13 @@ def _run(args: argparse.Namespace) -> int:
             fewer = {"wildcard": left, "batch": args.workers - 1}
             found["frozen"] = measured(bus, fewer, 1, _TIMEOUT_S)  # before its lease is over
             running[-1].send_signal(signal.SIGCONT)
+        with answering(*sizes, "plain", str(size)), connect(args.router) as bus:
+            found["plain"] = beside(bus, wanted, args.times)
+    ratio = {name: round(found["all"][name]["p50_ms"] / found["plain"][name]["p50_ms"], 2) for name in KINDS}
     summary = {
         "machine": platform.processor() or platform.machine(), "processors": os.cpu_count(), "uavs": args.uavs,
         "workers": args.workers, "router": args.zenohd or "embedded", "bytes_each": size, **found,
+        "over_plain_zenoh": ratio,
         "over": [name for name in KINDS if not found["all"][name].get("p50_ms", 1e9) <= LIMITS[name]],
         "load": os.getloadavg()[0],
     }  # fmt: skip
