@@ -1,12 +1,20 @@
 """What messages that cross, or one that is lost, leave half done in a worker's claims is put right at the next look."""
 
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from math import isfinite
+from typing import Any
+
 import flights as f
 import pytest
 
 import fleet
-from fleet.contract import Claim, Handover, Status
+from fleet.contract import Claim, Handover, Message, Sample, Status
 from fleet.memory_bus import MemoryBus
 from fleet.presence import Present
+from twin_worker.claims.keeper import INBOX
+from twin_worker.claims.protocol import Claiming
 from twin_worker.worker import Worker
 
 OTHER = Present("00000000000000aa", range(5), 1)
@@ -79,3 +87,79 @@ def test_who_hands_over_many_is_waited_for_as_long_as_copies_come(
     assert claiming._ask({OTHER.worker: [3]}) == [], "one has come meanwhile"
     now[0] += 0.2
     assert claiming._ask({OTHER.worker: [3]}) == [3]
+
+
+# --- while threads of the bus are at work ----------------------------------------------------------------------------
+
+BLOCKED_S = 0.5  # how long a thread that may be waiting for a lock is waited for [s]
+
+
+def beside(act: Callable[[], object]) -> threading.Thread:
+    """Do something on a thread of its own, and go on once it is done, or waits for what is locked here."""
+    thread = threading.Thread(target=act, daemon=True)
+    thread.start()
+    thread.join(BLOCKED_S)
+    return thread
+
+
+class Inbox(deque[Message]):
+    """One that another thread appends to while it is read, and again before it is cleared."""
+
+    def __init__(self, *given: Any, hear: Callable[[], object], **named: Any) -> None:
+        super().__init__(*given, **named)
+        self.hear, self.threads = hear, list[threading.Thread]()
+
+    def __iter__(self) -> Iterator[Message]:
+        for message in super().__iter__():
+            if not self.threads:
+                self.threads.append(beside(self.hear))
+            yield message
+
+    def clear(self) -> None:
+        self.threads.append(beside(self.hear))
+        super().clear()
+
+
+def test_what_the_bus_appends_while_a_twin_begins_is_taken_in(worker: Worker) -> None:
+    """A twin comes while its telemetry does: nothing is lost, nothing raised, nothing taken in twice."""
+    twins, coming = worker._twins, iter([Sample(uav=2, t=f.T0 + t) for t in (2.0, 3.0)])
+    twins.expect([2])
+    held = twins.held[2]
+    held.inbox = Inbox(hear=lambda: twins.hear(next(coming)), maxlen=INBOX)
+    for t in (0.0, 1.0):
+        twins.hear(Sample(uav=2, t=f.T0 + t))
+    twins._begin(held, worker._make(2), [Sample(uav=2, t=f.T0)])
+    for thread in held.inbox.threads:
+        thread.join()
+    assert [message.t - f.T0 for message in held.inbox] == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_two_that_are_asked_at_once_are_both_known_to_answer() -> None:
+    """Each worker that sends copies is waited for longer; a note of one must not undo that of the other."""
+
+    class Copies(MemoryBus):
+        def gather(self, kind: type, who: object, *_: object) -> Iterator[Handover]:
+            yield Handover(t=f.T0, uav=99, epoch=1, code="", load=b"")
+
+    class Noting(Claiming):
+        between: list[threading.Thread] | None = None
+
+        @property
+        def _asked_for(self) -> dict[int, float]:
+            found = self._noted
+            if self.between is not None and not self.between:
+                self.between.append(threading.current_thread())
+                self.between.append(beside(lambda: self._copy("b", [2])))
+            return found
+
+        @_asked_for.setter
+        def _asked_for(self, noted: dict[int, float]) -> None:
+            self._noted = noted
+
+    bus = Copies()
+    claiming = Noting(bus, range(5), Worker(bus, range(5), omega=0.0)._twins)
+    claiming._asked_for = dict.fromkeys((1, 2), float("-inf"))
+    claiming.between = []
+    claiming._copy("a", [1])
+    claiming.between[1].join()
+    assert all(isfinite(since) for since in claiming._noted.values()), "both answer"

@@ -39,6 +39,7 @@ class Held:
     shed: int = 0
     failed: str = ""  # what went wrong last, a defect of ours
     lock: threading.Lock = field(default_factory=threading.Lock)  # held while the twin changes, or is copied
+    filling: threading.Lock = field(default_factory=threading.Lock)  # held while the inbox is appended to, or replaced
     ready: bool = True  # its twin is here
     bare: bool = False  # without the telemetry of before
     since: float = float("-inf")  # when its twin came [s, monotonic]
@@ -90,8 +91,9 @@ class Twins:
             return False
         if isinstance(message, Sample):
             held.arrived, held.placed = time.monotonic(), message.position or held.placed
-        held.shed += len(held.inbox) == INBOX
-        held.inbox.append(message)
+        with held.filling:  # never `lock`, which is held for as long as an identification takes
+            held.shed += len(held.inbox) == INBOX
+            held.inbox.append(message)
         return True
 
     def overhear(self, said: Model | Prediction, stamp: Stamp | None) -> bool:
@@ -199,9 +201,11 @@ class Twins:
         """Go on with a twin, and with what came since: telemetry it has already taken in is not taken in again."""
         with held.lock:
             known = twin.data_t if twin.data_t > 0 else twin.history.newest
-            since = [m for m in held.inbox if not isinstance(m, Sample) or m.t > max([known, *(b.t for b in before)])]
-            held.inbox.clear()
-            held.inbox.extend([*before, *since])
+            known = max([known, *(b.t for b in before)])
+            with held.filling:
+                since = [m for m in held.inbox if not isinstance(m, Sample) or m.t > known]
+                held.inbox.clear()
+                held.inbox.extend([*before, *since])
             held.twin = twin
             held.bare, held.ready, held.since = bare, True, time.monotonic()
             if held.arrived != held.arrived and twin.history.newest > 0:
@@ -229,7 +233,9 @@ class Twins:
         try:
             if not held.ready or held.bare:
                 return None
-            load = packed(Load(held.twin, list(held.inbox), *self._extras.show(uav)))
+            with held.filling:
+                waiting = list(held.inbox)
+            load = packed(Load(held.twin, waiting, *self._extras.show(uav)))
         except TypeError:  # a defect: its new owner begins cold
             _log.exception("uav-%d cannot be handed over; report it", uav)
             load = b""

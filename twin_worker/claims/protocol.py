@@ -247,13 +247,16 @@ class Claiming:
     def _ask(self, wanted: dict[str, list[int]]) -> list[int]:
         """Ask each holder for copies, all at the same time; give what is asked for in vain."""
         now, uavs = time.monotonic(), {uav for mine in wanted.values() for uav in mine}
-        self._asked_for = {uav: self._asked_for.get(uav, now) for uav in uavs}
+        with self._lock:
+            self._asked_for = {uav: self._asked_for.get(uav, now) for uav in uavs}
         for worker, mine in wanted.items():
             if not self.threaded:
                 self._copy(worker, mine)
             elif worker not in self._asking or not self._asking[worker].is_alive():
                 self._asking[worker] = self._begin(self._copy, worker, mine)
-        return [uav for uav, since in self._asked_for.items() if now - since > _HAND_S and uav not in self.claims.held]
+        with self._lock:
+            late = [uav for uav, since in self._asked_for.items() if now - since > _HAND_S]
+            return [uav for uav in late if uav not in self.claims.held]
 
     def _copy(self, worker: str, uavs: list[int]) -> None:
         """Ask one holder, and take each as it comes."""
@@ -261,8 +264,8 @@ class Claiming:
         payload = msgspec.msgpack.encode(Wanted(uavs=tuple(uavs)))
         for twin in self._bus.gather(Handover, worker, payload, _COPIES_S):
             now = time.monotonic()  # it hands over: the rest will come
-            self._asked_for = self._asked_for | dict.fromkeys(uavs, now)
             with self._lock:
+                self._asked_for = self._asked_for | dict.fromkeys(uavs, now)
                 wanted = twin.uav in uavs and twin.uav not in self.claims.held and 0 <= twin.epoch < _MOST_EPOCH
                 if not wanted or not self.claims.may_write(time.monotonic()):
                     continue
