@@ -1,10 +1,18 @@
-"""Publish, subscribe, ask and answer on Zenoh. The only file that imports zenoh."""
+"""Publish, subscribe, ask and answer on Zenoh. The only file that imports zenoh.
+
+Nobody may make the router wait. A message that must not be dropped on a full way (CongestionControl.BLOCK) stops the
+router's reading thread for up to 5 s where its receiver does not read; everything else that comes in on that thread,
+and every declaration, waits meanwhile. So what is received is put aside at once, whatever Python does with it, the
+oldest dropped where too much waits; large answers are sent one by one, to be dropped on a full way and asked for again;
+short answers have a queue that no telemetry fills.
+"""
 
 import json
+import logging
 import secrets
 import socket
 import threading
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import AbstractContextManager
 from itertools import islice
 from typing import Any, TypeVar
@@ -19,11 +27,17 @@ from fleet.contract import PER_UAV, Claim
 from fleet.talk import Answer, Collected, Heard, Letter, Overheard, Token, Wants, asked_for, key, newest, uav_in
 
 M = TypeVar("M")
+_log = logging.getLogger(__name__)
 _WAITED_FOR = (Claim,)  # seldom and needed: the sender waits where the way is full, everything else is dropped there
 _LIVE = f"{ROOT}/@live/"
 _PUT_ASIDE = 20_000  # messages of a class that wait until they are handed out
+_UNHEARD = 4096  # messages of one subscription, or queries of one queryable, that wait for Python; the oldest go first
 _ANSWERS = 4096  # that may wait to be read
-_AT_LEISURE = zenoh.Priority.DATA_LOW  # of answers of megabytes, that telemetry and predictions overtake
+_SHORT = {"priority": zenoh.Priority.DATA_HIGH}  # questions and answers of kilobytes: telemetry does not fill their way
+_LARGE = {  # answers of megabytes: telemetry and predictions overtake them, and nobody waits for who does not read them
+    "priority": zenoh.Priority.DATA_LOW,
+    "congestion_control": zenoh.CongestionControl.DROP,
+}
 _TOKENS = 4096  # asked for at once; with the usual channel more than 256 would block for ever
 
 
@@ -71,7 +85,7 @@ class ZenohBus(AbstractContextManager):
             if pair is not None:
                 heard(*pair)
 
-        self._declared.append(self._session.declare_subscriber(key(kind, "*"), on_sample))
+        self._receive(kind, on_sample, _UNHEARD)
 
     def overhear(self, kind: type, heard: Overheard) -> None:
         """Call `heard(payload, encoding, stamp)` for every message of a class, as it came, on a session's thread."""
@@ -79,7 +93,30 @@ class ZenohBus(AbstractContextManager):
         def on_sample(sample: zenoh.Sample) -> None:
             heard(sample.payload.to_bytes(), str(sample.encoding), _stamp(sample))
 
-        self._declared.append(self._session.declare_subscriber(key(kind, "*"), on_sample))
+        self._receive(kind, on_sample, _PUT_ASIDE)
+
+    def _receive(self, kind: type, act: Callable[[zenoh.Sample], None], most: int) -> None:
+        """Do something with every message of a class, on a thread of its own; at most so many wait for it."""
+        subscriber = self._session.declare_subscriber(key(kind, "*"), zenoh.handlers.RingChannel(most))
+        self._declared.append(subscriber)
+        self._work_off(subscriber.handler, act, key(kind, "*"))
+
+    @staticmethod
+    def _work_off(waiting: "zenoh.Handler[Any]", act: Callable[[Any], None], name: str) -> None:
+        """Do something with everything that comes, one by one, until the session is closed."""
+
+        def run() -> None:
+            while True:
+                try:
+                    one = waiting.recv()
+                except zenoh.ZError:  # the session is closed
+                    return
+                try:
+                    act(one)
+                except Exception:  # a defect met by one message must not stop the others
+                    _log.exception("bus: what came on %s met a defect; report it", name)
+
+        threading.Thread(target=run, name=f"bus {name}", daemon=True).start()
 
     def collect(self, kind: type, heard: Collected) -> None:
         """Put every message of a class aside until `hand_out`; where nobody takes them out the oldest go first."""
@@ -123,7 +160,9 @@ class ZenohBus(AbstractContextManager):
                     query.reply_err(str(error).encode(), encoding="text/plain")
 
         name = key(kind, "*" if kind in PER_UAV else f"{self.writer:016x}")
-        self._declared.append(self._session.declare_queryable(name, on_query, complete=False))
+        queryable = self._session.declare_queryable(name, zenoh.handlers.RingChannel(_UNHEARD), complete=False)
+        self._declared.append(queryable)
+        self._work_off(queryable.handler, on_query, name)
 
     def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
         """Ask everyone for a class; the highest epoch per aircraft is kept."""
@@ -140,13 +179,13 @@ class ZenohBus(AbstractContextManager):
 
     def gather(self, kind: type[M], who: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
         """Ask with a payload and give every answer as it comes."""
-        for reply in self._coming(key(kind, who), timeout_s, payload, _AT_LEISURE):
+        for reply in self._coming(key(kind, who), timeout_s, payload, _LARGE):
             if (found := reply.ok) is not None and (pair := self._read(kind, found)) is not None:
                 yield pair[0]
 
     def fetch(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
         """Ask and give the bytes of every answer as it comes; other versions are left out."""
-        for reply in self._coming(key(kind, who), timeout_s, priority=_AT_LEISURE):
+        for reply in self._coming(key(kind, who), timeout_s, care=_LARGE):
             if (found := reply.ok) is not None and str(found.encoding) == encoding(kind):
                 yield found.payload.to_bytes()
 
@@ -154,7 +193,7 @@ class ZenohBus(AbstractContextManager):
         return list(self._coming(name, timeout_s, payload))
 
     def _coming(
-        self, name: str, timeout_s: float, payload: bytes | None = None, priority: zenoh.Priority | None = None
+        self, name: str, timeout_s: float, payload: bytes | None = None, care: dict[str, Any] = _SHORT
     ) -> Iterator[zenoh.Reply]:
         try:
             yield from self._session.get(
@@ -164,7 +203,7 @@ class ZenohBus(AbstractContextManager):
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,
                 payload=payload,
-                priority=priority,
+                **care,
             )
         except zenoh.ZError as error:
             raise ConnectionError(

@@ -1,8 +1,11 @@
 """One law for both buses: what is published is heard, what is asked is answered, the highest epoch wins."""
 
+import os
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from itertools import pairwise
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
@@ -16,9 +19,10 @@ from fleet.access.entry import endpoint
 from fleet.access.knock import reachable
 from fleet.bus import connect, open_router
 from fleet.codec import Stamp, encode, encoding
-from fleet.contract import Account, Alert, AlertKind, FleetState, Prediction, Sample, Status
+from fleet.contract import Account, Alert, AlertKind, FleetState, Handover, Prediction, Sample, Status
 from fleet.memory_bus import MemoryBus
 from fleet.talk import Bus, key, newest, uav_in
+from tests.bench.referee.forwarder import Forwarder
 
 PATIENCE_S = 10.0
 STAMP = Stamp(epoch=5, writer=99)
@@ -133,6 +137,68 @@ def test_bytes_that_do_not_decode_are_counted_and_the_next_message_is_heard(pair
         assert found == EXAMPLES[Status]
         found = heard.get(timeout=PATIENCE_S)
     assert pair.there.bad == 3
+
+
+# --- who is slow holds up nobody -------------------------------------------------------------------------------------
+
+MANY = 3000  # messages; Zenoh keeps 256 for a callback, then stops reading
+LEAST_S = 2.5  # much less than Zenoh waits for who does not read [s]
+
+
+def test_who_is_slow_with_one_class_still_hears_the_others_asks_and_is_asked(router: tuple[str, zenoh.Session]) -> None:
+    """What Python has no time for must not keep a session from reading: the router would wait with it."""
+    heard: SimpleQueue = SimpleQueue()
+    begun, go_on = threading.Event(), threading.Event()
+
+    def slow(*_: object) -> None:
+        begun.set()
+        go_on.wait(6.0 * PATIENCE_S)
+
+    with connect(router[0]) as here, connect(router[0]) as there:
+        try:
+            there.subscribe(Sample, slow)
+            there.subscribe(Status, lambda message, _: heard.put(message))
+            there.answer(Account, lambda *_: [(EXAMPLES[Account], None)])
+            here.answer(Alert, lambda *_: [(EXAMPLES[Alert], None)])
+            told(heard, lambda: (here.publish(EXAMPLES[Sample]), here.publish(EXAMPLES[Status])))
+            assert begun.wait(PATIENCE_S) and asked(here, Account, "*") and asked(there, Alert, "*")
+            for _ in range(MANY):
+                here.publish(EXAMPLES[Sample])
+            while not heard.empty():
+                heard.get()
+            assert told(heard, lambda: here.publish(EXAMPLES[Status])) == EXAMPLES[Status]
+            assert asked(here, Account, "*") and asked(there, Alert, "*")
+        finally:
+            go_on.set()
+
+
+def test_who_reads_no_large_answer_holds_up_nobody(router: tuple[str, zenoh.Session]) -> None:
+    """A process is frozen while copies come to it: others hear whoever sends them, where the router waited for 5 s."""
+    heard: SimpleQueue = SimpleQueue()
+    large = [Handover(t=0.0, uav=uav, epoch=1, code="", load=os.urandom(1_000_000)) for uav in range(60)]
+    with Forwarder(endpoint(router[0])) as way, connect(router[0]) as here, connect(router[0]) as other:
+
+        def copies(_: int | None, asked_for: dict[str, str], payload: bytes) -> Iterator[tuple[Handover, None]]:
+            way.stalled = bool(payload)
+            return ((each, None) for each in (large if payload else [EXAMPLES[Handover]]))
+
+        here.answer(Handover, copies)
+        other.subscribe(Status, lambda message, _: heard.put(time.monotonic()))
+        told(heard, lambda: here.publish(EXAMPLES[Status]))
+        with connect(f"tcp/127.0.0.1:{way.port}") as frozen:
+            while not list(frozen.gather(Handover, "*", b"", 1.0)):
+                pass
+            asking = threading.Thread(target=lambda: list(frozen.gather(Handover, "*", b"all", PATIENCE_S)))
+            asking.start()
+            begun, pause = time.monotonic(), threading.Event()
+            while time.monotonic() < begun + 1.5 * LEAST_S or not way.stalled:
+                here.publish(EXAMPLES[Status])
+                pause.wait(0.05)
+            way.stalled = False
+            asking.join()
+            first = told(heard, lambda: here.publish(EXAMPLES[Status]))
+        at = [begun, first, *(heard.get() for _ in range(heard.qsize()))]
+        assert max(b - a for a, b in pairwise(at)) < LEAST_S, "the router waited"
 
 
 # --- ask and answer --------------------------------------------------------------------------------------------------

@@ -7,13 +7,16 @@ from math import isfinite
 from typing import Any
 
 import flights as f
+import msgspec
 import pytest
 
 import fleet
-from fleet.contract import Claim, Handover, Message, Sample, Status
+from fleet.codec import encode
+from fleet.contract import Claim, Handover, History, Message, Sample, Status, Wanted
 from fleet.memory_bus import MemoryBus
 from fleet.presence import Present
 from twin_worker.claims.keeper import INBOX
+from twin_worker.claims.past import recall
 from twin_worker.claims.protocol import Claiming
 from twin_worker.worker import Worker
 
@@ -163,3 +166,30 @@ def test_two_that_are_asked_at_once_are_both_known_to_answer() -> None:
     claiming._copy("a", [1])
     claiming.between[1].join()
     assert all(isfinite(since) for since in claiming._noted.values()), "both answer"
+
+
+def test_copies_are_asked_for_one_by_one_and_the_past_again_where_it_was_lost() -> None:
+    """What is large is dropped where nobody reads it: little is under way at a time, and a loss is asked for again."""
+
+    class Lossy(MemoryBus):
+        def __init__(self) -> None:
+            super().__init__()
+            self.asked: list[tuple[int, ...]] = []
+            self.pasts = 0
+
+        def gather(self, kind: type, who: object, payload: bytes, timeout_s: float) -> Iterator[Handover]:
+            self.asked.append(msgspec.msgpack.decode(payload, type=Wanted).uavs)
+            return iter(())
+
+        def fetch(self, *_: object) -> Iterator[bytes]:
+            self.pasts += 1
+            past = History(uav=3, t=f.T0, samples=tuple(m for m in f.messages(f.turn(1.0), uav=3)))
+            return iter([encode(past)] if self.pasts == 2 else ())
+
+    bus = Lossy()
+    claiming = Claiming(bus, range(5), Worker(bus, range(5), omega=0.0)._twins)
+    claiming.claims.take(2, 1)
+    claiming._copy("a", [1, 2, 3])
+    assert bus.asked == [(1,), (3,)], "what is held meanwhile is not asked for"
+    (past,) = [said for said in recall(bus, 3, {}) if isinstance(said, Sample)]
+    assert bus.pasts == 2 and past.uav == 3

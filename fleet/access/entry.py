@@ -11,6 +11,7 @@ from fleet.access.rules import CERTIFICATE, PASSWORD, access_control, limits
 ROUTER = "tcp/127.0.0.1:7447"
 _TLS = "transport/link/tls"
 _WORDS = "transport/auth/usrpwd"
+_FULL = "transport/link/tx/queue/congestion_control"
 _REFUSED_MS = 10_000  # a router that lets a session in takes less, also on a busy machine
 
 
@@ -133,6 +134,8 @@ def _common(mode: str, *, connect: list[str], listen: list[str]) -> dict[str, An
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         "transport/link/tx/lease": 1000,
         "transport/link/tx/keep_alive": 4,
+        "transport/link/tx/queue/size/data_low": 16,  # batches of 64 kB: large answers pass on a busy machine, too
+        f"{_FULL}/drop/max_wait_before_drop_fragments": 500_000,  # of a large answer, in all [us]
         "transport/link/rx/max_message_size": MESSAGE_MOST,
         "transport/shared_memory/enabled": False,  # who is killed leaves its share behind, mapped by all others
     }

@@ -8,6 +8,7 @@ from twin_worker.claims.tape import read
 
 PATIENCE_S = 0.5  # with a gateway that does not answer [s]
 _LONG_S = 2.0  # with one that sends megabytes [s]
+_TRIES = 2  # megabytes are dropped on a way that is full
 SELDOM: tuple[type[Message], ...] = (Status, Params, Mission)
 """What is said so seldom that the last of each is worth keeping."""
 
@@ -21,5 +22,8 @@ def recall(bus: Bus, uav: int, known: Mapping[type, Message]) -> list[Message]:
     found: list[Message] = []
     for kind in SELDOM:
         found += [known[kind]] if kind in known else [said for said, _ in bus.ask(kind, uav, PATIENCE_S)]
-    heard = map(read, bus.fetch(History, uav, _LONG_S))
-    return [*found, *(said for said in heard if said is not None and said.uav == uav)]
+    for _ in range(_TRIES):
+        heard = [said for said in map(read, bus.fetch(History, uav, _LONG_S)) if said is not None and said.uav == uav]
+        if heard:
+            return [*found, *heard]
+    return found

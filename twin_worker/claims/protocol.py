@@ -34,6 +34,7 @@ _ANNOUNCE_S = 0.25  # several times in `SILENT_S` [s]
 _ASK_S = 0.5  # for everyone to say what they hold; a frozen worker never does [s]
 _HAND_S = 3.0  # between copies from one that holds what should be ours; it writes meanwhile [s]
 _COPIES_S = 20.0  # for all that one worker is asked for at once [s]
+_COPY_S = 1.4  # for one of them; two that are lost do not have the rest taken without: less than half of `_HAND_S` [s]
 _LEAVE_S = 5.0  # for the others to take everything over at the end [s]
 _MEND_S = 1.0  # between looks for what was left half done [s]
 _MOST_EPOCH = 1 << 62  # beyond is no epoch
@@ -259,19 +260,28 @@ class Claiming:
             return [uav for uav in late if uav not in self.claims.held]
 
     def _copy(self, worker: str, uavs: list[int]) -> None:
-        """Ask one holder, and take each as it comes."""
-        self._keeper.expect(uavs)
-        payload = msgspec.msgpack.encode(Wanted(uavs=tuple(uavs)))
-        for twin in self._bus.gather(Handover, worker, payload, _COPIES_S):
-            now = time.monotonic()  # it hands over: the rest will come
-            with self._lock:
-                self._asked_for = self._asked_for | dict.fromkeys(uavs, now)
-                wanted = twin.uav in uavs and twin.uav not in self.claims.held and 0 <= twin.epoch < _MOST_EPOCH
-                if not wanted or not self.claims.may_write(time.monotonic()):
-                    continue
-                self.claims.note(twin.uav, Rank(twin.epoch, worker))
-                epoch = self.claims.take(twin.uav, _wall_ms())
-            self._keeper.adopt(twin.uav, epoch, twin)
+        """Ask one holder, and take each as it comes.
+
+        One at a time: copies that nobody reads yet must fit into what lies between two processes, or be dropped there.
+        """
+        until = time.monotonic() + _COPIES_S
+        for uav in uavs:
+            left = min(until - time.monotonic(), _COPY_S)
+            if left > 0.0 and uav not in self.claims.held:
+                payload = msgspec.msgpack.encode(Wanted(uavs=(uav,)))
+                for twin in self._bus.gather(Handover, worker, payload, left):
+                    self._copied(worker, uavs, twin)
+
+    def _copied(self, worker: str, uavs: list[int], twin: Handover) -> None:
+        now = time.monotonic()  # it hands over: the rest will come
+        with self._lock:
+            self._asked_for = self._asked_for | dict.fromkeys(uavs, now)
+            wanted = twin.uav in uavs and twin.uav not in self.claims.held and 0 <= twin.epoch < _MOST_EPOCH
+            if not wanted or not self.claims.may_write(time.monotonic()):
+                return
+            self.claims.note(twin.uav, Rank(twin.epoch, worker))
+            epoch = self.claims.take(twin.uav, _wall_ms())
+        self._keeper.adopt(twin.uav, epoch, twin)
 
     def _take(self, uavs: list[int]) -> None:
         for uav in uavs:
