@@ -10,6 +10,7 @@ import pytest
 from ulog_writer import MAGIC, START_US, TRUTH, flight, message, read, rows, said, ulog
 
 from fleet.telemetry import ulog_sieve
+from fleet.telemetry.dialects.ulog import TOPICS
 from fleet.telemetry.ulog import UlogLog
 
 SAMPLE = "real/px4_vtol_cubeorange_6s_reader_test.ulg"
@@ -162,3 +163,22 @@ def test_a_log_whose_clock_leaps_a_century_has_few_chunks():
     for columns in topics.values():
         columns["timestamp"][len(columns["timestamp"]) // 2 :] += np.uint64(3_000_000_000_000_000)
     assert len(list(read(ulog(topics)).chunks())) <= 3
+
+
+def test_a_jump_of_the_clock_costs_twenty_rows_whatever_is_logged_between():
+    """Rows of topics nobody reads came between the rows that jumped, and the rest of the log was dropped."""
+    topics = flight((1, 11), seconds=20.0)
+    for columns in topics.values():
+        columns["timestamp"] = columns["timestamp"] + np.where(
+            columns["timestamp"] > START_US + 10_000_000, 90_000_000, 0
+        )
+    wanted = read(ulog(topics))
+    stamps = topics["sensor_combined"]["timestamp"]
+    between = {f"unwanted_{k}": {"timestamp": stamps + np.uint64(k), "x": np.zeros(len(stamps), "f4")} for k in (1, 2)}
+    assert not set(between) & TOPICS
+    log = read(ulog(topics | between))
+    assert log.skipped == wanted.skipped
+    assert sum(int(s.split()[0]) for s in log.skipped if "with a stamp far off" in s) <= ulog_sieve.COMPANY + 12
+    for field, (t, _) in rows(wanted).items():
+        np.testing.assert_array_equal(rows(log)[field][0], t)
+        assert t[-1] > START_US * 1e-6 + 105
