@@ -11,6 +11,7 @@ import atexit
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -18,6 +19,7 @@ from typing import Any
 INTERRUPTED = 130  # exit code: 128 + SIGINT
 COMMANDS = ("fleet", "gateway", "twin_worker", "viewer")  # console scripts, and packages whose modules are run with -m
 PARENT = "PARAUAV_PARENT"  # process id of the parent that started this process as its child
+_AGAIN_S = 0.02  # before a KeyboardInterrupt that was dropped is raised anew [s]
 
 
 class _State:
@@ -91,6 +93,12 @@ def _on_unraisable(what: Any) -> None:
         sys.__unraisablehook__(what)
     elif _now.working:
         _now.raised = False
+        _thread.start_new_thread(_insist, ())  # raised here, in the hook, it would be dropped again
+
+
+def _insist() -> None:
+    while _now.working and not _now.raised:
+        time.sleep(_AGAIN_S)
         _thread.interrupt_main()
 
 

@@ -169,9 +169,8 @@ def test_a_jump_of_the_clock_costs_twenty_rows_whatever_is_logged_between():
     """Rows of topics nobody reads came between the rows that jumped, and the rest of the log was dropped."""
     topics = flight((1, 11), seconds=20.0)
     for columns in topics.values():
-        columns["timestamp"] = columns["timestamp"] + np.where(
-            columns["timestamp"] > START_US + 10_000_000, 90_000_000, 0
-        )
+        late = columns["timestamp"] > START_US + 10_000_000
+        columns["timestamp"] = columns["timestamp"] + late * np.uint64(90_000_000)
     wanted = read(ulog(topics))
     stamps = topics["sensor_combined"]["timestamp"]
     between = {f"unwanted_{k}": {"timestamp": stamps + np.uint64(k), "x": np.zeros(len(stamps), "f4")} for k in (1, 2)}
