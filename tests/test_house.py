@@ -11,7 +11,7 @@ from conftest import LONG_FILES, ROOT
 PACKAGES = ("fleet", "gateway", "twin_worker", "viewer")
 
 ROOMS = (  # inside fleet a room imports only from rooms above it, and from itself
-    ("frames", "heap", "plain"),
+    ("frames", "heap", "interrupt", "plain"),
     ("logs",),
     ("contract",),
     ("access",),
