@@ -1,5 +1,8 @@
 """ParaUAV: a fleet of digital twins for UAV swarms (what every process shares)."""
 
+from fleet import interrupt as interrupt  # first: from here on it handles Ctrl-C
+
+# isort: split
 import hashlib
 import os
 import tempfile

@@ -9,6 +9,8 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
+from fleet.interrupt import deferred
+
 REFRESH_S = 0.5
 PLAIN_S = 10.0  # between lines where the output is no terminal [s]
 
@@ -54,12 +56,22 @@ def alongside(show: Callable[[threading.Event], None]) -> Iterator[None]:
     """Run `show` on a thread for as long as the block lasts; the event it is given tells it to end."""
     done = threading.Event()
     thread = threading.Thread(target=show, args=(done,), name="shown")
-    thread.start()
+
+    def end() -> None:
+        with deferred():
+            done.set()
+            if thread.ident is not None:
+                thread.join()
+
     try:
-        yield
+        try:
+            with deferred():
+                thread.start()
+            yield
+        finally:
+            end()
     finally:
-        done.set()
-        thread.join()
+        end()  # Ctrl-C may have come before the first one began; a thread left behind would keep the process alive
 
 
 def _bars(

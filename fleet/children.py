@@ -9,16 +9,16 @@ import time
 from collections import deque
 from contextlib import AbstractContextManager
 
+from fleet.interrupt import PARENT, deferred
 from fleet.plain import plain
 
-PARENT = "PARAUAV_PARENT"  # process id of the parent that started this process as its child
 _PATIENCE_S = 8.0  # between the request to stop and the end of patience [s]
 _ALONE_S = 10.0  # the same for a child that is all its parent waits for [s]
 
 
 def run_until(stop: threading.Event, module: str, *options: str) -> int:
     """Run `python -m module options…` in the foreground until it ends or `stop` is set; give its exit code."""
-    child = subprocess.Popen([sys.executable, "-m", module, *options])
+    child = subprocess.Popen([sys.executable, "-m", module, *options], env=os.environ | {PARENT: str(os.getpid())})
     try:
         while child.poll() is None and not stop.wait(0.2):
             pass
@@ -27,6 +27,22 @@ def run_until(stop: threading.Event, module: str, *options: str) -> int:
             child.terminate()
     code = child.wait(_ALONE_S)
     return code if code >= 0 else 128 - code
+
+
+def run_to_end(module: str, *options: str) -> tuple[int, str]:
+    """Run `python -m module options…` to its end and return its exit code and standard error; Ctrl-C ends it too."""
+    child = None
+    try:
+        with deferred():  # otherwise it could be started without being known here
+            command = [sys.executable, "-m", module, *options]
+            child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        _, errors = child.communicate()
+        return child.returncode, errors
+    finally:
+        with deferred():
+            if child is not None and child.poll() is None:
+                child.kill()
+                child.communicate()
 
 
 class Children(AbstractContextManager):

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 
 from fleet import __version__, commands
-from fleet.children import PARENT
+from fleet.interrupt import INTERRUPTED, PARENT, interruptible
 from fleet.logs import begin, fail
 
 GRACE_S = 30.0  # an orphan may take so long to end by its own door [s]
@@ -32,15 +32,19 @@ def parser_for(prog: str, summary: str, examples: str) -> argparse.ArgumentParse
 
 
 def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
-    """Run a command; an expected failure becomes one sentence and exit code 2, Ctrl-C a clean 0."""
+    """Run a command; an expected failure becomes one sentence and exit code 2, Ctrl-C one and exit code 130.
+
+    A command that runs until it is stopped handles Ctrl-C itself (`stop_on_signal`) and returns 0.
+    """
     begin(prog, as_json=getattr(args, "log_json", False))
     try:
-        return run(args)
+        code = interruptible(lambda: run(args))
     except (ValueError, OSError) as error:
         fail(prog, str(error))
         return 2
-    except KeyboardInterrupt:
-        return 0
+    if code == INTERRUPTED and not os.environ.get(PARENT):  # else the parent says so
+        fail(prog, "interrupted")
+    return code
 
 
 def stop_on_signal() -> threading.Event:

@@ -24,6 +24,7 @@ from twin_worker.assess.keep import KEYS, covariance
 from twin_worker.assess.log import Log
 from twin_worker.assess.methods import BASELINES
 from twin_worker.assess.share import assess
+from twin_worker.assess.table import notes
 from twin_worker.assess.truth import FIRST_S, WHOLE_S
 
 KEYS_OF_A_METHOD = {
@@ -319,8 +320,20 @@ def test_too_short_a_recording_counts_no_start_and_says_so(short, tmp_path, caps
     out = tmp_path / "out"
     assert main([str(short), "--methods", "cv", "--out", str(out)]) == 1
     said = capsys.readouterr().out
-    assert "no start counts" in said and "apart:" in said
+    assert "no start counts: " in said and "are set apart, see below" in said and "apart:" in said
     assert [made.name for made in out.iterdir()] == ["predictions_apart.npz"]
+
+
+@pytest.mark.parametrize(
+    ("run", "words"),
+    [
+        ({"counted": 0, "silent": 7}, "at 7 on a mission nothing was predicted"),
+        ({"counted": 3, "silent": 0}, "at none of 3 did every method predict"),
+        ({"counted": 0, "silent": 0}, "nothing was predicted, and no mission was followed after the first 120 s"),
+    ],
+)
+def test_the_table_says_why_it_has_no_figures_as_the_json_does(run, words):
+    assert notes({"apart": {}, "compare": {}, "run": run}, []) == [f"no start counts: {words}"]
 
 
 def test_too_few_starts_for_the_papers_experiment_are_refused(capfd):
@@ -335,7 +348,7 @@ def test_ctrl_c_ends_it_cleanly(recorded, tmp_path):
         assert "compiling" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
         rest = process.stderr.read()
-    assert process.returncode == 0 and "Traceback" not in rest and "stopped" in rest
+    assert process.returncode == 130 and "Traceback" not in rest and "stopped" in rest
     assert not numbers.exists()
 
 

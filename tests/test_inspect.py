@@ -15,13 +15,11 @@ from fleet.contract import Link, Mission, Params, Status
 from fleet.page.ink import drawn, mode_colours
 from fleet.plain import plain
 from fleet.sheet import table
-from fleet.telemetry import abilities as needs
 from fleet.telemetry.abilities import abilities
 from fleet.telemetry.findings import Facts, File, Findings, findings, happened
 from fleet.telemetry.recordings import replay_messages
 from fleet.telemetry.survey import Survey, airborne, survey
 from fleet.telemetry.thinned import Span, Thinned, overlap
-from twin_worker import imm, learn, memory, preprocess, verify
 
 T0 = flights.T0
 S02, S10 = "sitl/s02_nominal_light_wind.tlog.xz", "sitl/s10_multi3_nominal.tlog.xz"
@@ -66,67 +64,6 @@ def judged(of: Survey) -> dict[str, tuple[bool, str]]:
     return {name: (can, why) for name, can, why in abilities(of)}
 
 
-# --- abilities -------------------------------------------------------------------------------------------------------
-
-
-def test_the_figures_are_those_the_twin_works_by():
-    assert preprocess.LONGEST_GAP == needs.LONGEST_S
-    assert (learn.LEAST_S, learn.NO_WINGS) == (needs.LEAST_S, needs.NO_WINGS)
-    least, papers, most = learn._HELD_S  # held out beside what is identified
-    assert max(learn._STRETCH_S[1] + most, learn._PAPER_S + papers) == needs.WINDOW_S and least < papers < most
-    assert memory.ROUTE_MODES == needs.ROUTE_MODES
-    assert min(verify.HORIZONS_S) == needs.UNBROKEN_S
-    assert verify._QUIET == needs.QUIET
-    assert max(4 * imm.STEP, 50 * preprocess.DT) == needs.RECENT_S
-
-
-def test_a_plane_with_everything_can_everything_but_diagnose():
-    told = judged(known(lively()))
-    assert [name for name, (can, _) in told.items() if not can] == ["diagnose"]
-    assert "the data would do" in told["diagnose"][1]
-
-
-@pytest.mark.parametrize(
-    ("laid", "more", "name", "words"),
-    [
-        (lively(20), {}, "identify lateral", "20 s of whole data in the air, 30 s are needed"),
-        (lively(), {"vehicle": "multirotor"}, "identify longitudinal", "multirotor is not modelled"),
-        (slower(lively(), "attitude", 14), {}, "identify lateral", "attitude at 1.8 Hz is unbroken for 0 of"),
-        (flights.turn(60), {}, "identify longitudinal", "elevator and throttle never move"),
-        (
-            lively() | {"attitude": flights.turn(60)["attitude"]},
-            {},
-            "verify",
-            "steady flight shows nothing: bank varies",
-        ),
-        (lively(), {"mode": "FBWA"}, "predict on the route", "0 s in a mode that follows a mission, 5 s are needed"),
-        (lively(), {"items": 0}, "predict on the route", "no mission list"),
-        ({k: v for k, v in lively().items() if k != "leg"}, {}, "predict on the route", "MISSION_CURRENT"),
-        ({k: v for k, v in lively().items() if k != "servo"}, {}, "predict by turn rate", "no servo rows"),
-        ({k: v for k, v in lively().items() if k != "air"}, {}, "estimate wind", "no air rows"),
-        (flights.turn(60, Va=2.0), {}, "estimate wind", "airspeed reaches 2.0 m/s"),
-        (flights.turn(60, Va=2.0), {}, "identify lateral", "never in the air"),
-    ],
-)
-def test_what_is_missing_is_said_with_figures(laid, more, name, words):
-    can, why = judged(known(laid, **more))[name]
-    assert not can
-    assert words in why
-
-
-def test_a_copter_is_still_predicted_by_its_turn_rate():
-    told = judged(known(lively(), vehicle="multirotor"))
-    assert told["predict by turn rate"][0]
-    assert not told["verify"][0]
-
-
-def test_slow_rows_that_the_twin_still_fills_are_a_yes_with_a_but():
-    can, why = judged(known(slower(lively(), "attitude", 10)))["identify lateral"]
-    assert can
-    assert "attitude at 2.5 Hz" in why
-    assert "servo map assumed" in why
-
-
 # --- survey ----------------------------------------------------------------------------------------------------------
 
 
@@ -146,7 +83,7 @@ def test_a_pretend_flight_is_described(pretended):
     texts = [event.text for event in told.events if event.kind == "text"]
     assert "Engine out" in texts
     assert "chatter" not in texts
-    assert {can.name for can in told.abilities if not can.can} == {"diagnose"}
+    assert {can.name for can in told.abilities if not can.can} == set()
 
 
 def test_events_are_told_once_and_in_time():
@@ -315,18 +252,18 @@ def test_what_an_aircraft_says_cannot_steer_the_terminal(capsys):
 
 
 def test_a_twin_that_answers_and_one_that_does_not(tlog, monkeypatch, capsys):
-    def answers(command, **_):
-        assert command[1:3] == ["-m", "twin_worker.replay"]
+    def answers(module, *options):
+        assert module == "twin_worker.replay"
         told = {"1": {"methods": {"paper": 7}, "first_verified_s": 34.0, "within": {"10": 0.9}, "sentence": "well"}}
-        with open(command[-1], "w") as file:
+        with open(options[-1], "w") as file:
             json.dump(told, file)
-        return subprocess.CompletedProcess(command, 0, "", "")
+        return 0, ""
 
-    monkeypatch.setattr(inspect.subprocess, "run", answers)
+    monkeypatch.setattr(inspect, "run_to_end", answers)
     assert main(["inspect", str(tlog), "--twin"]) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert "7 by paper; verified after 34 s; within 10 %: 90% at 10 s; well" in out
-    monkeypatch.setattr(inspect.subprocess, "run", lambda c, **_: subprocess.CompletedProcess(c, 1, "", "boom"))
+    monkeypatch.setattr(inspect, "run_to_end", lambda *_: (1, "boom"))
     code, told = told_by([tlog, "--twin"], capsys)
     assert code == 1
     assert "boom" in told["files"][0]["twin"]["sentence"]
@@ -360,7 +297,7 @@ def test_a_recorded_flight_of_another_autopilot(recordings):
     assert told.servo_map == "1 aileron, 2 elevator, 3 throttle, 4 rudder"
     assert told.airspeed.sensor == "yes"
     assert told.wind.from_deg == pytest.approx(4, abs=8)
-    assert {can.name for can in told.abilities if not can.can} == {"diagnose"}
+    assert {can.name for can in told.abilities if not can.can} == set()
 
 
 def test_three_aircraft_in_one_recording(recordings):

@@ -126,7 +126,7 @@ def test_ctrl_c_ends_it_cleanly(recorded, tmp_path):
         assert "reading" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
         rest = process.stderr.read()
-    assert process.returncode == 0 and "Traceback" not in rest and "stopped" in rest
+    assert process.returncode == 130 and "Traceback" not in rest and "stopped" in rest
     assert not numbers.exists()
 
 

@@ -18,6 +18,7 @@ from fleet.contract import (
     Status,
 )
 from tests.flights import ROUTE
+from twin_worker import memory
 from twin_worker.offline import run
 from twin_worker.twin import Twin, advance, fleet_row
 
@@ -70,6 +71,16 @@ def test_the_prediction_comes_true_for_a_few_seconds(flown):
             flew = [np.interp(p.t + 8.0, t, c) for c in where.T]
             miss.append(np.linalg.norm(p.path.numpy()[8] - flew))
     assert len(miss) > 5 and np.median(miss) < 40.0  # of some 190 m
+
+
+def test_an_offline_run_makes_one_twin_for_each_aircraft(monkeypatch):
+    """Once one was made, and its airframe's TOML parsed, for every message."""
+    loads = []
+    load = memory.load
+    monkeypatch.setattr(memory, "load", lambda which: loads.append(which) or load(which))
+    said = [Status(uav=uav, t=f.T0 + k, mode="AUTO") for k in range(50) for uav in (1, 2)]
+    assert list(run(said, twins := {})) == []
+    assert sorted(twins) == [1, 2] and len(loads) == 2
 
 
 def test_one_flight_gives_one_answer(heard, flown):

@@ -10,6 +10,7 @@ import pytest
 from ulog_writer import MAGIC, START_US, TRUTH, flight, message, read, rows, said, ulog
 
 from fleet.telemetry import ulog_sieve
+from fleet.telemetry.dialects.ulog import TOPICS
 from fleet.telemetry.ulog import UlogLog
 
 SAMPLE = "real/px4_vtol_cubeorange_6s_reader_test.ulg"
@@ -162,3 +163,14 @@ def test_a_log_whose_clock_leaps_a_century_has_few_chunks():
     for columns in topics.values():
         columns["timestamp"][len(columns["timestamp"]) // 2 :] += np.uint64(3_000_000_000_000_000)
     assert len(list(read(ulog(topics)).chunks())) <= 3
+
+
+def test_a_jump_of_the_clock_costs_twenty_rows_whatever_is_logged_between():
+    """Rows of topics nobody reads came between the rows that jumped, and the rest of the log was dropped."""
+    imu = flight((1, 11), seconds=20.0)["sensor_combined"]
+    imu["timestamp"] = imu["timestamp"] + (imu["timestamp"] > START_US + 10_000_000) * np.uint64(90_000_000)
+    between = {"unwanted": {"timestamp": imu["timestamp"] + np.uint64(1), "x": np.zeros(len(imu["timestamp"]), "f4")}}
+    assert not set(between) & TOPICS
+    log = read(ulog({"sensor_combined": imu} | between))
+    assert "20 rows of sensor_combined with a stamp far off left out" in log.skipped
+    assert len(rows(log)["imu"][0]) == len(imu["timestamp"]) - ulog_sieve.COMPANY

@@ -16,6 +16,7 @@ from fleet.autopilots.shadow import shadow
 from fleet.contract import Item
 from fleet.frames import G, Origin
 from fleet.mission import KIND, TAKEOFF, VA_C, Route
+from fleet.plain import below
 from twin_worker.compiled.straight import straight
 from twin_worker.control import CRUISE_OF, Control, on_wings
 from twin_worker.predict import unrolled
@@ -104,7 +105,7 @@ def fly(track: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
     first = max(first, int(bad[-1]) + 1 if len(bad) else 0)
     if len(track) - first < LEAST_S / STEP:
         reported = len(track) and np.isfinite(seq[-1])
-        why = f"{max(len(track) - first, 0) * STEP:.0f} s on this route, {LEAST_S:.0f} s are needed; wait"
+        why = f"{below(max(len(track) - first, 0) * STEP, LEAST_S)} s on this route, {LEAST_S:.0f} s are needed; wait"
         return Ahead(None, -1, why if reported else "the mission item in force is not reported (MISSION_CURRENT)")
     seen = track.part(first, len(track))
     return _fly(seen, seq[first:].astype(np.int64), board, grey, ahead)

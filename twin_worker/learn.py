@@ -5,6 +5,7 @@ import numpy as np
 
 from fleet.contract import Message, Outcome, State, Verdict
 from fleet.frames import G
+from fleet.plain import below
 from fleet.window import Window
 from twin_worker import coupled
 from twin_worker.choose import choose
@@ -103,7 +104,7 @@ def _why_not(twin: Twin, window: Window | None) -> Verdict | None:
         return None
     where = " on its wings" if twin.vehicle == QUADPLANE else ""
     missing = lacking(twin.history) or "wait"
-    sentence = f"{twin.name}: {have:.0f} s of whole data{where}, {LEAST_S:.0f} s are needed; {missing}"
+    sentence = f"{twin.name}: {below(have, LEAST_S)} s of whole data{where}, {LEAST_S:.0f} s are needed; {missing}"
     return Verdict(outcome=Outcome.STARVED, sentence=sentence)
 
 

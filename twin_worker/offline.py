@@ -19,6 +19,8 @@ def run(messages: Iterable[Message], twins: dict[int, Twin], traffic: Traffic | 
     """
     traffic = traffic or Traffic()
     for message in messages:
-        twin = twins.setdefault(message.uav, Twin(message.uav))
+        twin = twins.get(message.uav)
+        if twin is None:
+            twin = twins[message.uav] = Twin(message.uav)
         results = advance(twin, (message,))
         yield from traffic.after(twin.uav, twin.turned_t, results)

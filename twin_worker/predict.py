@@ -15,6 +15,7 @@ from fleet.autopilots.shadow import shadow
 from fleet.contract import Item
 from fleet.frames import Origin, wrap
 from fleet.mission import FIRST, KIND, LAND, P_D, P_N, READ, SPEED, TAKEOFF, Route, route
+from fleet.plain import below
 from fleet.simulate import N_STATE, simulate
 from fleet.window import Window
 from twin_worker.compiled.straight import straight
@@ -190,7 +191,7 @@ def heard(now: Situation) -> Heard | Flown:
     """Lay what was flown on the present route for a replay, or say why it cannot be."""
     good = _on_this_route(now.window, now.onboard.since)
     if len(good) < 5.0 / good.dt:
-        return Flown(None, -1, f"{good.seconds:.0f} s on this route, 5 s are needed; wait")
+        return Flown(None, -1, f"{below(good.seconds, 5.0)} s on this route, 5 s are needed; wait")
     every = slice((len(good) - 1) % _SHADOW_STEP, None, _SHADOW_STEP)
     at = good.t[every]
     seq = _reported(now.history, "leg", at, 15.0)[:, 0]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from fleet.children import run_until
 from fleet.cli import stop_on_signal
+from fleet.interrupt import INTERRUPTED
 
 EXAMPLES = """
   fleet calibrate monday/*.tlog --airframe skywalker --out skywalker.json
@@ -37,5 +38,5 @@ def run(args: argparse.Namespace) -> int:
     code = run_until(stop, "twin_worker.diagnose.learn", *options, "--", *map(str, args.file))
     if stop.is_set():
         print("calibrate: stopped; no model was written", file=sys.stderr)
-        return 0
+        return INTERRUPTED
     return code

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from fleet.children import run_until
 from fleet.cli import stop_on_signal
+from fleet.interrupt import INTERRUPTED
 
 _LONGEST_S = 1e6
 
@@ -78,5 +79,5 @@ def run(args: argparse.Namespace) -> int:
     code = run_until(stop, "twin_worker.diagnose", *options, *simulated, "--", *map(str, args.file))
     if stop.is_set():
         print("diagnose: stopped; what was not finished is not written", file=sys.stderr)
-        return 0
+        return INTERRUPTED
     return code

@@ -1,10 +1,11 @@
 """Tell what is in a recording, and what a twin can do with it: table, JSON, a page to print."""
 
 import argparse
+import contextlib
 import json
-import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +13,9 @@ import msgspec
 from rich.console import Console
 
 from fleet.bars import shown
+from fleet.children import run_to_end
 from fleet.commands.schema import fields_of, parts_of, summary
+from fleet.interrupt import deferred
 from fleet.sheet import table
 from fleet.telemetry.findings import Facts, File, Findings, findings
 from fleet.telemetry.recordings import Recording
@@ -92,7 +95,7 @@ def read(path: Path, offset: int = 0) -> Heard:
     try:
         recording = Recording(path, offset)
         with shown([recording], _say, Console(stderr=True), leave=False):
-            surveys = survey(news for _, step in recording.steps() for news in step)
+            surveys = survey((news for _, step in recording.steps() for news in step), recording.kind)
         facts = {uav: Facts(craft.firmware, tuple(craft.texts)) for uav, craft in recording.crafts.items()}
         said += recording.skipped
     except (ValueError, OSError) as error:
@@ -137,16 +140,27 @@ def _check(args: argparse.Namespace) -> None:
 
 def _twin(path: Path) -> dict[str, Any]:
     """Let a twin fly the recording in a process of its own; give its figures by UAV id, or a sentence."""
-    with tempfile.TemporaryDirectory() as folder:
-        answer = Path(folder) / "twin.json"
-        command = [sys.executable, "-m", "twin_worker.replay", str(path), "--json", str(answer)]
-        child = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
+    with _folder() as folder:
+        answer = folder / "twin.json"
+        code, errors = run_to_end("twin_worker.replay", str(path), "--json", str(answer))
         try:
             told = json.loads(answer.read_text())
         except (OSError, ValueError):
-            last = (child.stderr.strip().splitlines() or ["no reason given"])[-1]
-            return {"sentence": f"the twin ended with code {child.returncode}: {last}"}
+            last = (errors.strip().splitlines() or ["no reason given"])[-1]
+            return {"sentence": f"the twin ended with code {code}: {last}"}
     return told if isinstance(told, dict) else {"sentence": "the twin's answer was no object"}
+
+
+@contextlib.contextmanager
+def _folder() -> Iterator[Path]:
+    """Make a temporary folder and remove it at the end, also where Ctrl-C comes during either."""
+    with deferred():
+        folder = tempfile.TemporaryDirectory()
+    try:
+        yield Path(folder.name)
+    finally:
+        with deferred():
+            folder.cleanup()
 
 
 def _write_json(told: list[File], name: str) -> None:
@@ -154,4 +168,5 @@ def _write_json(told: list[File], name: str) -> None:
     if name == "-":
         sys.stdout.write(text)
     else:
-        Path(name).write_text(text)
+        with deferred():  # a file half written could pass for a whole one
+            Path(name).write_text(text)

@@ -10,6 +10,7 @@ from threading import Event
 
 from fleet.children import run_until
 from fleet.cli import id_range, stop_on_signal
+from fleet.interrupt import INTERRUPTED
 
 EXAMPLES = """
   fleet paper identify --out figures --json paper.json
@@ -60,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         )
     stop = stop_on_signal()
     with _recordings(args, stop) as files:
-        return 0 if stop.is_set() else _judge(args, files, stop)
+        return INTERRUPTED if stop.is_set() else _judge(args, files, stop)
 
 
 @contextlib.contextmanager
@@ -108,5 +109,5 @@ def _judge(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
     code = run_until(stop, *command, *options, *map(str, files))
     if stop.is_set():
         print("paper: stopped; what was not finished is not written", file=sys.stderr)
-        return 0
+        return INTERRUPTED
     return code

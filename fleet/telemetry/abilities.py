@@ -10,7 +10,8 @@ import numpy as np
 from fleet.airframe import ServoMap, servo_map
 from fleet.contract import COLUMNS
 from fleet.mission import FIRST, route
-from fleet.telemetry.survey import LONGEST_S, Survey, airborne, spells
+from fleet.plain import below
+from fleet.telemetry.survey import FAST, LONGEST_S, ROTORS, ROTORS_FAST, Survey, airborne, spells
 from fleet.telemetry.thinned import Span, inside, overlap, seconds
 from fleet.window import INPUTS
 
@@ -25,6 +26,17 @@ LEAST_VA, PAIRED_S = 3.0, 0.5  # airspeed, and age of the rows that go with a gr
 PAIRS = 50  # wind triangles before the estimate is guarded
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 NO_WINGS = ("multirotor", "helicopter")
+WINGS = ("fixed_wing", "quadplane")
+DIAGNOSE_S, DIAGNOSE_ROWS = 25.0, 50  # trusted flight, and rows of each needed kind, a diagnosis needs
+OWN_PAST_S = 50.0  # trusted flight where an aircraft is compared with its own past [s]
+VANE_HZ = 18.0  # accelerometer rows by which gusts are seen
+_BEGIN_S, _END_S = 5.0, 1.5  # of a recording, left out by a diagnosis [s]
+_ITEMS_IN = {  # where a recording has its mission items, by its kind
+    "ULog": "PX4 logs no mission items; record telemetry instead (.tlog), with the mission downloaded while recording",
+    "DataFlash log": "the autopilot logs them as CMD messages (ArduPilot); keep the log from its beginning",
+    "DataFlash text log": "the autopilot logs them as CMD messages (ArduPilot); keep the log from its beginning",
+    "fleet recording": "the gateway downloads it unless --listen-only is set; record with it connected",
+}
 _GOOD_HZ = 10.0  # below this the twin works, but sees fast motion badly
 _STILL = 0.005  # an input that varies less never moves, share of its throw [-]
 _WORD = {"delta_a": "aileron", "delta_e": "elevator", "delta_r": "rudder", "delta_t": "throttle"}
@@ -57,7 +69,7 @@ def abilities(known: Survey) -> list[Ability]:
         _on_route(known, unidentified, flown),
         _by_turn_rate(known, whole),
         wind,
-        _diagnose(unidentified, verified, wind),
+        _diagnose(known, flown),
     ]
 
 
@@ -105,7 +117,8 @@ def _starved(known: Survey, flown: list[Span], whole: list[Span]) -> str:
     if lack := _lacking(known):
         return lack
     if not flown:
-        return "never in the air: no 5 s faster than 6 m/s"
+        fast = ROTORS_FAST if known.vehicle in ROTORS else FAST
+        return f"never in the air: no 5 s faster than {fast:.0f} m/s"
     for name in NEEDED:
         covered = seconds(overlap(known.rows[name].stretches(), flown))
         if covered < 0.5 * seconds(flown):
@@ -116,7 +129,7 @@ def _starved(known: Survey, flown: list[Span], whole: list[Span]) -> str:
     parts = overlap(whole, flown)
     have = most_within(parts, WINDOW_S)
     if have < LEAST_S:
-        return f"{have:.0f} s of whole data in the air, {LEAST_S:.0f} s are needed"
+        return f"{below(have, LEAST_S)} s of whole data in the air, {LEAST_S:.0f} s are needed"
     longest = max(part.seconds for part in parts)
     if longest < UNBROKEN_S:
         return f"the longest unbroken stretch is {longest:.1f} s, {UNBROKEN_S:.0f} s are needed"
@@ -168,21 +181,25 @@ def _verify(known: Survey, unidentified: str, spans: list[Span]) -> Ability:
 
 
 def _on_route(known: Survey, unidentified: str, flown: list[Span]) -> Ability:
+    """Judge what the twin flies ahead by: an identified model, else the kinematics of its kind of aircraft."""
     name = "predict on the route"
-    if unidentified:
-        return Ability(name, False, unidentified)
+    if unidentified and known.vehicle not in (*WINGS, *NO_WINGS):
+        return Ability(name, False, f"{unidentified}, and a vehicle of kind {known.vehicle} has no kinematic model")
+    if none := [kind for kind in ("attitude", "velocity", "position") if known.rows[kind].count < 8]:
+        return Ability(name, False, f"no {', '.join(none)} rows in the recording")
     following = overlap([span for span, mode in spells(known) if mode in ROUTE_MODES], flown)
     flew = seconds(following)
     if flew < ROUTE_S:
         modes = ", ".join(dict.fromkeys(mode for _, mode in spells(known))) or "no mode"
         return Ability(
-            name, False, f"{flew:.0f} s in a mode that follows a mission, {ROUTE_S:.0f} s are needed ({modes})"
+            name,
+            False,
+            f"{below(flew, ROUTE_S)} s in a mode that follows a mission, {ROUTE_S:.0f} s are needed ({modes})",
         )
     origin = known.origin()
     if not known.items or origin is None:
-        return Ability(
-            name, False, "no mission list in the recording; let the ground station download it while recording"
-        )
+        remedy = _ITEMS_IN.get(known.kind, "let the ground station download it while recording")
+        return Ability(name, False, f"no mission list in the recording; {remedy}")
     autopilot = known.status.autopilot if known.status else "unknown"
     first = FIRST.get(autopilot, 1)
     if not len(route(known.items, seq=first, origin=origin, params=known.values, first=first).legs):
@@ -192,7 +209,10 @@ def _on_route(known: Survey, unidentified: str, flown: list[Span]) -> Ability:
     told = autopilot in ("ardupilot", "px4")
     law = "" if told else f"; autopilot {autopilot} is flown by the law that asks for the banks it asks for, if any"
     items = f"{len(known.items)} mission items" + ("" if known.mission and known.mission.complete else ", not all")
-    return Ability(name, True, f"{flew:.0f} s on the route, {items}; take-off and landing are not modelled{law}")
+    if known.vehicle in NO_WINGS:
+        return Ability(name, True, f"{flew:.0f} s on the route, {items}; by its speed and acceleration limits")
+    how = f"by the kinematics of a wing, since {unidentified}" if unidentified else "take-off and landing not modelled"
+    return Ability(name, True, f"{flew:.0f} s on the route, {items}; {how}{law}")
 
 
 def _by_turn_rate(known: Survey, whole: list[Span]) -> Ability:
@@ -227,7 +247,30 @@ def _wind(known: Survey) -> Ability:
     return Ability(name, True, f"{pairs} wind triangles of ground velocity, airspeed and heading")
 
 
-def _diagnose(unidentified: str, verified: Ability, wind: Ability) -> Ability:
-    lack = unidentified or ("" if verified.can else verified.why) or ("" if wind.can else f"no wind: {wind.why}")
-    data = f"the data would not do: {lack}" if lack else "the data would do"
-    return Ability("diagnose", False, f"missing physics is not named yet; {data}")
+def _diagnose(known: Survey, flown: list[Span]) -> Ability:
+    """Judge by what `fleet diagnose` demands of a flight."""
+    name = "diagnose"
+    if known.vehicle in NO_WINGS:
+        return Ability(name, False, f"a {known.vehicle} is not diagnosed: the simulation it is compared with has wings")
+    if few := [kind for kind in NEEDED if known.rows[kind].count < DIAGNOSE_ROWS]:
+        return Ability(name, False, f"fewer than {DIAGNOSE_ROWS} {', '.join(few)} rows in the recording")
+    trusted = seconds(_without_gaps(known, flown))
+    if trusted < DIAGNOSE_S:
+        found = below(trusted, DIAGNOSE_S)
+        return Ability(name, False, f"{found} s in the air without gaps, {DIAGNOSE_S:.0f} s are needed")
+    said = f"{trusted:.0f} s in the air without gaps, against a model of `fleet calibrate`"
+    said += " or its own past" if trusted >= OWN_PAST_S else f"; its own past would need {OWN_PAST_S:.0f} s"
+    lacks = [] if known.rows["imu"].rate_hz >= VANE_HZ else [f"accelerometer at {VANE_HZ:.0f} Hz"]
+    lacks += [word for kind, word in (("air", "airspeed"), ("pressure", "pressure")) if not known.rows[kind].count]
+    return Ability(name, True, said + (f"; less is seen without {', '.join(lacks)}" if lacks else ""))
+
+
+def _without_gaps(known: Survey, flown: list[Span]) -> list[Span]:
+    """Give the stretches in the air, without gaps of any needed kind, and without what begins and ends the rows."""
+    ends = [known.rows[kind].rows()[0][[0, -1]] for kind in NEEDED]
+    parts = overlap(flown, [Span(max(a for a, _ in ends) + _BEGIN_S, min(b for _, b in ends) - _END_S)])
+    for kind in NEEDED:
+        gaps = known.rows[kind].gaps()
+        starts, stops = [-np.inf, *(gap.stop for gap in gaps)], [*(gap.start for gap in gaps), np.inf]
+        parts = overlap(parts, [Span(a, b) for a, b in zip(starts, stops, strict=True)])
+    return parts

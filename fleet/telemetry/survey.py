@@ -19,8 +19,10 @@ LONGEST_S = {
 SILENT_S = 3.0  # no row of any kind for so long is a gap of the link [s]
 MOST_EVENTS = 2_000
 BUDGET = 5_000_000  # rows kept over all aircraft and kinds
-FAST = 6.0  # no small aircraft is on the ground at this speed [m/s]
+FAST = 6.0  # no small fixed wing is on the ground at this speed [m/s]
 _HIGH = 5.0  # above the lowest of the recording: in the air, where armed [m]
+ROTORS = ("multirotor", "helicopter", "quadplane")
+ROTORS_FAST, ROTORS_HIGH = 2.0, 1.5  # the same of aircraft that take off vertically [m/s, m]
 _BRIDGE_S, _HOP_S = 10.0, 5.0  # shorter landings and flights are none [s]
 _BY_ITSELF = ("STAT_", "BARO1_GND_", "BARO2_GND_", "BARO3_GND_", "GND_ABS_")  # parameters nobody set
 
@@ -44,6 +46,7 @@ class Survey:
     Attributes:
         uav: UAV id
         begun: when the recording begins [s since 1970]
+        kind: of the recording, as in `recordings.KINDS`; empty: not known
         rows: measurements by kind, as in `contract.COLUMNS`
         refused: kinds of a message that did not fit the contract
         modes: (since when [s since 1970], mode), as they followed each other
@@ -54,6 +57,7 @@ class Survey:
 
     uav: int
     begun: float
+    kind: str = ""
     rows: dict[str, Thinned] = field(default_factory=lambda: {name: _thinned(name) for name in COLUMNS})
     newest: float = -np.inf
     refused: int = 0
@@ -97,11 +101,12 @@ class Survey:
             self.lost_events += 1
 
 
-def survey(messages: Iterable[Message]) -> dict[int, Survey]:
+def survey(messages: Iterable[Message], kind: str = "") -> dict[int, Survey]:
     """Take a whole recording.
 
     Args:
         messages: Sample, Status, Mission, Params in the order they were heard
+        kind: of the recording, as in `recordings.KINDS`
     Returns:
         what it says of each aircraft, by UAV id
     """
@@ -112,7 +117,7 @@ def survey(messages: Iterable[Message]) -> dict[int, Survey]:
             continue
         begun = message.t if np.isnan(begun) else begun
         if message.uav not in found:
-            found[message.uav] = Survey(message.uav, begun)
+            found[message.uav] = Survey(message.uav, begun, kind)
             _share(found)
         hear(found[message.uav], message)
     for each in found.values():
@@ -220,11 +225,16 @@ def airborne(known: Survey) -> list[Span]:
     t_p, p = known.rows["position"].rows()
     if not len(t_v) or not len(t_p):
         return []
+    rotors = known.vehicle in ROTORS
+    fast, high = (ROTORS_FAST, ROTORS_HIGH) if rotors else (FAST, _HIGH)
     armed = inside(t_v, armed_spans(known))
-    flying = armed & (np.linalg.norm(v, axis=1) > FAST)
+    flying = armed & (np.linalg.norm(v, axis=1) > fast)
     if armed.any() and any(on for _, on in known.armings):
         height = np.interp(t_v, t_p, p[:, 2]) * 1e-3
-        flying |= armed & (height - np.percentile(height[armed], 1) > _HIGH)
+        flying |= armed & (height - np.percentile(height[armed], 1) > high)
+        t_h, above_home = known.rows["height"].rows()
+        if rotors and len(t_h):  # it may hover from the first row to the last
+            flying |= armed & (np.interp(t_v, t_h, above_home[:, 0]) > high)
     return _bridged(t_v, flying)
 
 

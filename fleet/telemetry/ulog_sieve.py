@@ -164,7 +164,8 @@ class Sieve:
             self.messages += 1
         if at > self._at:
             self._tell_damage()
-            self._at, self._now_us, self._strangers = at, now, 0
+            self._at, self._now_us = at, now
+            self._strangers = 0 if out else self._strangers  # rows of unwanted topics say nothing of time
         return bytes(out)
 
     def _next(self) -> bytes | None:

@@ -9,6 +9,7 @@ from rich.text import Text
 from fleet.sheet import plain
 from twin_worker.assess.case import OURS
 from twin_worker.assess.compare import BEATEN, WORSE
+from twin_worker.assess.truth import FIRST_S
 
 _LABELS = {
     "cv": "constant velocity",
@@ -22,6 +23,7 @@ _LABELS = {
 }
 _ERRORS = ("5", "16", "30", "60")
 _STYLES = {BEATEN: "green", WORSE: "red"}
+_NOTHING = f"nothing was predicted, and no mission was followed after the first {FIRST_S:.0f} s"
 _ASIDE = ("compare", "apart", "run")
 
 
@@ -108,7 +110,7 @@ def _difference(row: dict[str, Any] | None) -> Text:
 
 def notes(found: dict[str, Any], names: list[str]) -> list[str]:
     """Say what stood in for whom, and which starts do not count."""
-    lines = [] if names else ["no start counts: nothing to tell"]
+    lines = [] if names else [_why_none(found)]
     for name in names:
         made = found[name]["made_by"]
         others = {by: n for by, n in made.items() if by != name}
@@ -120,6 +122,17 @@ def notes(found: dict[str, Any], names: list[str]) -> list[str]:
             f"apart: {row['starts']} starts, {why}; ours held 10 % for {_number(row['m1_t10_lq_s'])} s (quartile)"
         )
     return lines
+
+
+def _why_none(found: dict[str, Any]) -> str:
+    """Say why there are no figures, as the keys `apart` and `run` of the JSON do."""
+    run, apart = found.get("run", {}), sum(row["starts"] for row in found["apart"].values())
+    reasons = [f"{apart} are set apart, see below"] if apart else []
+    if counted := run.get("counted", 0):
+        reasons.append(f"at none of {counted} did every method predict")
+    if silent := run.get("silent", 0):
+        reasons.append(f"at {silent} on a mission nothing was predicted")
+    return f"no start counts: {'; '.join(reasons) or _NOTHING}"
 
 
 def _table(title: str, *columns: str) -> Table:

@@ -7,6 +7,7 @@ import numpy as np
 
 from fleet.contract import Params, Sample, Status
 from fleet.frames import Origin, to_ned
+from fleet.plain import below
 from fleet.telemetry.recordings import replay_messages
 from twin_worker.diagnose.card import Card
 from twin_worker.diagnose.smooth import DT
@@ -104,7 +105,9 @@ def lay(name: str, history: History, params: dict[str, float], card: Card) -> Fl
     rows = {kind: history.rows(kind) for kind in ("attitude", "velocity", "position", "servo", "air", "imu")}
     length = np.ptp(rows["attitude"][0]) if len(rows["attitude"][0]) else 0.0
     if length < _LEAST_S:
-        raise ValueError(f"{name}: found {length:.0f} s, expected {_LEAST_S:.0f} s of flight at least; record longer")
+        raise ValueError(
+            f"{name}: found {below(length, _LEAST_S)} s, expected {_LEAST_S:.0f} s of flight at least; record longer"
+        )
     for kind in ("attitude", "velocity", "position", "servo"):
         if len(rows[kind][0]) < 50:
             raise ValueError(f"{name}: found no {kind} in it, expected telemetry of a flight; record that message too")
@@ -113,7 +116,8 @@ def lay(name: str, history: History, params: dict[str, float], card: Card) -> Fl
     stop = min(float(rows[kind][0][-1]) for kind in ("attitude", "velocity", "servo")) - zero - 0.1
     if stop - start < _LEAST_S:
         raise ValueError(
-            f"{name}: found {max(stop - start, 0):.0f} s, expected {_LEAST_S:.0f} s of flight at least; record longer"
+            f"{name}: found {below(max(stop - start, 0.0), _LEAST_S)} s, expected {_LEAST_S:.0f} s of flight at least; "
+            "record longer"
         )
     t = np.arange(np.ceil(start / DT), np.floor(stop / DT)) * DT
     lacks: list[str] = []
@@ -130,7 +134,7 @@ def lay(name: str, history: History, params: dict[str, float], card: Card) -> Fl
     flight = Flight(name, t, zero, readings, commands, horizontal, ground, ok, vane, tuple(lacks))
     if flight.seconds < _LEAST_S:
         raise ValueError(
-            f"{name}: found {flight.seconds:.0f} s in the air, expected {_LEAST_S:.0f} s at least; "
+            f"{name}: found {below(flight.seconds, _LEAST_S)} s in the air, expected {_LEAST_S:.0f} s at least; "
             "was it standing on the ground?"
         )
     return flight

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from fleet.plain import below
 from twin_worker.diagnose import hidden
 from twin_worker.diagnose.card import Card
 from twin_worker.diagnose.diagnose import diagnose
@@ -39,8 +40,8 @@ class OwnPast:
         after = since(flight, self.until).seconds
         if after < LEAST_AFTER_S:
             raise ValueError(
-                f"{flight.name}: found {after:.0f} s of trusted flight after {self.until:.0f} s, expected "
-                f"{LEAST_AFTER_S:.0f} s at least to diagnose; trust a shorter past"
+                f"{flight.name}: found {below(after, LEAST_AFTER_S)} s of trusted flight after {self.until:.0f} s, "
+                f"expected {LEAST_AFTER_S:.0f} s at least to diagnose; trust a shorter past"
             )
         shown = hidden.concealed(flight, conceal, before(flight, self.until))
         base = calibrate_past(flight, self.until, self.card, say, shown if conceal else None)

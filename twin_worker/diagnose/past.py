@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from fleet.effects import Onset, Stage, catalogue
+from fleet.plain import below
 from twin_worker.diagnose import equations as eq
 from twin_worker.diagnose.baseline import CHANNELS, DEAF, Baseline, Noise, silenced
 from twin_worker.diagnose.calibrate import settled
@@ -55,7 +56,7 @@ def calibrate_past(
     past = before(flight, until)
     if past.seconds < LEAST_S:
         raise ValueError(
-            f"{flight.name}: found {past.seconds:.0f} s of trusted flight before {until:.0f} s, expected "
+            f"{flight.name}: found {below(past.seconds, LEAST_S)} s of trusted flight before {until:.0f} s, expected "
             f"{LEAST_S:.0f} s at least; trust a longer past, or calibrate on other flights"
         )
     say(f"{flight.name}: its own past, {past.seconds:.0f} s of trusted flight")
