@@ -9,7 +9,7 @@ lost by mistake where telemetry arrived within the second before.
 import argparse
 import time
 
-from tests.late_arrival import ARRIVALS, flight, lived, published
+from tests.late_arrival import ARRIVALS, flight, lived, relayed
 
 
 def main() -> None:
@@ -25,7 +25,7 @@ def main() -> None:
     print("| speed | link lost by mistake | link lost | longest gap [s] | back after [s] | predictions | steps [s] |")
     print("|---|---|---|---|---|---|---|")
     for name in args.only or ARRIVALS:
-        found = lived(published(sent, ARRIVALS[name]), lambda now: clock.__setitem__(0, now)).found
+        found = lived(relayed(sent, ARRIVALS[name]), lambda now: clock.__setitem__(0, now)).found
         print(f"| {name} | {found.row()} |", flush=True)
 
 
