@@ -157,6 +157,10 @@ class Status(Message, frozen=True, kw_only=True):
     rejected: Annotated[int, Meta(description="messages or fields refused (not finite, out of range, stale)")] = 0
     clock_offset_s: Annotated[float, Meta(description="fleet time minus the aircraft's boot time [s]")] = 0.0
     clock_jumps: Annotated[int, Meta(description="times the aircraft's clock jumped")] = 0
+    clock_advance_s: Annotated[
+        float,
+        Meta(description="sum of the steps by which telemetry that fell behind its arrival was dated anew, later [s]"),
+    ] = 0.0
     clock_drift: Annotated[
         float | None, Meta(description="what the aircraft's clock loses on the fleet clock [s/s]; null: not known yet")
     ] = None

@@ -111,3 +111,34 @@ def test_a_message_without_time_takes_the_newest():
     t = clocks.fleet(BOOT, 9.0, T0 + 0.1)
     assert clocks.fleet(NONE, 0.0, T0 + 0.13) == pytest.approx(t + 0.03)
     assert clocks.fleet(NONE, 0.0, T0 + 60.0) == pytest.approx(t + 0.5)
+
+
+@pytest.mark.parametrize("pause", [2.0, 10.0, 30.0])
+def test_a_clock_that_stood_still_is_anchored_anew_once_and_only_forward(pause):
+    clock, rng, times, arrivals = Clock(), np.random.default_rng(2), [], []
+    for step in range(4000):
+        arrivals.append(T0 + step * 0.05 + (pause if step >= 1000 else 0.0) + rng.exponential(0.03))
+        times.append(clock.fleet(step * 0.05, max(arrivals)))
+    steps = np.diff(times) - 0.05
+    assert (steps > -0.05).all() and (steps > 0.5).sum() == 1
+    at = int(np.argmax(steps))
+    assert 10.0 < arrivals[at] - arrivals[1000] < 31.0  # the least delay of half a minute is what tells
+    assert steps[at] == pytest.approx(pause, abs=0.2) == clock.state[c.ADVANCE]
+    assert times[-1] == pytest.approx(arrivals[-1], abs=0.2) and clock.jumps == 0
+
+
+@pytest.mark.parametrize("speed", [0.5, 0.8, 0.97])
+def test_a_clock_slower_than_real_time_is_never_half_a_minute_behind(speed):
+    clock = Clock()
+    behind = np.array([T0 + s * 0.05 / speed - clock.fleet(s * 0.05, T0 + s * 0.05 / speed) for s in range(8000)])
+    assert behind.max() < (1 - speed) * 32.0 + 2.0 and behind.min() > -0.1
+    assert 1 <= (np.diff(behind) < -0.5).sum() <= 400.0 / speed / 30.0 and clock.jumps == 0  # one in half a minute
+
+
+def test_a_slow_radio_and_a_delay_that_passes_anchor_nothing():
+    clock, rng, arrival = Clock(), np.random.default_rng(3), T0
+    for step in range(4000):
+        late = 1.0 + rng.exponential(0.5) + (3.0 if 1000 <= step < 1240 else 0.0)
+        arrival = max(arrival, T0 + step * 0.05 + late)
+        clock.fleet(step * 0.05, arrival)
+    assert clock.state[c.ADVANCE] == 0.0 and clock.jumps == 0

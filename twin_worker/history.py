@@ -81,6 +81,12 @@ class History:
         """Have these rows, (n,) and (n, k), instead of all of their kind."""
         self._kept[name] = Kept(np.array(t, float), np.array(x, float))
 
+    def advance(self, before: float, by: float) -> None:
+        """Date rows from before a time later by `by` [s since 1970, s]: their clock was found to be so far behind."""
+        for kept in self._kept.values():
+            kept.advance(before, by)
+        self.newest = max((float(kept.t[: kept.n].max()) for kept in self._kept.values() if kept.n), default=-np.inf)
+
     def sound(self) -> bool:
         """Tell whether every kind has its columns: compiled code does not look."""
         widths = dict(_WIDTHS)

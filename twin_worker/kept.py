@@ -68,6 +68,13 @@ class Kept:
             self.n = len(t)
         self.settled = self.n
 
+    def advance(self, before: float, by: float) -> None:
+        """Date rows from before a time later by `by` [s]."""
+        self.lay()
+        t = self.t[: self.n]
+        t[t < before] += by
+        self.settled = 0  # what came since may lie among them
+
     def whole(self) -> tuple[np.ndarray, np.ndarray]:
         """Give all rows as they came, (n,) and (n, k)."""
         self.lay()

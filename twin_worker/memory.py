@@ -1,7 +1,7 @@
 """What one twin remembers: the telemetry, the model in force, how past predictions fared; and how it listens."""
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from twin_worker.conflict.ledger import Ledger
 from twin_worker.contest import Contest
 from twin_worker.control import Control
 from twin_worker.coupled import Coupled
+from twin_worker.delay import Delay
 from twin_worker.earned import Earned
 from twin_worker.engine.pace import Pace, Work
 from twin_worker.engine.quota import Quota
@@ -123,7 +124,8 @@ class Twin:
     ground: Ground = field(default_factory=Ground)
     noted: Note | None = None  # the newest event
     since: float = -np.inf  # last change of mode, mission or parameters
-    data_t: float = -np.inf  # newest time in any message
+    data_t: float = -np.inf  # newest time in any message, on the time axis of telemetry
+    delay: Delay = field(default_factory=Delay)  # of telemetry behind the gateway's clock
     turned_t: float = -np.inf  # data time of the last turn of the loop
     wind_t: float = -np.inf
     identify_t: float = -np.inf
@@ -253,7 +255,30 @@ def _hear_status(twin: Twin, status: Status) -> None:
         twin.learn_from = -np.inf
         twin.marks.clear()
         twin.data_t = twin.turned_t = -np.inf
+        twin.delay = Delay(twin.delay.gateway_t)
         twin.ground = Ground()
         void(twin, Event.CLOCK, status.t)
-    elif status.mode != before.mode:
+        return
+    if 0 < (step := status.clock_advance_s - before.clock_advance_s) < np.inf:
+        _advance_clock(twin, step)
+    if status.mode != before.mode:
         void(twin, Event.MODE if before.mode else None, status.t, f"{status.mode[:20]}, before {before.mode[:20]}")
+
+
+def _advance_clock(twin: Twin, step: float) -> None:
+    """Follow a gateway that re-anchored telemetry times forward: what came before is dated as what comes now."""
+    newest = twin.history.newest
+    if not np.isfinite(newest):
+        return
+    arrived = twin.delay.gateway_t - newest < 0.5 * step  # the first sample dated anew came before the status
+    twin.history.advance(newest - 0.5 * step if arrived else np.inf, step)
+    twin.grid.clear()
+    twin.wind.t, twin.wind_t = twin.wind.t + step, twin.wind_t + step
+    twin.learn_from, twin.back_t = twin.learn_from + step, twin.back_t + step
+    twin.modes = deque(((t + step, mode) for t, mode in twin.modes), maxlen=_MODES)
+    twin.pool = [replace(one, t=one.t + step) for one in twin.pool]
+    twin.marks.clear()
+    since = twin.since + step
+    void(twin, None, twin.history.newest)
+    said = f"telemetry was {step:.1f} s behind its arrival and was dated anew: what was predicted before is void"
+    twin.since, twin.noted = since, Note(Event.CLOCK, twin.history.newest, said)

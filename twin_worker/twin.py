@@ -4,8 +4,9 @@ from collections.abc import Iterable, Iterator
 from math import isfinite
 
 import numpy as np
+from msgspec.structs import replace
 
-from fleet.contract import Alert, Event, FleetRow, Link, Message, Sample, State
+from fleet.contract import Alert, Event, FleetRow, Link, Message, Sample, State, Status
 from fleet.frames import to_ned
 from twin_worker import contest
 from twin_worker.blow import blow
@@ -26,14 +27,17 @@ _TICK_S = 1.0  # between turns while data are silent, between scorings, and of t
 _BEFORE_S = 3.0  # positions from before those that were scored last, so that none falls between [s]
 _SILENT_TURNS = 150  # most of them [-]
 _LATE_S = 10.0  # velocities older than this come too late for the wind [s]
+_AHEAD_S = 1.0  # data time that is ahead of telemetry by more goes back when telemetry arrives [s]
 _LATEST = 4e9  # times beyond are noise [s since 1970]
 
 
 def advance(twin: Twin, messages: Iterable[Message], now: float = -np.inf) -> list[Message]:
     """Take what was heard, and identify, verify, predict and score whatever fell due meanwhile.
 
-    Data time is the newest time in any message, and deadlines are met after every single one: the answer does not
-    depend on how a driver groups them. Where the data themselves are silent the loop turns once a second.
+    Data time is the newest time in any message, on the time axis of telemetry, and deadlines are met after every
+    single one: the answer does not depend on how a driver groups them. Where the data themselves are silent the loop
+    turns once a second. Silence is judged by arrival: telemetry that arrives is not silent, whatever its times are
+    (see `twin_worker.delay`).
 
     Args:
         twin: the aircraft's twin, changed in place
@@ -46,10 +50,11 @@ def advance(twin: Twin, messages: Iterable[Message], now: float = -np.inf) -> li
     for message in messages:
         for at in silence(twin, message):
             results += _turn(twin, at)
-        heard = _heard(message)
-        hear(twin, message)
-        if isinstance(message, Sample) or np.isfinite(twin.data_t):  # after a jump of the clock telemetry leads
-            twin.data_t = max(twin.data_t, heard)
+        if isinstance(message, Sample):
+            if not _take_sample(twin, message):
+                continue
+        else:
+            _take_other(twin, message)
         results += _turn(twin, twin.data_t)
     return results + _turn(twin, now) if now > twin.data_t else results
 
@@ -60,6 +65,11 @@ def silence(twin: Twin, message: Message) -> Iterator[float]:
     Once a second; a longer silence than any prediction is worth is leapt over.
     """
     at, until = max(twin.data_t, twin.turned_t), _heard(message)
+    if isinstance(message, Sample):
+        if _leaps(twin, message):
+            return
+    else:
+        until -= _delay(twin, message)
     for _ in range(_SILENT_TURNS):
         if not until - at > 2 * _TICK_S or not np.isfinite(at):
             return
@@ -69,6 +79,46 @@ def silence(twin: Twin, message: Message) -> Iterator[float]:
 
 def _heard(message: Message) -> float:
     return message.t if 0 < message.t < _LATEST else -np.inf
+
+
+def _take_sample(twin: Twin, sample: Sample) -> bool:
+    """Take telemetry; False where it was dated anew and the status that tells by how much is still to come."""
+    leaps = _leaps(twin, sample)
+    hear(twin, sample)
+    newest = twin.history.newest
+    if isfinite(newest):
+        twin.delay.take_sample(newest, leaps)
+    ran_ahead = twin.data_t - newest > _AHEAD_S  # by status messages, while it was silent or before it fell behind
+    twin.data_t = newest if ran_ahead and isfinite(newest) else max(twin.data_t, _heard(sample))
+    return not leaps
+
+
+def _leaps(twin: Twin, sample: Sample) -> bool:
+    """Tell whether the time of telemetry leaps by no more than its delay: it was dated anew, and nothing is missing."""
+    leap = _heard(sample) - twin.history.newest
+    return _TICK_S < leap < twin.delay.now + _TICK_S and isfinite(twin.data_t)
+
+
+def _take_other(twin: Twin, message: Message) -> None:
+    """Take a message that carries the gateway's clock, dated as telemetry is."""
+    at, newest = _heard(message), twin.history.newest
+    if isfinite(at):
+        delay = _delay(twin, message)
+        if isinstance(message, Status) and isfinite(newest):
+            twin.delay.take_status(at, newest)
+        at -= delay
+        message = replace(message, t=at) if delay else message
+    hear(twin, message)
+    if isfinite(twin.data_t):  # after a jump of the clock telemetry leads
+        twin.data_t = max(twin.data_t, at)
+
+
+def _delay(twin: Twin, message: Message) -> float:
+    """Give how far telemetry is behind the clock of a message that is no telemetry [s]."""
+    newest = twin.history.newest
+    if not isinstance(message, Status) or not isfinite(newest) or not isfinite(_heard(message)):
+        return twin.delay.now
+    return twin.delay.of_status(message.t, newest)
 
 
 def _turn(twin: Twin, now: float) -> list[Message]:

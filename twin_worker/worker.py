@@ -39,6 +39,7 @@ from twin_worker.twin import Twin, advance, fleet_row
 
 _log = logging.getLogger(__name__)
 _SILENT_S = 1.0  # wall time without news after which data time runs on by the wall clock [s]
+_STALL_S = 1.0  # of silence counted between two sweeps at most: a worker that stood still knows of no silence [s]
 _STATE_S = 1.0  # between fleet tables [s]
 _OTHERS_S = 0.4  # between looks at what others predict [s]
 _SWEEP_S = 0.015  # of telemetry is taken in at once [s]
@@ -198,7 +199,11 @@ class Worker:
     def _watch_time(self) -> None:
         """Let heavy work wait where telemetry does: after a sweep that was late half as much of it is begun."""
         now = time.monotonic()
-        late, self._swept = now - self._swept > self._late, now
+        passed, self._swept = now - self._swept, now
+        late = passed > self._late
+        if _STALL_S < passed < float("inf"):  # what arrived meanwhile is not taken in yet: that is no silence
+            for held in self._held.copy().values():
+                held.arrived = min(held.arrived + passed - _STALL_S, now)
         self.learner.yield_to_telemetry(late)
         if self.claiming.threaded:
             self.quota.yield_to_telemetry(late)

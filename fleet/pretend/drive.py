@@ -15,7 +15,9 @@ from fleet.pretend.uav import PretendUav
 
 TICK_S = 0.01
 EPOCH_US = 1_700_000_000_000_000  # when recordings begin: the same bytes for the same seed [us since 1970]
-_LATE_S = 0.5  # behind real time by this much: say so [s]
+_LATE_S = 0.5  # behind real time by more, simulated time slows down [s]
+_STEP_S = 0.1  # of simulated time between two rounds at most: what is late comes evenly, not in a burst [s]
+_RATIO_S = 5.0  # real time over which the achieved speed is measured before it is told [s]
 
 
 def to_tlog(
@@ -86,6 +88,9 @@ def to_udp(
 ) -> float:
     """Fly in real time, one UDP socket per aircraft, and answer what comes back.
 
+    Where the machine is too slow, simulated time runs slower than real time: every tick is simulated and sent, none is
+    left out, and the achieved speed is told once.
+
     Args:
         uavs: aircraft to fly
         to: host and port of the gateway
@@ -93,33 +98,67 @@ def to_udp(
         loss: share of frames lost, either way
         seed: draws losses and delays
         stop: ends the flight
-        say: where to say that real time is not kept
+        say: where to say that real time is not kept, and what speed is achieved
     Returns:
-        the largest delay behind real time [s]
+        the largest delay of a round behind its due time [s]
     """
     rng = np.random.default_rng((seed, 7))
     links = [Link(np.random.default_rng((seed, 6, uav.uav_id)), loss) for uav in uavs]
     sockets = [_socket(to) for _ in uavs]
-    begun, lost, worst, warned = time.monotonic(), 0.0, 0.0, -60.0
+    pace, worst = _Pace(time.monotonic(), say), 0.0
     try:
         while not stop.is_set():
-            t = time.monotonic() - begun - lost
+            t = pace.next(time.monotonic())
             if seconds is not None and t >= seconds:
                 break
             for uav, link, sock in zip(uavs, links, sockets, strict=True):
                 _serve(uav, link, sock, t, bool(rng.random() < loss))
-            behind = time.monotonic() - begun - lost - t
+            behind = pace.due(time.monotonic()) - t
             worst = max(worst, behind)
-            if behind > _LATE_S:
-                lost += behind  # the world's clock stands still rather than racing after
-                if t - warned > 60:
-                    say(f"fly: found {behind:.2f} s behind real time, expected below {TICK_S} s; fly fewer aircraft")
-                    warned = t
             stop.wait(max(0.0, TICK_S - behind))
     finally:
         for sock in sockets:
             sock.close()
     return worst
+
+
+class _Pace:
+    """Simulated time against real time: the same speed as long as the machine keeps up, else slower.
+
+    Args:
+        begun: real time when simulated time is 0 [s, monotonic]
+        say: where to tell the achieved speed, once
+    """
+
+    def __init__(self, begun: float, say: Callable[[str], None]) -> None:
+        self.t = 0.0  # simulated time [s]
+        self._begun, self._say = begun, say
+        self._slow: tuple[float, float] | None = None  # simulated and real time since which it is slower [s]
+        self._told = False
+
+    def due(self, now: float) -> float:
+        """Give the simulated time that is due at `now` [s, monotonic]."""
+        return now - self._begun
+
+    def next(self, now: float) -> float:
+        """Give the simulated time to go on to at `now` [s, monotonic]."""
+        late = self.due(now) - self.t - _LATE_S
+        if late > 0:
+            self._begun += late
+            self._measure(now)
+        else:
+            self._slow = None
+        self.t = max(self.t, min(self.due(now), self.t + _STEP_S))
+        return self.t
+
+    def _measure(self, now: float) -> None:
+        t, since = self._slow = self._slow or (self.t, now)
+        if not self._told and now - since >= _RATIO_S:
+            self._told = True
+            ratio = (self.t - t) / (now - since)
+            self._say(
+                f"fly: found {ratio:.2f} times real time, expected 1; simulated time slows down: fly fewer aircraft"
+            )
 
 
 def _socket(to: tuple[str, int]) -> socket.socket:

@@ -41,6 +41,8 @@ def lay(frames: Frames, owner: np.ndarray, crafts: Sequence[Craft], flock: Flock
     judged = flock.judge(Laid(owner[which], frames.arrival[which], raw_s[order], values[order], *codes))
     for k in np.flatnonzero(~np.isnan(judged.jumped)).tolist():
         crafts[k].jumped(float(judged.jumped[k]))
+    for i in np.flatnonzero(judged.advanced).tolist():
+        crafts[owner[which[i]]].reanchored(float(frames.arrival[which[i]]), float(judged.advanced[i]))
     for k in np.flatnonzero(judged.refused).tolist():
         crafts[k].doubted(float(judged.newest[k]), int(judged.refused[k]))
 

@@ -1,7 +1,8 @@
 """Boot time to fleet time: an offset with slow drift, wraps undone, jumps noticed and survived. Compiled.
 
 fleet = boot + offset, and offset = min(arrival - boot) over the last half minute: the message that travelled
-fastest tells the offset best. Source: minimum-delay filter as in NTP (RFC 5905, section 10).
+fastest tells the offset best. Source: minimum-delay filter as in NTP (RFC 5905, section 10). The offset is slewed; a
+clock that falls behind faster than that (a simulator slower than real time, or paused) is re-anchored, forward only.
 """
 
 from math import inf, isnan, nan
@@ -20,6 +21,7 @@ LATELY = 0.01  # weight of the newest delay in the mean
 SLEW = 2e-3  # drift the offset may follow [s/s]
 SLEW_FAST = 0.1  # when the offset is plainly too late [s/s]
 PLAIN_S = 0.25  # what is plainly [s]
+BEHIND_S = 1.0  # minimum delay of a whole window above which the offset is re-anchored instead of slewed [s]
 
 (
     OFFSET,  # fleet time minus own time [s]
@@ -35,8 +37,9 @@ PLAIN_S = 0.25  # what is plainly [s]
     BUCKET,  # arrival at which this bucket began
     DELAY,  # of late, mean: arrival minus fleet time given out [s]
     WORST,  # largest since it was last taken [s]
+    ADVANCE,  # sum of the steps by which the offset was re-anchored forward, because the clock fell behind [s]
     LENGTH,
-) = range(14)
+) = range(15)
 BOOT, USEC, USEC32, NONE = range(4)
 """Where the time of a message comes from: time_boot_ms, time_usec, time_usec cut to 32 bit, nowhere."""
 
@@ -120,7 +123,14 @@ def _follow(clock, delay, arrival, passed):
     if arrival - clock[BUCKET] > BUCKET_S:
         clock[LEAST_BEFORE], clock[LEAST], clock[BUCKET] = clock[LEAST], delay, arrival
     clock[LEAST] = min(clock[LEAST], delay)
-    error = min(clock[LEAST], clock[LEAST_BEFORE]) - clock[OFFSET]
+    least = min(clock[LEAST], clock[LEAST_BEFORE])
+    error = least - clock[OFFSET]
+    if error > BEHIND_S:
+        anchor = max(least, delay - BEHIND_S)  # the least may be half a minute old, the newest may be an unlucky one
+        clock[ADVANCE] += anchor - clock[OFFSET]
+        clock[OFFSET], clock[LEAST], clock[LEAST_BEFORE] = anchor, delay, delay
+        clock[ANCHORED] = clock[BUCKET] = arrival
+        return
     if arrival - clock[ANCHORED] < WARM_UP_S:
         clock[OFFSET] += min(error, 0.0)
         return

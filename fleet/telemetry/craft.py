@@ -46,7 +46,7 @@ class Craft:
         self._done = 0  # of those waiting
         self._refused = 0
         self._sentence, self._said = "", float("-inf")
-        self._jumps = 0
+        self._jumps, self._advance_s = 0, 0.0
         self._told: tuple[Any, ...] = ()
         self._told_at = float("-inf")
 
@@ -64,6 +64,10 @@ class Craft:
     def jumped(self, arrival: float) -> None:
         """Take note that the aircraft's clock jumped."""
         self.queue(arrival, self._jump, clock.jumps(self.flock.clocks[self.number]))
+
+    def reanchored(self, arrival: float, step_s: float) -> None:
+        """Take note that telemetry times were moved forward by `step_s`, because they fell behind their arrival."""
+        self.queue(arrival, self._advance, step_s)
 
     def doubted(self, arrival: float, count: int) -> None:
         """Take note that so many rows were refused."""
@@ -158,13 +162,21 @@ class Craft:
         self.route.stale = True  # after a restart there may be another mission on board
         self.say(f"the aircraft's clock jumped ({count} times so far), time was anchored anew", now)
 
+    def _advance(self, step_s: float, now: float) -> None:
+        self._advance_s += step_s
+        self.say(
+            f"telemetry times were {step_s:.1f} s behind their arrival for half a minute and were re-anchored; "
+            "expected real time: a slow or paused simulator falls behind",
+            now,
+        )
+
     def _count_refused(self, count: int, _: float) -> None:
         self._refused += count
 
     def _status(self, now: float) -> Status | None:
         counted = self.flock.counts.state[self.number]
         self.link = Link.LOST if now - counted[SPOKE] > LOST_S else Link.LIVE
-        state = (self.link, self.mode, self.armed)
+        state = (self.link, self.mode, self.armed, self._jumps, self._advance_s)
         passed = now - self._told_at
         if state == self._told and 0 <= passed < STATUS_S:
             return None
@@ -186,6 +198,7 @@ class Craft:
             rejected=self._rejected(),
             **self.timing.told(now),
             clock_jumps=self._jumps,
+            clock_advance_s=self._advance_s,
             sentence=self._words(now),
         )
 

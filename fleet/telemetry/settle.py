@@ -24,7 +24,7 @@ def new_memory() -> np.ndarray:
 
 
 @nb.njit(cache=True, nogil=True)
-def settle(clocks, memory, owner, ticks, raw_s, arrival, field, rank, given, t, fate, jumped):
+def settle(clocks, memory, owner, ticks, raw_s, arrival, field, rank, given, t, fate, jumped, advanced):
     """Judge rows in the order they were heard.
 
     Args:
@@ -37,13 +37,15 @@ def settle(clocks, memory, owner, ticks, raw_s, arrival, field, rank, given, t, 
         t: filled with fleet times, nan while a jump is suspected [s since 1970]
         fate: filled with KEPT, PASSED_OVER or REFUSED
         jumped: arrival of the last row at which a jump of the clock was noticed, by aircraft, (m,) [s since 1970]
+        advanced: filled with the step by which a clock was re-anchored forward at this row, mostly 0, (n,) [s]
     """
     for i in range(len(t)):
         mine, fields = clocks[owner[i]], memory[owner[i]]
-        known = _jumps(mine)
+        known, ahead = _jumps(mine), _advance(mine)
         t[i] = c.tell(mine, ticks[i], raw_s[i], arrival[i])
         if _jumps(mine) != known:
             jumped[owner[i]] = arrival[i]
+        advanced[i] = _advance(mine) - ahead
         if isnan(t[i]):
             fate[i] = REFUSED
         elif given[i] != NO_FIELD and t[i] > fields[given[i], LAST] + YIELD_S:
@@ -55,6 +57,11 @@ def settle(clocks, memory, owner, ticks, raw_s, arrival, field, rank, given, t, 
 @nb.njit(cache=True, nogil=True)
 def _jumps(clocks):
     return max(clocks[c.BOOT, c.JUMPS], clocks[c.USEC, c.JUMPS], clocks[c.USEC32, c.JUMPS])
+
+
+@nb.njit(cache=True, nogil=True)
+def _advance(clocks):
+    return max(clocks[c.BOOT, c.ADVANCE], clocks[c.USEC, c.ADVANCE], clocks[c.USEC32, c.ADVANCE])
 
 
 @nb.njit(cache=True)

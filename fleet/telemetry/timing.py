@@ -34,7 +34,7 @@ class Timing:
         self._clocks = clocks
         self._filter: KalmanFilter | None = None
         self._looked = float("-inf")
-        self._jumps = 0
+        self._steps = 0.0  # jumps, and the sum of what was re-anchored
         self._satellites: float | None = None
         self._trips: deque[float] = deque(maxlen=_TRIPS)
 
@@ -78,8 +78,9 @@ class Timing:
         if 0 <= passed < EVERY_S or np.isnan(boot[c.NEWEST]):
             return
         self._looked = now
-        if self._filter is None or boot[c.JUMPS] != self._jumps or not passed < 10 * EVERY_S:
-            self._jumps, self._satellites = boot[c.JUMPS], None
+        steps = float(boot[c.JUMPS] + boot[c.ADVANCE])
+        if self._filter is None or steps != self._steps or not passed < 10 * EVERY_S:
+            self._steps, self._satellites = steps, None
             self._filter = _anchored(float(boot[c.OFFSET]))
             return
         step = np.array([[1.0, passed], [0.0, 1.0]])

@@ -109,7 +109,10 @@ class Drive:
 
 def _clock_jumps(one: Examined, message: Message) -> bool:
     before = one.twin.status
-    return isinstance(message, Status) and before is not None and message.clock_jumps != before.clock_jumps
+    if not isinstance(message, Status) or before is None:
+        return False
+    now, then = ((status.clock_jumps, status.clock_advance_s) for status in (message, before))
+    return now != then
 
 
 def _answers(one: Examined) -> Iterator[Case]:

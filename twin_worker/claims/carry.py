@@ -20,6 +20,7 @@ from twin_worker.conflict.ledger import Ledger, Open
 from twin_worker.contest import Contest
 from twin_worker.control import Control
 from twin_worker.coupled import Coupled
+from twin_worker.delay import Delay
 from twin_worker.earned import Earned
 from twin_worker.engine.pace import Pace
 from twin_worker.engine.quota import Quota
@@ -76,7 +77,7 @@ _NAMED = (c.State, c.Event, c.AlertKind, Origin)
 _OURS = (
     *(Load, Twin, History, Grid, WindFilter, Record, Ledger, Open, Rotor, Grey, Learnt, Contest, Earned, Mark),
     *(Coupled, Axis, Hybrid, Ridge, Believed, Extension, Ground, Note, Control, Earlier, Book, Levels, Factors),
-    *(Made, Trust, Airframe, ServoMap, Pace),
+    *(Made, Trust, Airframe, ServoMap, Pace, Delay),
 )
 CARRIED: Known = {
     **{one.__name__: one for one in (*_WIRE, *_NAMED, *_OURS) if one is not Book},

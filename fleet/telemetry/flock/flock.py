@@ -33,6 +33,7 @@ class Judged(NamedTuple):
     jumped: np.ndarray  # arrival at the last jump of the clock; nan: none, (m,) [s since 1970]
     refused: np.ndarray  # rows refused, (m,)
     newest: np.ndarray  # arrival of the last row, (m,) [s since 1970]
+    advanced: np.ndarray  # by row: step by which the clock was re-anchored forward there, mostly 0, (n,) [s]
 
 
 class Flock:
@@ -61,14 +62,15 @@ class Flock:
         """Give rows their time, put them in order, leave out the late, the repeated and the second best."""
         n, many = len(laid.owner), len(self.clocks)
         t, fate, jumped = np.empty(n), np.empty(n, np.int8), np.full(many, np.nan)
+        advanced = np.empty(n)
         order = (laid.owner, laid.tick, laid.raw_s, laid.arrival, laid.field, laid.rank, laid.given)
-        settle(self.clocks, self._memory, *order, t, fate, jumped)
+        settle(self.clocks, self._memory, *order, t, fate, jumped, advanced)
         kept = np.flatnonzero(fate == KEPT)
         key = laid.owner[kept] * len(FIELDS) + laid.field[kept]
         self.shelves.lay(key, laid.arrival[kept], t[kept], laid.values[kept])
         newest = np.full(many, np.nan)
         newest[laid.owner] = laid.arrival
-        return Judged(jumped, np.bincount(laid.owner[fate == REFUSED], minlength=many), newest)
+        return Judged(jumped, np.bincount(laid.owner[fate == REFUSED], minlength=many), newest, advanced)
 
     def lay(self, number: int, field: str, t: np.ndarray, x: np.ndarray) -> None:
         """Add rows of one kind that have their time already.
