@@ -27,6 +27,7 @@ from twin_worker.claims.protocol import Claiming
 from twin_worker.conflict.ledger import Ledger
 from twin_worker.conflict.separation import Separation
 from twin_worker.conflict.traffic import Traffic
+from twin_worker.engine.beside import Beside
 from twin_worker.engine.learner import Learner
 from twin_worker.engine.pace import Pace, Work
 from twin_worker.engine.quota import Quota
@@ -35,12 +36,13 @@ from twin_worker.engine.stand_in import said_already, stand_in
 from twin_worker.memory import AUTO
 from twin_worker.mismatch.live import Live
 from twin_worker.mismatch.told import word
-from twin_worker.twin import Twin, advance, fleet_row
+from twin_worker.twin import Twin, advance, catch_up, fleet_row
 
 _log = logging.getLogger(__name__)
 _SILENT_S = 1.0  # wall time without news after which data time runs on by the wall clock [s]
 _STATE_S = 1.0  # between fleet tables [s]
 _OTHERS_S = 0.4  # between looks at what others predict [s]
+_OTHERS = 0.1  # of the CPU time of this process that such a look may take [-]
 _SWEEP_S = 0.015  # of telemetry is taken in at once [s]
 _LATE_S = 0.12, 0.2  # between sweeps, from which telemetry counts as late: least and most [s]
 _LATE, _HEAVY = 1.2, 0.25  # that in periods of renewal; what heavy work may take of it, CPU [-]
@@ -70,11 +72,13 @@ class Worker:
         self.quota = Quota(most=_HEAVY * self._late)
         self.sentence = ""
         self.rates = Rates()
-        self.learner = Learner(self._whole, self._publish, self.rates)
+        self.beside = Beside()
+        self.learner = Learner(self._whole, self._publish, self.rates, self.beside)
         self._swept = float("-inf")  # when the last sweep began [s, monotonic]
         self._first = 0  # whose turn is the first of the next sweep
         self.traffic = Traffic(separation or Separation())
         self._twins = Twins(bus, uavs, self._make, self)
+        self._twins.paced = self.beside.do
         self._held = self._twins.held
         self.claiming = Claiming(bus, uavs, self._twins)
         self._news = threading.Event()
@@ -196,10 +200,10 @@ class Worker:
         return [*new, *(held for held in found if held not in new)]
 
     def _watch_time(self) -> None:
-        """Let heavy work wait where telemetry does: after a sweep that was late half as much of it is begun."""
+        """Let heavy work wait where telemetry does: a sweep that was late leaves it a share of the CPU time."""
         now = time.monotonic()
         late, self._swept = now - self._swept > self._late, now
-        self.learner.yield_to_telemetry(late)
+        self.beside.yield_to_telemetry(late)
         if self.claiming.threaded:
             self.quota.yield_to_telemetry(late)
         for work in (Work.PREDICT, Work.ENSEMBLE):
@@ -258,16 +262,18 @@ class Worker:
             hand.join(_END_S)
 
     def _turn_while(self, condition: Callable[[], bool]) -> None:
-        due, listen, pause = 0.0, 0.0, threading.Event()
+        due, listen, enough, pause = 0.0, 0.0, 0.0, threading.Event()
         while condition():
             self._news.wait(timeout=0.1)
             pause.wait(_SWEEP_S)
             self._news.clear()
             self.claiming.tick()
             self.turn()
-            if time.monotonic() >= listen:
-                listen = time.monotonic() + _OTHERS_S
+            if time.monotonic() >= listen and time.process_time() >= enough:
+                begun = time.thread_time()
                 self.bus.hand_out((Prediction,))
+                listen = time.monotonic() + _OTHERS_S
+                enough = time.process_time() + (time.thread_time() - begun) * (1.0 / _OTHERS - 1.0)
             if time.monotonic() >= due:
                 due = time.monotonic() + _STATE_S
                 self.bus.publish(self.state())
@@ -281,8 +287,19 @@ def data_time(held: Held) -> float:
 
 
 def _advance_all(held: Held, waiting: int, traffic: Traffic) -> Iterator[Message]:
-    """Turn the loop after every message, as offline; the wall clock turns it on where data have fallen silent."""
+    """Turn the loop after every message, as offline; the wall clock turns it on where data have fallen silent.
+
+    Where the quota has a limit, what has waited is taken in at once: a late worker would otherwise never catch up.
+    """
     twin = held.twin
+    if twin.quota is not None and twin.quota.limited and waiting > 1:
+        with held.lock:
+            if not held.ready:
+                return
+            twin.quota.behind = True
+            results = catch_up(twin, [held.inbox.popleft() for _ in range(waiting - 1)])
+        yield from traffic.after(twin.uav, twin.turned_t, results)
+        waiting = 1
     for left in reversed(range(waiting)):
         with held.lock:
             if not held.ready:  # handed over meanwhile, with what still waits
