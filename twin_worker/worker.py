@@ -32,7 +32,7 @@ from twin_worker.engine.learner import Learner
 from twin_worker.engine.pace import Pace, Work
 from twin_worker.engine.quota import Quota
 from twin_worker.engine.rates import Rates
-from twin_worker.engine.stand_in import said_already, stand_in
+from twin_worker.engine.stand_in import LOOK_S, said_already, stand_in, stand_in_for
 from twin_worker.memory import AUTO
 from twin_worker.mismatch.live import Live
 from twin_worker.mismatch.told import word
@@ -214,7 +214,8 @@ class Worker:
         """Publish under the claim in force; what is held no longer, or not surely, is kept back."""
         if held.ready and self.claiming.may_write():
             self.bus.publish(result, Stamp(held.epoch, self.bus.writer))
-            held.written = held.written or isinstance(result, Prediction)
+            if isinstance(result, Prediction):
+                held.written, held.published = True, time.monotonic()
 
     def _diagnose(self) -> None:
         """Let the diagnosis go on in the background, and publish what it found."""
@@ -251,7 +252,8 @@ class Worker:
         """Join, turn until told to stop, publishing the fleet table once a second; then hand everything over."""
         self.claiming.threaded, self.quota.aside = True, frozenset({Work.IDENTIFY})
         self.listen()
-        hands = [threading.Thread(target=each.run, args=(stop,), daemon=True) for each in (self.claiming, self.learner)]
+        each = (self.claiming.run, self.learner.run, self._stand_in)
+        hands = [threading.Thread(target=run, args=(stop,), daemon=True) for run in each]
         for hand in hands:
             hand.start()
         self._turn_while(lambda: not stop.is_set())
@@ -260,6 +262,16 @@ class Worker:
         self._turn_while(heirs.is_alive)  # each is written for until its own turn to go comes
         for hand in (*hands, heirs):
             hand.join(_END_S)
+
+    def _stand_in(self, stop: threading.Event) -> None:
+        """Look after aircraft whose twins are late, on a thread of its own: it waits for no other work."""
+        while not stop.wait(LOOK_S):
+            try:
+                stand_in_for(self.holding(), self._publish)
+            except ConnectionError:  # the session is closed: we are leaving
+                return
+            except Exception:  # a defect met once must not end the renewals
+                _log.exception("renewing late predictions met a defect; report it")
 
     def _turn_while(self, condition: Callable[[], bool]) -> None:
         due, listen, enough, pause = 0.0, 0.0, 0.0, threading.Event()

@@ -71,6 +71,7 @@ class Claims:
         self._silence: dict[str, float] = {}  # of each peer [s]
         self._settled = float("-inf")
         self._ticked = float("nan")
+        self._weighed: tuple[object, dict[int, str]] = ((), {})  # owners of what is missing, and for whom and what
 
     # --- what is heard -----------------------------------------------------------------------------------------------
 
@@ -148,8 +149,10 @@ class Claims:
             return plan
         plan.sure = True
         plan.take += [uav for uav, epoch in self.held.items() if self._outdone(uav, epoch)]
-        missing = self.known - self.held.keys()
-        for uav, who in owners(sorted(missing), self._candidates()).items():
+        asked = self.known - self.held.keys(), self._candidates()
+        if asked != self._weighed[0]:  # as it seldom is
+            self._weighed = asked, owners(sorted(asked[0]), asked[1])
+        for uav, who in self._weighed[1].items():
             if who != self.me:
                 continue
             holder = self._holder(uav)

@@ -37,6 +37,7 @@ class Held:
     arrived: float = float("nan")  # wall time of the newest sample [s, monotonic]
     placed: Rows | None = None  # positions heard last
     stood: float = float("-inf")  # data time of what was said without the twin, here or elsewhere [s since 1970]
+    published: float = float("-inf")  # when a prediction was, last [s, monotonic]
     shed: int = 0
     failed: str = ""  # what went wrong last, a defect of ours
     lock: threading.Lock = field(default_factory=threading.Lock)  # held while the twin changes, or is copied
