@@ -177,18 +177,35 @@ def test_who_is_leaving_owns_nothing_but_is_still_asked() -> None:
     assert one.plan(0.0) == Plan()
 
 
-def test_who_says_nothing_while_others_speak_passes_for_dead_until_it_speaks() -> None:
+def test_who_says_nothing_for_seconds_while_others_speak_passes_for_dead_until_it_speaks() -> None:
     one = claims(peers=("a",))
     one.heard("a", dict.fromkeys(range(4), WALL))
     one.tick(0.0, True)
     one.heard("a", {})
-    for now in np.arange(0.1, 2.0, 0.1):
+    for now in np.arange(0.1, SILENT_S + 1.0, 0.1):
         one.hears = True
         one.tick(now, True)
         assert now > SILENT_S or not one.plan(now).take
-    assert one.plan(1.9) == Plan(take=list(range(4))) and not one.heirs()
+    assert one.plan(now).take == list(range(4)) and not one.heirs()
     one.heard("a", {})
-    assert one.lives("a") and not set(one.plan(1.9).take) & set(owned_by("a", one.heirs()))
+    assert one.lives("a") and not set(one.plan(now).take) & set(owned_by("a", one.heirs()))
+
+
+def test_who_is_late_but_has_its_token_is_not_replaced_until_the_token_goes() -> None:
+    """A process at a tenth of a core announces every second or two; its session's keep-alives come all the same."""
+    one = claims(peers=("a",), known=IDS)
+    one.heard("a", dict.fromkeys(IDS, WALL))
+    rng = np.random.default_rng(3)
+    word = 0.0
+    for now in np.arange(0.1, 60.0, 0.1):
+        one.hears = True  # others, and telemetry
+        if now >= word:
+            one.heard("a", dict.fromkeys(IDS, WALL))
+            word = now + rng.uniform(0.5, 3.0)
+        one.tick(now, True)
+        assert not one.plan(now).take
+    one.vanished("a", 1)
+    assert one.plan(now).take == list(IDS)
 
 
 def test_where_nothing_at_all_is_heard_nobody_passes_for_dead() -> None:

@@ -5,6 +5,7 @@ import copy
 import os
 import sys
 import threading
+import time
 
 import flights as f
 import msgspec
@@ -14,17 +15,19 @@ import pytest
 from fleet.contract import Array, Prediction, Sample
 from fleet.frames import to_geodetic
 from fleet.memory_bus import MemoryBus
+from twin_worker import twin as loop
 from twin_worker.__main__ import BEHIND, _get_ready
 from twin_worker.engine import quota as clocked
-from twin_worker.engine.learner import Learner
+from twin_worker.engine.beside import LEAST, Beside
 from twin_worker.engine.pace import Pace, Work, read_pace
-from twin_worker.engine.quota import LEAST_S, SWEEP_S, Quota
+from twin_worker.engine.quota import EARNED, LEAST_S, SWEEP_S, Quota
 from twin_worker.engine.rates import OVER_S, Rates
+from twin_worker.engine.stand_in import said_already, stand_in_for
 from twin_worker.horizon import AHEAD
 from twin_worker.predict import LEAST_AHEAD_S
-from twin_worker.renew import LATEST_S, renew
+from twin_worker.renew import LATEST_S, OVERDUE_S, renew
 from twin_worker.twin import Twin, advance
-from twin_worker.worker import Worker
+from twin_worker.worker import Held, Worker, _advance_all
 
 
 def test_a_pace_is_read_and_refused_in_a_sentence() -> None:
@@ -81,22 +84,121 @@ def test_what_is_old_already_is_not_foreseen_where_telemetry_waits(clock: list[f
     assert limited.grants(Work.RENEW) and not limited.grants(Work.PREDICT)
 
 
-def test_heavy_work_yields_to_late_telemetry_by_halves_and_comes_back() -> None:
+def test_heavy_work_earns_a_share_of_the_cpu_time_while_telemetry_is_late_and_comes_back(clock: list[float]) -> None:
     quota, limits = Quota(), []
-    for late in (False, True, True, *[True] * 20, *[False] * 40):
+    for late, used in ((False, 0.0), (True, 0.02), (True, 0.01), (True, 0.0), (True, 9.0), *[(False, 0.01)] * 40):
+        clock[0] += used
         quota.yield_to_telemetry(late)
         limits.append(quota.limit)
-    assert limits[:3] == [SWEEP_S, SWEEP_S / 2, SWEEP_S / 4] and limits[22] == LEAST_S and limits[-1] == SWEEP_S
+    assert limits[:5] == pytest.approx([SWEEP_S, EARNED * 0.02, EARNED * 0.01, LEAST_S, SWEEP_S])
+    assert limits[-1] == SWEEP_S
 
 
-def test_identification_yields_to_late_telemetry_and_never_starves() -> None:
-    learner = Learner(list, lambda *_: None, Rates())
-    assert learner.rest(0.2) == 0.0
-    learner.yield_to_telemetry(late=True)
-    assert learner.rest(0.2) == pytest.approx(0.2)
-    for _ in range(1000):
-        learner.yield_to_telemetry(late=True)
-    assert 0.2 < learner.rest(0.05) < 0.5 and learner.rest(5.0) <= 1.0
+@pytest.mark.parametrize("piece_s", [0.002, 0.007, 0.03])
+def test_heavy_work_falls_in_proportion_to_the_cpu_time_that_is_granted(clock: list[float], piece_s: float) -> None:
+    """A tenth of a core makes every sweep late by the wall clock, whatever is done in it."""
+
+    def done_per_cpu_s(granted: float, late_s: float = 0.12, telemetry_s: float = 0.008) -> float:
+        quota, pieces, swept, begun = Quota(limit=SWEEP_S), 0, clock[0], clock[0]
+        while clock[0] < begun + 20.0:
+            late, swept = (clock[0] - swept) / granted > late_s, clock[0]
+            quota.yield_to_telemetry(late)
+            quota.sweep()
+            clock[0] += telemetry_s
+            while quota.grants(Work.PREDICT):
+                clock[0] += piece_s
+                pieces += 1
+        return pieces * piece_s / (clock[0] - begun)
+
+    usual, starved = done_per_cpu_s(1.0), done_per_cpu_s(0.1)
+    assert usual > 0.7 and 0.4 < starved < 0.8
+
+
+def test_what_one_piece_of_work_took_too_much_is_missing_in_the_next_sweeps(clock: list[float]) -> None:
+    quota, granted = Quota(limit=2.0**-7), []
+    for _ in range(12):
+        quota.sweep()
+        granted.append(quota.grants(Work.PREDICT))
+        clock[0] += 2.0**-5 if granted[-1] else 0.0
+        quota.settle()
+    assert granted == [True, False, False, False] * 3
+
+
+def test_work_beside_the_sweep_rests_until_the_others_had_their_cpu_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = dict.fromkeys(("wall", "mine", "all"), 0.0)
+    names = {"monotonic": "wall", "thread_time": "mine", "process_time": "all"}
+    for name, clock in names.items():
+        monkeypatch.setattr(f"twin_worker.engine.beside.time.{name}", lambda clock=clock: now[clock])
+    beside, granted = Beside(), 0.0
+
+    class Stop:
+        def wait(self, seconds: float) -> bool:
+            now["wall"] += seconds
+            now["all"] += granted * seconds
+            return False
+
+    def work() -> None:
+        now["mine"] += 0.2
+        now["all"] += 0.2
+        now["wall"] += 2.0
+
+    def rested() -> float:
+        before = now["wall"]
+        beside.do(work, Stop())  # type: ignore[arg-type]
+        return now["wall"] - before - 2.0
+
+    assert rested() == 0.0
+    for _ in range(9):
+        beside.yield_to_telemetry(late=True)
+    assert beside.share == LEAST
+    granted = 0.1
+    share = 1.2 * LEAST
+    assert rested() == pytest.approx(0.2 * (1 / share - 1) / granted, abs=0.06), "CPU time of the others"
+    granted = 0.0
+    assert rested() == pytest.approx(2.0 * (1 / (1.2 * share) - 1), abs=0.06), "idle, they do not want any"
+
+
+def test_a_flight_ahead_that_waits_for_cpu_time_is_replaced_by_renewals(
+    heard: tuple, twin: Twin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    twin.pace, twin.quota = Pace(predict=1.0, identify=1000.0), Quota(limit=1.0)
+    twin.identify_t = twin.data_t
+    monkeypatch.setattr(twin.quota, "grants", lambda work: work is Work.RENEW)
+    twin.base, begun = twin.prediction, twin.prediction.t
+    rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 40.0], 40.0, 1e9)
+    made = [m for message in rest for m in advance(twin, (message,)) if isinstance(m, Prediction)]
+    times = [begun, *(one.t for one in made)]
+    assert max(np.diff(times)) < 1.5 and times[-1] > begun + 35.0 and twin.base.t == begun
+
+
+def test_what_has_waited_is_taken_in_at_once_and_the_loop_turns_once_a_second(
+    heard: tuple, twin: Twin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    turned: list[float] = []
+    monkeypatch.setattr(loop, "_turn", lambda twin, now: turned.append(now) or setattr(twin, "turned_t", now) or [])
+    rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 12.0], 12.0, 1e9)
+    worker = Worker(MemoryBus(), range(4), omega=0.0)
+    worker.quota.limit, twin.quota = 0.05, worker.quota
+    held = Held(twin, 1)
+    held.inbox.extend(rest)
+    list(_advance_all(held, len(rest), worker.traffic))
+    assert not held.inbox and twin.history.newest == pytest.approx(rest[-1].t, abs=0.2)
+    assert 10 <= len(turned) <= 15 < len(rest) and max(np.diff(turned)) < 1.3
+
+
+def test_who_is_not_reached_in_time_is_renewed_from_the_position_received_last(heard: tuple, twin: Twin) -> None:
+    twin.base, told = twin.prediction, []
+    held = Held(twin, 1)
+    for message in f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 31.0], 31.0, 1e9):
+        held.placed = message.position or held.placed
+        held.published = time.monotonic() - (2.0 if message.t > twin.prediction.t + 30.0 else 0.0)
+        stand_in_for([held], lambda made, _: told.append(made))
+    times = np.array([made.t for made in told])
+    assert len(times) and times[0] > twin.prediction.t + 29.5 and (np.diff(times) > 0.8).all()
+    late = msgspec.structs.replace(twin.prediction, t=times[0] - 20.0)
+    assert said_already(late, held) and not said_already(msgspec.structs.replace(late, t=times[-1] + 1.0), held)
+    held.placed = f.rows([times[0] - 25.0], [[0.0, 0.0, 0.0]])
+    assert not said_already(late, held), "the clock was set back"
 
 
 def test_what_is_shed_is_said() -> None:
@@ -147,6 +249,11 @@ def test_nothing_is_renewed_that_is_old_void_or_lost(twin: Twin) -> None:
             setattr(odd, name, value)
         assert renew(odd) == []
     on(twin, LATEST_S + 0.5, np.zeros(3))
+    assert renew(twin), "the next is due and waits"
+    twin.predict_t = twin.base.t + LATEST_S
+    assert renew(twin) == []
+    twin.predict_t = twin.base.t
+    on(twin, OVERDUE_S + 0.5, np.zeros(3))
     assert renew(twin) == []
     short = copy.deepcopy(fresh)
     few = {name: Array.of(getattr(short.base, name).numpy()[:2]) for name in ("ahead", "path", "tube")}

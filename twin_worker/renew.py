@@ -11,6 +11,7 @@ from fleet.physics.kernel import kernel
 from twin_worker.memory import Twin
 
 LATEST_S = 10.0  # after a flight ahead it is renewed no longer [s]
+OVERDUE_S = 60.0  # the same where the next is due and has to wait for CPU time: better than nothing [s]
 _BACK_S = 10.0  # in which an aircraft is back on the path that was foreseen [s]
 
 
@@ -53,7 +54,14 @@ def renew(twin: Twin) -> list[Message]:
 def renewable(twin: Twin, t: float) -> bool:
     """Tell whether there is a path to renew at `t`: flown while telemetry came, and not long before."""
     base = twin.base
-    return base is not None and not (twin.lost or twin.broken or base.coast_s) and t < base.t + LATEST_S
+    if base is None or twin.lost or twin.broken or base.coast_s:
+        return False
+    return t < base.t + (OVERDUE_S if overdue(twin, t) else LATEST_S)
+
+
+def overdue(twin: Twin, t: float) -> bool:
+    """Tell whether at `t` the next flight ahead is due, but was not made: it waits for CPU time."""
+    return t >= twin.predict_t + twin.pace.predict
 
 
 def renewed(twin: Twin, t: float, position: np.ndarray) -> Prediction | None:

@@ -20,7 +20,7 @@ from twin_worker.kinds import command_in_force
 from twin_worker.learn import learn
 from twin_worker.memory import Twin, hear
 from twin_worker.mismatch.marks import EVERY_S, mark
-from twin_worker.renew import renew, renewable
+from twin_worker.renew import overdue, renew, renewable
 
 LOST_S = 3.0  # without a sample: link lost [s]
 _TICK_S = 1.0  # between turns while data are silent, between scorings, and of tries to foresee [s]
@@ -57,6 +57,26 @@ def advance(twin: Twin, messages: Iterable[Message], now: float = -np.inf) -> li
             _take_other(twin, message)
         results += _turn(twin, twin.data_t)
     return results + _turn(twin, now) if now > twin.data_t else results
+
+
+def catch_up(twin: Twin, messages: Iterable[Message]) -> list[Message]:
+    """Take what has waited, and turn the loop once a second of data time instead of after every message.
+
+    Args:
+        twin: the aircraft's twin, changed in place
+        messages: as of `advance`, which takes the newest one
+    Returns:
+        Model, Prediction and Alert messages to publish
+    """
+    results: list[Message] = []
+    for message in messages:
+        if not _heard(message) < twin.turned_t + _TICK_S:
+            results += advance(twin, (message,))
+            continue
+        hear(twin, message)
+        if isinstance(message, Sample) or np.isfinite(twin.data_t):
+            twin.data_t = max(twin.data_t, _heard(message))
+    return results
 
 
 def silence(twin: Twin, message: Message) -> Iterator[float]:
@@ -144,7 +164,7 @@ def _turn(twin: Twin, now: float) -> list[Message]:
             _again(twin, now)
         twin.base = new or twin.base  # which is not renewed for ever
         results += [*made, *watch(twin, now, new)]
-    elif _due(now, twin.renew_t, SOON * pace.renew) and twin.may(Work.RENEW):
+    elif _due(now, twin.renew_t, SOON * _renew_s(twin, now)) and twin.may(Work.RENEW):
         twin.renew_t = now
         results += renew(twin)
         if not twin.lost and not renewable(twin, twin.history.newest):
@@ -152,6 +172,12 @@ def _turn(twin: Twin, now: float) -> list[Message]:
     if twin.put_off is not None and not twin.lost and twin.may(Work.ENSEMBLE):
         fly_put_off(twin, LOOK_BACK_S)
     return results
+
+
+def _renew_s(twin: Twin, now: float) -> float:
+    """Give the period of renewals [s]; a flight ahead that has to wait for CPU time is replaced by them."""
+    pace = twin.pace
+    return min(pace.renew, max(pace.predict, _TICK_S)) if overdue(twin, now) else pace.renew
 
 
 def _again(twin: Twin, now: float) -> None:

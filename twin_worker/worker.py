@@ -27,21 +27,23 @@ from twin_worker.claims.protocol import Claiming
 from twin_worker.conflict.ledger import Ledger
 from twin_worker.conflict.separation import Separation
 from twin_worker.conflict.traffic import Traffic
+from twin_worker.engine.beside import Beside
 from twin_worker.engine.learner import Learner
 from twin_worker.engine.pace import Pace, Work
 from twin_worker.engine.quota import Quota
 from twin_worker.engine.rates import Rates
-from twin_worker.engine.stand_in import said_already, stand_in
+from twin_worker.engine.stand_in import LOOK_S, said_already, stand_in, stand_in_for
 from twin_worker.memory import AUTO
 from twin_worker.mismatch.live import Live
 from twin_worker.mismatch.told import word
-from twin_worker.twin import Twin, advance, fleet_row
+from twin_worker.twin import Twin, advance, catch_up, fleet_row
 
 _log = logging.getLogger(__name__)
 _SILENT_S = 1.0  # wall time without news after which data time runs on by the wall clock [s]
 _STALL_S = 1.0  # of silence counted between two sweeps at most: a worker that stood still knows of no silence [s]
 _STATE_S = 1.0  # between fleet tables [s]
 _OTHERS_S = 0.4  # between looks at what others predict [s]
+_OTHERS = 0.1  # of the CPU time of this process that such a look may take [-]
 _SWEEP_S = 0.015  # of telemetry is taken in at once [s]
 _LATE_S = 0.12, 0.2  # between sweeps, from which telemetry counts as late: least and most [s]
 _LATE, _HEAVY = 1.2, 0.25  # that in periods of renewal; what heavy work may take of it, CPU [-]
@@ -71,11 +73,13 @@ class Worker:
         self.quota = Quota(most=_HEAVY * self._late)
         self.sentence = ""
         self.rates = Rates()
-        self.learner = Learner(self._whole, self._publish, self.rates)
+        self.beside = Beside()
+        self.learner = Learner(self._whole, self._publish, self.rates, self.beside)
         self._swept = float("-inf")  # when the last sweep began [s, monotonic]
         self._first = 0  # whose turn is the first of the next sweep
         self.traffic = Traffic(separation or Separation())
         self._twins = Twins(bus, uavs, self._make, self)
+        self._twins.paced = self.beside.do
         self._held = self._twins.held
         self.claiming = Claiming(bus, uavs, self._twins)
         self._news = threading.Event()
@@ -197,14 +201,14 @@ class Worker:
         return [*new, *(held for held in found if held not in new)]
 
     def _watch_time(self) -> None:
-        """Let heavy work wait where telemetry does: after a sweep that was late half as much of it is begun."""
+        """Let heavy work wait where telemetry does: a sweep that was late leaves it a share of the CPU time."""
         now = time.monotonic()
         passed, self._swept = now - self._swept, now
         late = passed > self._late
         if _STALL_S < passed < float("inf"):  # what arrived meanwhile is not taken in yet: that is no silence
             for held in self._held.copy().values():
                 held.arrived = min(held.arrived + passed - _STALL_S, now)
-        self.learner.yield_to_telemetry(late)
+        self.beside.yield_to_telemetry(late)
         if self.claiming.threaded:
             self.quota.yield_to_telemetry(late)
         for work in (Work.PREDICT, Work.ENSEMBLE):
@@ -215,7 +219,8 @@ class Worker:
         """Publish under the claim in force; what is held no longer, or not surely, is kept back."""
         if held.ready and self.claiming.may_write():
             self.bus.publish(result, Stamp(held.epoch, self.bus.writer))
-            held.written = held.written or isinstance(result, Prediction)
+            if isinstance(result, Prediction):
+                held.written, held.published = True, time.monotonic()
 
     def _diagnose(self) -> None:
         """Let the diagnosis go on in the background, and publish what it found."""
@@ -252,7 +257,8 @@ class Worker:
         """Join, turn until told to stop, publishing the fleet table once a second; then hand everything over."""
         self.claiming.threaded, self.quota.aside = True, frozenset({Work.IDENTIFY})
         self.listen()
-        hands = [threading.Thread(target=each.run, args=(stop,), daemon=True) for each in (self.claiming, self.learner)]
+        each = (self.claiming.run, self.learner.run, self._stand_in)
+        hands = [threading.Thread(target=run, args=(stop,), daemon=True) for run in each]
         for hand in hands:
             hand.start()
         self._turn_while(lambda: not stop.is_set())
@@ -262,17 +268,29 @@ class Worker:
         for hand in (*hands, heirs):
             hand.join(_END_S)
 
+    def _stand_in(self, stop: threading.Event) -> None:
+        """Look after aircraft whose twins are late, on a thread of its own: it waits for no other work."""
+        while not stop.wait(LOOK_S):
+            try:
+                stand_in_for(self.holding(), self._publish)
+            except ConnectionError:  # the session is closed: we are leaving
+                return
+            except Exception:  # a defect met once must not end the renewals
+                _log.exception("renewing late predictions met a defect; report it")
+
     def _turn_while(self, condition: Callable[[], bool]) -> None:
-        due, listen, pause = 0.0, 0.0, threading.Event()
+        due, listen, enough, pause = 0.0, 0.0, 0.0, threading.Event()
         while condition():
             self._news.wait(timeout=0.1)
             pause.wait(_SWEEP_S)
             self._news.clear()
             self.claiming.tick()
             self.turn()
-            if time.monotonic() >= listen:
-                listen = time.monotonic() + _OTHERS_S
+            if time.monotonic() >= listen and time.process_time() >= enough:
+                begun = time.thread_time()
                 self.bus.hand_out((Prediction,))
+                listen = time.monotonic() + _OTHERS_S
+                enough = time.process_time() + (time.thread_time() - begun) * (1.0 / _OTHERS - 1.0)
             if time.monotonic() >= due:
                 due = time.monotonic() + _STATE_S
                 self.bus.publish(self.state())
@@ -286,8 +304,19 @@ def data_time(held: Held) -> float:
 
 
 def _advance_all(held: Held, waiting: int, traffic: Traffic) -> Iterator[Message]:
-    """Turn the loop after every message, as offline; the wall clock turns it on where data have fallen silent."""
+    """Turn the loop after every message, as offline; the wall clock turns it on where data have fallen silent.
+
+    Where the quota has a limit, what has waited is taken in at once: a late worker would otherwise never catch up.
+    """
     twin = held.twin
+    if twin.quota is not None and twin.quota.limited and waiting > 1:
+        with held.lock:
+            if not held.ready:
+                return
+            twin.quota.behind = True
+            results = catch_up(twin, [held.inbox.popleft() for _ in range(waiting - 1)])
+        yield from traffic.after(twin.uav, twin.turned_t, results)
+        waiting = 1
     for left in reversed(range(waiting)):
         with held.lock:
             if not held.ready:  # handed over meanwhile, with what still waits

@@ -3,8 +3,10 @@
 A worker knows the others by their liveliness tokens and what they hold by their announcements. An aircraft belongs to
 its `owner`. The owner asks a live holder for a copy of its twin, and takes what nobody live holds. Every taking raises
 the aircraft's epoch; of two writers the higher `Rank` is believed, by readers and by both: who held it before goes on
-writing until it hears of the higher claim, so that nobody waits. Who has a token and says nothing passes for dead, too:
-a frozen process keeps its token for longer than a lease.
+writing until it hears of the higher claim, so that nobody waits. Who has a token lives, however late its words come: the router
+takes the token of a process that is frozen or cut off after a lease, and a process that is given little CPU time keeps
+it, since the keep-alives of its session need next to none. Who has a token and says nothing for seconds while others do
+passes for dead, too: its session lives, but nobody speaks there.
 
     unsure    after a pause, and with no router in sight: writes nothing and claims nothing until it has asked the
               others what they hold
@@ -20,7 +22,7 @@ from twin_worker.claims.owner import owners
 
 PAUSE_S = 0.8  # a worker that stood still for longer may have been replaced [s]
 SETTLE_S = 2.5  # after the router came back, before anything is claimed: on a busy machine tokens come late [s]
-SILENT_S = 0.9  # without a word of a worker, while others are heard; longer than `PAUSE_S`, so that it knows, too [s]
+SILENT_S = 5.0  # without a word of a worker whose token stands, while others are heard: longer than any lateness [s]
 _STEP_S = 0.3  # of silence counted between two ticks at most: what was late itself hears no silence [s]
 
 
@@ -69,6 +71,7 @@ class Claims:
         self._silence: dict[str, float] = {}  # of each peer [s]
         self._settled = float("-inf")
         self._ticked = float("nan")
+        self._weighed: tuple[object, dict[int, str]] = ((), {})  # owners of what is missing, and for whom and what
 
     # --- what is heard -----------------------------------------------------------------------------------------------
 
@@ -146,8 +149,10 @@ class Claims:
             return plan
         plan.sure = True
         plan.take += [uav for uav, epoch in self.held.items() if self._outdone(uav, epoch)]
-        missing = self.known - self.held.keys()
-        for uav, who in owners(sorted(missing), self._candidates()).items():
+        asked = self.known - self.held.keys(), self._candidates()
+        if asked != self._weighed[0]:  # as it seldom is
+            self._weighed = asked, owners(sorted(asked[0]), asked[1])
+        for uav, who in self._weighed[1].items():
             if who != self.me:
                 continue
             holder = self._holder(uav)

@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from math import isfinite
 from typing import Protocol
 
@@ -36,6 +37,7 @@ class Held:
     arrived: float = float("nan")  # wall time of the newest sample [s, monotonic]
     placed: Rows | None = None  # positions heard last
     stood: float = float("-inf")  # data time of what was said without the twin, here or elsewhere [s since 1970]
+    published: float = float("-inf")  # when a prediction was, last [s, monotonic]
     shed: int = 0
     failed: str = ""  # what went wrong last, a defect of ours
     lock: threading.Lock = field(default_factory=threading.Lock)  # held while the twin changes, or is copied
@@ -74,6 +76,7 @@ class Twins:
         self.held: dict[int, Held] = {}
         self.lock = threading.Lock()
         self.ids = ids
+        self.paced: Callable[[Callable[[], None]], None] = _at_once  # does what others need not wait for
         self._bus, self._make, self._extras = bus, make, extras
         self._models: dict[int, Model] = {}  # last published by others, of ids of ours
         self._predictions: dict[int, Prediction] = {}
@@ -146,12 +149,13 @@ class Twins:
         """Begin some without their twins: with the gateway's last minutes, and the model published last.
 
         All of them go on at once. The past comes one by one, first to those whose future is known for the shortest
-        time, and what follows from it is spread over the usual periods.
+        time, and what follows from it is spread over the usual periods. Where CPU time is short those that are
+        renewed meanwhile wait for theirs.
         """
         begun = [(uav, twin) for uav in uavs if (twin := self._go_on(uav)) is not None]
         begun.sort(key=lambda one: one[1].prediction.horizon_s if one[1].prediction else 0.0)
         for k, (uav, twin) in enumerate(begun):
-            self._recall(uav, twin, k / len(begun))
+            (self.paced if twin.prediction else _at_once)(partial(self._recall, uav, twin, k / len(begun)))
 
     def _go_on(self, uav: int) -> Twin | None:
         """Make a twin that writes at once where another worker published a prediction; None where there is a twin."""
@@ -263,3 +267,7 @@ class Twins:
         """Name those without the telemetry of before."""
         with self.lock:
             return tuple(uav for uav, held in self.held.items() if held.bare)
+
+
+def _at_once(work: Callable[[], None]) -> None:
+    work()

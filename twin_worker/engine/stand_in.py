@@ -1,12 +1,19 @@
-"""What is said of an aircraft whose twin is being worked on: its last path, from the position heard last."""
+"""What is published of an aircraft whose twin is late or locked: its last path, from the position received last."""
+
+import time
+from collections.abc import Callable
 
 import numpy as np
 
 from fleet.contract import Message, Prediction
 from twin_worker.claims.keeper import Held
 from twin_worker.engine.pace import SOON
-from twin_worker.renew import LATEST_S, renewed
+from twin_worker.renew import OVERDUE_S, renewed
 
+LOOK_S = 0.4  # between looks for aircraft without a prediction [s]
+OLD_S = 1.2  # since an aircraft's last prediction was published, from which on another is due: least [s]
+_LATE = 1.2  # the same in the wanted periods of predictions [-]
+_BACK_S = 1.0  # telemetry that lies so far before what was published: the clock was set back [s]
 _FARTHEST = 2e9  # positions beyond are noise [1e-7 deg, mm]
 
 
@@ -30,6 +37,26 @@ def stand_in(held: Held) -> Prediction | None:
     return made
 
 
+def stand_in_for(holding: list[Held], publish: Callable[[Message, Held], None]) -> None:
+    """Renew the predictions of all whose twins were not reached in time: for want of CPU time, or locked."""
+    for held in holding:
+        pace = held.twin.pace
+        if time.monotonic() - held.published > max(OLD_S, _LATE * min(pace.predict, pace.renew)):
+            if (made := stand_in(held)) is not None:
+                publish(made, held)
+
+
 def said_already(result: Message, held: Held) -> bool:
     """Tell whether a prediction, come late, is older than what was said meanwhile."""
-    return isinstance(result, Prediction) and held.stood - LATEST_S < result.t <= held.stood
+    if not isinstance(result, Prediction) or not held.stood - OVERDUE_S < result.t <= held.stood:
+        return False
+    return held.placed is None or _newest(held) > held.stood - _BACK_S
+
+
+def _newest(held: Held) -> float:
+    """Give the time of the newest position received [s since 1970]."""
+    try:
+        t = held.placed.t.numpy() if held.placed is not None else np.empty(0)
+    except ValueError:
+        return np.inf
+    return float(t[-1]) if len(t) else np.inf

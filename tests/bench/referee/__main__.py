@@ -34,6 +34,8 @@ LIMITS = {  # by fault: what is measured, and the most that is allowed
     "restart_router": {"owners_changed": 0},
     "delay": {"owners_changed": 0},
     "blink": {"owners_changed": 0},
+    "starve": {"owners_changed": 0, "gap_s": 3.0},
+    "starve_all": {"owners_changed": 0, "gap_s": 3.0},
 }
 _WARM = 0.95  # share of the aircraft that must have a model before the first fault [-]
 ANNOUNCED_S = 1.2  # after which everyone has said what it holds now [s]

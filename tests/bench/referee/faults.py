@@ -9,10 +9,12 @@ import numpy as np
 from twin_worker.claims.owner import owners
 
 from .site import Site, Worker, until
+from .starve import limited
 
 _PATIENCE_S = 30.0
 _AFTER_S = 2.0  # looked at after it is over [s]
 _CALM_S = 4.0
+_STARVED = 0.1  # share of a core [-]
 
 
 def _held(site: Site, worker: Worker) -> set[int]:
@@ -173,6 +175,47 @@ def blink(site: Site, worker: Worker) -> dict[str, Any]:
     return {"owners_changed": moved, "gap_s": site.reader.gap(set(before), begun)}
 
 
-ALL = {one.__name__: one for one in (calm, kill, freeze, leave, join, restart_router, cut, stall, delay, blink)}
+def starve(site: Site, _: Worker, seconds: float = 25.0) -> dict[str, Any]:
+    """Limit every worker to a tenth of a core for a while: all are late, nobody is dead."""
+    return _starved(site, [worker.process.pid for worker in site.workers], seconds)
+
+
+def starve_all(site: Site, _: Worker, seconds: float = 25.0) -> dict[str, Any]:
+    """Limit every worker, the gateway and the router to a tenth of a core each."""
+    pids = [site.gateway.pid, site.router_process.pid, *(worker.process.pid for worker in site.workers)]
+    return _starved(site, pids, seconds)
+
+
+def _starved(site: Site, pids: list[int], seconds: float) -> dict[str, Any]:
+    """Limit processes for some time [s]; give how many owners changed, and how many predictions there are left."""
+    uavs = set(range(site.uavs))
+    usual_since, changes = time.monotonic(), site.reader.moved
+    wait(_CALM_S)
+    usual = site.reader.count(uavs, usual_since) / _CALM_S
+    used = sum(worker.cpu_s for worker in site.workers)
+    with limited(pids, _STARVED):
+        begun = time.monotonic()
+        wait(seconds)
+        took = time.monotonic() - begun
+        per_s, gap, late = site.reader.count(uavs, begun) / took, site.reader.gap(uavs, begun), site.reader.late(begun)
+        claims = site.reader.announced(begun)
+        used = (sum(worker.cpu_s for worker in site.workers) - used) / took
+    back = time.monotonic()
+    wait(_CALM_S)
+    return {
+        "owners_changed": site.reader.moved - changes,
+        "claims_gap_s": claims,
+        "gap_s": gap,
+        "predictions_per_s": [round(usual, 1), round(per_s, 1)],
+        "behind_s": late,
+        "workers_cpu": round(used, 2),
+        "back": {"gap_s": site.reader.gap(uavs, back)},
+    }
+
+
+ALL = {
+    one.__name__: one
+    for one in (calm, kill, freeze, leave, join, restart_router, cut, stall, delay, blink, starve, starve_all)
+}
 ON_THE_WAY = (cut, stall, delay)  # for a worker that has a way of its own
 ENDS = (kill, leave)  # for a worker that is not spared

@@ -30,6 +30,9 @@ class Reader:
         self.fits: dict[int, float] = {}  # mean fit of the model in force, as published last
         self.windows: dict[int, float] = {}
         self.whole: dict[str, dict[int, float]] = {}  # by worker: since when it holds which, not bare
+        self.claimed: dict[str, list[float]] = defaultdict(list)  # when each worker announced
+        self.ranks: dict[int, tuple[int, str]] = {}  # the highest claim on each aircraft
+        self.moved = 0  # aircraft that another worker claimed
         self.regressions = self.fenced = self.back = self.changes = 0
         bus.subscribe(Prediction, self._prediction)
         bus.subscribe(Model, self._model)
@@ -56,6 +59,11 @@ class Reader:
     def _claim(self, claim: Claim, _: Stamp | None) -> None:
         now = time.monotonic()
         with self.lock:
+            self.claimed[claim.worker].append(now)
+            for uav, epoch in claim.held:
+                rank = self.ranks.get(uav, (0, ""))
+                self.moved += bool(rank[1]) and claim.worker != rank[1] and (epoch, claim.worker) > rank
+                self.ranks[uav] = max(rank, (epoch, claim.worker))
             before = self.whole.get(claim.worker, {})
             self.whole[claim.worker] = {uav: before.get(uav, now) for uav, _ in claim.held if uav not in claim.bare}
 
@@ -88,6 +96,27 @@ class Reader:
         found = [gap for uav in uavs for gap in self._gaps(uav, since)]
         return float(np.median(found)), float(np.quantile(found, 0.99))
 
+    def count(self, uavs: set[int], since: float) -> int:
+        """Give how many predictions of these were accepted since."""
+        with self.lock:
+            return sum(one.heard >= since for uav in uavs for one in self.came[uav])
+
+    def announced(self, since: float) -> float:
+        """Give the longest time without an announcement of any worker [s]."""
+        with self.lock:
+            found = [[at for at in times if at >= since] for times in self.claimed.values()]
+        return max((float(np.diff([since, *times, time.monotonic()]).max()) for times in found if times), default=0.0)
+
+    def late(self, since: float) -> tuple[float, float]:
+        """Give median and most of how much later predictions came than the newest of any was for [s]."""
+        with self.lock:
+            found = sorted((one.heard, one.t) for came in self.came.values() for one in came if one.heard >= since)
+        if not found:
+            return float("inf"), float("inf")
+        heard, t = np.array(found).T
+        behind = np.maximum.accumulate(t - heard) - (t - heard)
+        return float(np.median(behind)), float(behind.max())
+
     def _gaps(self, uav: int, since: float) -> list[float]:
         with self.lock:
             heard = [one.heard for one in self.came[uav]]
@@ -106,3 +135,4 @@ class Reader:
         with self.lock:
             for came in self.came.values():
                 del came[:-1]
+            self.claimed.clear()
