@@ -27,9 +27,7 @@ def trouble(path: Path) -> str:
         if found.st_uid not in (0, os.geteuid()):
             return f"{above} above it with owner {found.st_uid}, expected root or {os.geteuid()}; name another folder"
         if mode & _WRITABLE and not mode & stat.S_ISVTX:
-            return (
-                f"{above} above it with mode {mode:04o}, expected none but its owner to write there; chmod go-w {above}"
-            )
+            return f"{above} above it with mode {mode:04o}, expected that only its owner may write; chmod go-w {above}"
     return ""
 
 

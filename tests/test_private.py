@@ -45,8 +45,8 @@ def test_the_compile_cache_is_in_the_user_s_own_folder_for_the_owner_alone(tmp_p
 
 @pytest.mark.parametrize("home", ["/dev/null", "/proc/self", "relative"])
 def test_without_a_home_to_write_to_a_fresh_private_folder_is_used_and_removed(home: str, tmp_path: Path) -> None:
-    look = "from pathlib import Path; p = Path(__import__('os').environ['NUMBA_CACHE_DIR']); print(p, oct(p.stat().st_mode))"
-    code, out, _ = started(look + "; print(fleet.CACHE_NOTE)", HOME=home, TMPDIR=tmp_path)
+    look = "import os; p = os.environ['NUMBA_CACHE_DIR']; print(p, oct(os.stat(p).st_mode)); print(fleet.CACHE_NOTE)"
+    code, out, _ = started(look, HOME=home, TMPDIR=tmp_path)
     place, mode = out.split("\n")[0].split()
     assert code == 0 and Path(place).parent == tmp_path and mode == "0o40700"
     assert "every start compiles" in out and not list(tmp_path.iterdir())

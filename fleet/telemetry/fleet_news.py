@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fleet.codec import Stamp, decode, encoding
+from fleet.codec import Stamp, decode, encoding, timely
 from fleet.contract import (
     COLUMNS,
     MAX_ITEMS,
@@ -120,6 +120,8 @@ class FleetNews:
         uav = getattr(message, "uav", None)
         if uav is None or record.stamp is None:
             return True
+        if not timely(record.stamp.epoch, record.heard):
+            return False
         highest = self._claims[uav] = max(self._claims.get(uav, record.stamp), record.stamp)
         return record.stamp == highest
 
