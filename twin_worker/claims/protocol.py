@@ -259,11 +259,8 @@ class Claiming:
             return True
         if worker not in self._ahead and len(self._ahead) < _MOST_AHEAD:
             self._ahead.add(worker)
-            found, cure = (
-                f"claims over {EPOCH_AHEAD_MS // 60_000} minutes ahead of this clock",
-                "set its clock, restart it",
-            )
-            _log.warning("worker %s: found %s, expected one time for all; they are refused; %s", worker, found, cure)
+            found = f"claims over {EPOCH_AHEAD_MS // 60_000} minutes ahead of this clock, which are refused"
+            _log.warning("worker %s: found %s; expected one time for all; set its clock, restart it", worker, found)
         return False
 
     def _ask(self, wanted: dict[str, list[int]]) -> list[int]:

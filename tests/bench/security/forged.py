@@ -3,7 +3,7 @@
 import time
 
 from fleet.codec import Stamp, timely
-from fleet.contract import Claim, Handover, Prediction, State
+from fleet.contract import Claim, Handover, Status
 from fleet.fence import Fence
 from fleet.memory_bus import MemoryBus
 from fleet.talk import newest
@@ -86,11 +86,8 @@ def results_of_the_future() -> str:
         fence = Fence()
         assert not fence.believes(1, Stamp(epoch, 2)), f"epoch {epoch} was believed"
         assert fence.believes(1, rightful), f"epoch {epoch} blinds the reader"
-        made = [
-            Prediction(uav=1, t=t, state=State.PREDICTING, method=word) for t, word in ((9.0, "forged"), (1.0, "ok"))
-        ]
-        ((found, stamp),) = newest([(made[0], Stamp(epoch, 2)), (made[1], rightful)])
-        assert found.method == "ok" and stamp == rightful, f"epoch {epoch} won the answer"
+        ((found, stamp),) = newest([(Status(uav=1, t=9.0), Stamp(epoch, 2)), (Status(uav=1, t=1.0), rightful)])
+        assert found.t == 1.0 and stamp == rightful, f"epoch {epoch} won the answer"
     return "refused; the rightful writer is heard"
 
 
