@@ -243,7 +243,8 @@ class Sieve:
         if not _is_good(kind, body, self.formats):
             return None
         if kind == ord("F") and not self._in_data:
-            self.formats.learn(body)
+            if not self.formats.learn(body):
+                return b""
         elif kind == ord("A"):
             self._in_data = True
             if not self.formats.subscribe(body):
