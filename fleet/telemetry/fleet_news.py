@@ -60,6 +60,8 @@ class FleetNews:
         if self._log.bad:
             where = f"the first near byte {self._log.first_bad}"
             said.insert(0, f"{self._log.bad} damaged bytes skipped, {where}, {self._log.read} messages read")
+        if self._log.tangled:
+            said.insert(0, "too much of it begins like a record and is none, the rest was left unread; cut it")
         return said
 
     def steps(self, results: bool = False) -> Iterator[tuple[float, list[Any]]]:

@@ -17,7 +17,9 @@ _MOST_FIELDS = 999  # of one format
 _MOST_DECLARED = 50_000  # fields of all formats; PX4 declares some 10,000
 _MOST_COLUMNS = 50_000  # numbers in one row of each wanted topic, all topics together
 _MOST_ATTEMPTS = 10_000  # subscriptions looked at, good or not
+_LONGEST_NAME = 100
 _NAME = re.compile(rb"[A-Za-z_]\w{0,99}")
+_FORMAT_TEXT = re.compile(rb"[A-Za-z_]\w{0,99}:[\w \[\];]*")
 _FIELD = re.compile(rb"(\w{1,60})(?:\[(\d{1,5})\])? (\w{1,60})")  # no two parts can match the same bytes
 _KEY = re.compile(rb"(\w+)(?:\[(\d+)\])? ([\w./@-]+)")
 _CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f]")  # escape may colour a text
@@ -138,6 +140,41 @@ class Formats:
             if size > _LARGEST:
                 return None
         return size, columns
+
+
+def could_be(kind: int, raw: bytearray, begin: int, end: int) -> tuple[bool, int]:
+    """Tell whether bytes may be the body of a message, without copying them, and how many were looked at.
+
+    Args:
+        kind: of the message
+        raw: any bytes
+        begin, end: of the body in them
+    """
+    if kind == ord("F"):
+        text = _FORMAT_TEXT.match(raw, begin, end)
+        stop = text.end() if text else begin
+        return stop == end, stop - begin
+    if kind in b"LC":
+        first = begin + (9 if kind == ord("L") else 11)
+        if first > end or raw[begin] not in b"01234567":
+            return False, 0
+        control = _CONTROL.search(raw, first, end)
+        return control is None, (control.start() if control else end) - first
+    if kind in b"AIPMQORSB":
+        return _short(kind, raw, begin, end), 0
+    return True, 0
+
+
+def _short(kind: int, raw: bytearray, begin: int, end: int) -> bool:
+    """Tell at a glance whether a body may be a subscription, a value or a mark."""
+    if kind == ord("A"):
+        return 3 < end - begin <= 3 + _LONGEST_NAME
+    if kind in b"ORSB":
+        return end - begin == {"O": 2, "R": 2, "S": 8}.get(chr(kind))
+    at = begin + (kind in b"MQ")
+    if at >= end or at + 1 + raw[at] > end:
+        return False
+    return _KEY.fullmatch(raw, at + 1, at + 1 + raw[at]) is not None
 
 
 def _parts(fields: bytes) -> list[bytes]:
