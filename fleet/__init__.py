@@ -3,12 +3,20 @@
 from fleet import interrupt as interrupt  # first: from here on it handles Ctrl-C
 
 # isort: split
+
+import atexit
 import hashlib
 import os
+import shutil
+import sys
 import tempfile
+import time
 from pathlib import Path
 
+from fleet import private
+
 __version__ = "0.1.0"
+_UNUSED_S = 30 * 86_400  # a compile cache of other sources is removed after so long [s]
 
 
 def _sources_hash() -> str:
@@ -27,11 +35,54 @@ def _sources_hash() -> str:
 SOURCES = _sources_hash()
 
 
-def _name_compile_cache() -> None:
-    base = os.environ.get("PARAUAV_CACHE") or Path(tempfile.gettempdir()) / f"parauav-{os.getuid()}"
-    os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(base) / f"numba-{SOURCES}"))
+def _compile_cache() -> tuple[Path, str]:
+    """Find the folder of compiled functions, which numba unpickles: whoever may write there runs code as this user.
+
+    Returns:
+        the folder, where nobody else may write; what `fleet doctor` should note of it
+    Raises:
+        ValueError: when the user names one that others could have changed.
+        OSError: when it cannot be made.
+    """
+    if given := os.environ.get("NUMBA_CACHE_DIR"):
+        return private.folder(Path(given).absolute(), "NUMBA_CACHE_DIR"), ""
+    if given := os.environ.get("PARAUAV_CACHE"):
+        return _within(private.folder(Path(given).absolute(), "PARAUAV_CACHE")), ""
+    try:
+        usual = private.cache_folder()
+        private.folder(usual, "cache")
+        private.close(usual)
+        return _within(usual), ""
+    except (ValueError, OSError, RuntimeError) as error:
+        found = Path(tempfile.mkdtemp(prefix="parauav-cache-"))
+        atexit.register(_remove, found, os.getpid())
+        return found, f"the user's cache folder does not serve ({error}), so every start compiles; see PARAUAV_CACHE"
 
 
-_name_compile_cache()
+def _within(base: Path) -> Path:
+    """Give the folder of these sources, for its owner alone; with a new one those that nobody uses any more go."""
+    found = base / f"numba-{SOURCES}"
+    if not found.exists():
+        for old in base.glob("numba-*"):
+            if time.time() - old.lstat().st_mtime > _UNUSED_S:
+                shutil.rmtree(old, ignore_errors=True)
+    private.folder(found, "compile cache")
+    private.close(found)
+    os.utime(found)
+    return found
+
+
+def _remove(folder: Path, pid: int) -> None:
+    if os.getpid() == pid:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+try:
+    _folder, CACHE_NOTE = _compile_cache()
+except (ValueError, OSError) as _error:
+    _why = str(_error) if isinstance(_error, ValueError) else f"compile cache: found {_error}, expected to write there"
+    print(f"{_why}; or leave NUMBA_CACHE_DIR and PARAUAV_CACHE unset", file=sys.stderr, flush=True)
+    raise SystemExit(2) from None
+os.environ["NUMBA_CACHE_DIR"] = str(_folder)
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # small matrices: BLAS threads cost 10-50 times on a busy machine

@@ -2,6 +2,7 @@
 
 import math
 import struct
+import time
 from typing import Any, NamedTuple, TypeVar
 
 import msgspec
@@ -10,6 +11,7 @@ from fleet.access.roles import SAID
 from fleet.contract import PER_UAV, TOPICS
 
 M = TypeVar("M")
+EPOCH_AHEAD_MS = 300_000  # an epoch further ahead of one's own clock is forged, or of a clock that is wrong
 _STAMP = struct.Struct("<QQ")
 _PACK = msgspec.msgpack.Encoder()
 _UNPACK: dict[str, Any] = {topic: msgspec.msgpack.Decoder(kind) for topic, kind in TOPICS.items()}
@@ -21,10 +23,20 @@ _NAMED = {
 
 
 class Stamp(NamedTuple):
-    """Who wrote a worker result, and under which claim; the highest epoch per UAV wins."""
+    """Who wrote a worker result, and under which claim; the highest timely epoch per UAV wins."""
 
     epoch: int
     writer: int
+
+
+def timely(epoch: int, wall_s: float | None = None) -> bool:
+    """Tell whether an epoch may be believed: it is a time [ms since 1970], and no claim is from the future.
+
+    Args:
+        epoch: of a claim
+        wall_s: the reader's own clock, now unless said [s since 1970]
+    """
+    return 0 <= epoch <= (time.time() if wall_s is None else wall_s) * 1e3 + EPOCH_AHEAD_MS
 
 
 class Wire(NamedTuple):

@@ -22,8 +22,9 @@
 
 Wire: a msgpack map; any msgpack library reads it. Arrays are maps `{dtype, shape, data}`. The Zenoh encoding
 carries the version: `application/msgpack;parauav.prediction.1`. Fields may be added (with a default); a reader
-refuses another major version. Worker results carry an attachment of 16 bytes, little endian: epoch u64, writer u64;
-readers keep the highest epoch per UAV.
+refuses another major version. Worker results carry an attachment of 16 bytes, little endian: epoch u64, writer u64.
+An epoch is the time of the claim [ms since 1970], or one above the last: readers refuse one over 5 minutes ahead of
+their own clock, and keep the highest of the others per UAV.
 
 Time `t` is seconds since 1970 on the fleet clock. Angles in rad, SI throughout, NED and FRD frames.
 """
@@ -644,7 +645,8 @@ class Account(msgspec.Struct, frozen=True, kw_only=True):
 class Claim(msgspec.Struct, frozen=True, kw_only=True):
     """Which aircraft one worker writes for.
 
-    Of two claims on one aircraft the higher epoch counts, then the higher writer.
+    Of two claims on one aircraft the higher epoch counts, then the higher writer; one over 5 minutes ahead of the
+    reader's own clock is refused.
     """
 
     topic: ClassVar[str] = "@claim"

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-from fleet.codec import Stamp
+from fleet.codec import Stamp, timely
 
 GIVE_UP_S = 10.0  # a writer silent for so long has lost its claim: a lower one (a restarted fleet) may speak [s]
 
@@ -26,8 +26,10 @@ class Fence:
         self._by_uav: dict[int, _Believed] = {}
 
     def believes(self, uav: int, stamp: Stamp | None) -> bool:
-        """Tell whether a worker may speak for an aircraft: nobody with a higher claim has spoken lately."""
+        """Tell whether a worker may speak for an aircraft: nobody with a higher timely claim has spoken lately."""
         rank, now = stamp or Stamp(0, 0), self._clock()
+        if not timely(rank.epoch):
+            return False
         held = self._by_uav.get(uav)
         if held is not None and rank < held.rank and now - held.heard < GIVE_UP_S:
             return False

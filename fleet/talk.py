@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Any, Protocol, TypeVar
 
 from fleet.access.roles import ROOT
-from fleet.codec import Stamp, Wire
+from fleet.codec import Stamp, Wire, timely
 from fleet.contract import PER_UAV
 
 M = TypeVar("M")
@@ -123,13 +123,15 @@ class Bus(AbstractContextManager, Protocol):
 
 
 def newest(found: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
-    """Keep the reply with the highest claim, then the newest, per UAV (and alert); without a UAV all stay."""
+    """Keep the reply with the highest timely claim, then the newest, per UAV (and alert); without a UAV all stay."""
     best: dict[tuple[int, str], tuple[M, Stamp | None]] = {}
     rest = []
     for message, stamp in found:
         uav = getattr(message, "uav", None)
         if uav is None:
             rest.append((message, stamp))
+            continue
+        if stamp is not None and not timely(stamp.epoch):
             continue
         what = uav, str(getattr(message, "about", ""))
         held = best.get(what)

@@ -5,6 +5,7 @@ import pytest
 
 from fleet.codec import Stamp
 from fleet.fence import GIVE_UP_S, Fence
+from tests.bench.security import forged
 from twin_worker.claims.decide import PAUSE_S, SETTLE_S, SILENT_S, Claims, Plan, Rank
 from twin_worker.claims.owner import owner, owners
 
@@ -241,3 +242,20 @@ def test_readers_believe_the_higher_claim_until_it_falls_silent(low: Stamp | Non
     assert not fence.believes(1, low)
     now[0] = 2 * GIVE_UP_S
     assert fence.believes(1, low), "a fleet that was started anew with its clock set back"
+
+
+# --- claims from the future -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("attempt", forged.BY_FORGING, ids=lambda one: one.__name__)
+def test_a_forged_epoch_is_adopted_by_nobody_and_blinds_nobody(attempt) -> None:
+    assert attempt()
+
+
+def test_a_clock_that_was_set_back_claims_anew_what_it_holds() -> None:
+    one = claims(peers=("a",))
+    one.take(0, WALL)
+    one.note(1, Rank(WALL, "a"))
+    assert one.timely(WALL, WALL) == {} and one.held == {0: WALL}
+    assert one.timely(WALL - 2, WALL - 5) == {0: WALL - 5} == one.held
+    assert one.seen == {0: Rank(WALL - 5, one.me)}, "what the other claimed by the former clock is forgotten"

@@ -33,6 +33,8 @@ def papers_of(folder: Path, role: str) -> Papers:
         if not path.is_file():
             raise ValueError(f"certificates: found no {path}, expected it for the role {role}; {HOW}, or copy it here")
     private(papers.key)
+    for path in (folder, folder / "ca.pem", papers.certificate):
+        _unaltered(path)
     ends, now = ending(papers.certificate), datetime.now(UTC)
     if ends < now:
         names = "router FOLDER NAME..." if role == ROUTER_ROLE else f"role FOLDER {role}"
@@ -69,8 +71,28 @@ def private(path: Path) -> None:
         raise ValueError(
             f"certificates: found {path} with mode {mode:04o}, expected it for owner and group alone; chmod 640 {path}"
         )
+    if found.st_uid not in (0, os.geteuid()) and os.geteuid() != 0:
+        raise ValueError(
+            f"certificates: found {path} with owner {found.st_uid}, expected {os.geteuid()}, who runs this, or root; "
+            f"chown it, or make another"
+        )
     if not os.access(path, os.R_OK):
         raise ValueError(f"certificates: found {path} that this user may not read; chown it to who runs ParaUAV")
+
+
+def _unaltered(path: Path) -> None:
+    """Refuse a certificate, or a folder of them, that others may replace.
+
+    Raises:
+        ValueError: when it is so.
+        OSError: when it cannot be looked at.
+    """
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if mode & 0o022 and not mode & stat.S_ISVTX:
+        raise ValueError(
+            f"certificates: found {path} with mode {mode:04o}, expected that only its owner may change it; "
+            f"chmod go-w {path}"
+        )
 
 
 def password_of(path: Path, role: str) -> str:

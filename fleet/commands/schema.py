@@ -21,7 +21,7 @@ EXAMPLES = """
   fleet schema sample --json          JSON schema, key, encoding and attachment
 """
 
-ATTACHMENT = "16 bytes, little endian: epoch u64, writer u64; keep the highest epoch per UAV"
+ATTACHMENT = "16 bytes, little endian: epoch u64, writer u64; keep the highest epoch per UAV below now + 5 min"
 STAMPED = ("model", "prediction", "mismatch", "alert")  # what workers write, so what carries the attachment
 
 

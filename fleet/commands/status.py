@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from fleet.bus import connect
+from fleet.codec import timely
 from fleet.config import entry, router_arguments
 from fleet.contract import Account, Claim, FleetRow, FleetState, State, Status
 from fleet.plain import plain
@@ -51,6 +52,8 @@ def fleet_rows(bus: Bus) -> list[FleetRow]:
     for state, _ in bus.ask(FleetState):
         for row in state.rows:
             held = best.get(row.uav)
+            if not timely(row.epoch):
+                continue
             if held is None or (row.epoch, row.worker) > (held.epoch, held.worker):
                 best[row.uav] = row
     for status, _ in bus.ask(Status):

@@ -10,7 +10,7 @@ from cryptography import x509
 
 from fleet.access.entry import Entry, endpoint
 from fleet.access.knock import answers
-from fleet.access.papers import ending, papers_of
+from fleet.access.papers import ending, papers_of, private
 from fleet.access.roles import ROLES, ROUTER_ROLE
 from fleet.examine.finding import BAD, NOTE, OK, Finding
 from fleet.examine.machine import free
@@ -27,6 +27,7 @@ def papers(at: Entry) -> Iterator[Finding]:
         known = "known by passwords" if at.passwords else "anyone may join"
         cure = "" if grade == OK else "; --config with certificates encrypts it: deploy/README.md"
         yield Finding(grade, "certificates", f"none are used: {where}, in the clear, {known}{cure}")
+        yield from _passwords(at)
         return
     roles = [role for role in (*ROLES, ROUTER_ROLE) if (at.certificates / f"{role}.pem").is_file()]
     if at.mutual and at.role not in roles:
@@ -39,6 +40,16 @@ def papers(at: Entry) -> Iterator[Finding]:
         except (ValueError, OSError) as error:
             yield Finding(BAD, "certificates", str(error).removeprefix("certificates: "))
     yield _authority(at.certificates)
+    yield from _passwords(at)
+
+
+def _passwords(at: Entry) -> Iterator[Finding]:
+    """Say what is wrong with the file of passwords, if anything is."""
+    if at.passwords is not None:
+        try:
+            private(at.passwords)
+        except (ValueError, OSError) as error:
+            yield Finding(BAD, "passwords", str(error).removeprefix("certificates: "))
 
 
 def _authority(folder: Path) -> Finding:

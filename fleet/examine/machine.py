@@ -8,6 +8,8 @@ import sys
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
+import fleet
+from fleet import private
 from fleet.examine.finding import Finding
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -18,7 +20,9 @@ def look() -> Iterator[Finding]:
     """Look at everything."""
     yield python()
     yield from packages()
-    yield from (compile_cache(), chromium(), recordings())
+    yield compile_cache()
+    yield from onboard_cache()
+    yield from (chromium(), recordings())
 
 
 def python() -> Finding:
@@ -49,14 +53,37 @@ def _installed(name: str) -> str:
 
 
 def compile_cache() -> Finding:
-    """Check that numba may keep what it compiles."""
-    folder = Path(os.environ["NUMBA_CACHE_DIR"])
-    nearest = next(p for p in (folder, *folder.parents) if p.exists())
-    if not os.access(nearest, os.W_OK):
-        return Finding("BAD", "compile cache", f"may not write {folder}; name another folder in PARAUAV_CACHE")
-    count = sum(1 for _ in folder.rglob("*.nbc")) if folder.exists() else 0
+    """Check that numba may keep what it compiles, and that nobody else may change it."""
+    place = Path(os.environ["NUMBA_CACHE_DIR"])
+    try:
+        found, foreign = private.trouble(place), private.strangers(place)
+    except OSError as error:
+        return Finding("BAD", "compile cache", f"{error}; name another folder in PARAUAV_CACHE")
+    if found:
+        return Finding("BAD", "compile cache", f"{place}: found {found}")
+    if foreign:
+        cure = f"they could run code as you; rm -r {place}"
+        return Finding("BAD", "compile cache", f"{place}: found {len(foreign)} files of other users in it; {cure}")
+    if not os.access(place, os.W_OK):
+        return Finding("BAD", "compile cache", f"may not write {place}; name another folder in PARAUAV_CACHE")
+    if fleet.CACHE_NOTE:
+        return Finding("note", "compile cache", f"{place}: {fleet.CACHE_NOTE}")
+    count = sum(1 for _ in place.rglob("*.nbc"))
     state = f"{count} functions compiled" if count else "empty, so the first start compiles (a minute)"
-    return Finding("ok", "compile cache", f"{folder}: {state}")
+    return Finding("ok", "compile cache", f"{place}: {state}")
+
+
+def onboard_cache() -> Iterator[Finding]:
+    """Check the folder of what aircraft told before, where there is one."""
+    try:
+        place = private.onboard_folder()
+        found = private.trouble(place)
+    except (OSError, RuntimeError):
+        return
+    if found:
+        yield Finding("BAD", "onboard cache", f"{place}: found {found}")
+    else:
+        yield Finding("ok", "onboard cache", f"{place}: {sum(1 for _ in place.glob('*.json'))} aircraft")
 
 
 def mavlink_port(links: Collection[str] = ()) -> Finding:

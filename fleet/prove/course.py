@@ -10,7 +10,7 @@ from typing import Any
 
 from fleet.children import run_until
 from fleet.prove.mark import Mark, mark
-from fleet.prove.seal import digest, unseal
+from fleet.prove.seal import digest, taken, unseal
 
 Say = Callable[[str], None]
 
@@ -65,13 +65,13 @@ def examine(paper: Paper, stop: Event, say: Say) -> Marked:
     with TemporaryDirectory(prefix="parauav-key-") as elsewhere:
         key = Path(elsewhere) / "key"
         _conceal(paper, key, stop)
-        sealed = digest(paper.sealed)
-        say(f"labels sealed, the key kept elsewhere: sha256 {sealed}")
-        written = [_diagnose(paper, folder, stop, say) for folder in _airframes(paper.folder)]
-        reports = digest(*written)
-        say(f"reports committed: sha256 {reports}")
-        labels: dict[str, Any] = json.loads(unseal(paper.sealed, key, sealed))
-        say("seal opened, hash as promised")
+        sealed, secret = digest(paper.sealed), taken(key)
+    say(f"labels sealed, the key in this process alone: sha256 {sealed}")
+    written = [_diagnose(paper, folder, stop, say) for folder in _airframes(paper.folder)]
+    reports = digest(*written)
+    say(f"reports committed: sha256 {reports}")
+    labels: dict[str, Any] = json.loads(unseal(paper.sealed, secret, sealed))
+    say("seal opened, hash as promised")
     (paper.folder / "labels.json").write_text(json.dumps(labels, indent=1) + "\n")
     if digest(*written) != reports:
         raise ValueError(

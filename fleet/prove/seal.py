@@ -1,9 +1,13 @@
 """A sealed letter: encrypted with a key that is kept elsewhere, known by its hash before anybody can read it."""
 
 import hashlib
+import os
+import stat
 from pathlib import Path
 
 from cryptography.fernet import Fernet, InvalidToken
+
+from fleet import private
 
 
 def digest(*paths: Path) -> str:
@@ -17,12 +21,29 @@ def digest(*paths: Path) -> str:
 def seal(words: bytes, sealed: Path, key: Path) -> None:
     """Encrypt into `sealed`, and put the key where only its owner reads it."""
     secret = Fernet.generate_key()
-    key.touch(mode=0o600)
-    key.write_bytes(secret)
+    private.write(key, secret)
     sealed.write_bytes(Fernet(secret).encrypt(words))
 
 
-def unseal(sealed: Path, key: Path, promised: str) -> bytes:
+def taken(key: Path) -> bytes:
+    """Read a key and remove its file, so that no process that begins later can read it.
+
+    Raises:
+        ValueError: when others could have read or changed it.
+        OSError: when it cannot be read.
+    """
+    found = key.lstat()
+    mode = stat.S_IMODE(found.st_mode)
+    if not stat.S_ISREG(found.st_mode) or mode & 0o077 or found.st_uid != os.geteuid():
+        raise ValueError(
+            f"{key}: found mode {mode:04o}, owner {found.st_uid}, expected a file for its owner alone; start anew"
+        )
+    secret = key.read_bytes()
+    key.unlink()
+    return secret
+
+
+def unseal(sealed: Path, key: bytes, promised: str) -> bytes:
     """Open a seal.
 
     Raises:
@@ -31,6 +52,6 @@ def unseal(sealed: Path, key: Path, promised: str) -> bytes:
     if digest(sealed) != promised:
         raise ValueError(f"{sealed.name}: found another hash than {promised[:16]}…, expected the labels; start anew")
     try:
-        return Fernet(key.read_bytes().strip()).decrypt(sealed.read_bytes())
+        return Fernet(key.strip()).decrypt(sealed.read_bytes())
     except (InvalidToken, ValueError):
-        raise ValueError(f"{key.name}: found no key of {sealed.name}, expected its own; name it") from None
+        raise ValueError(f"{sealed.name}: found a key of another seal, expected its own; start anew") from None

@@ -19,6 +19,9 @@ HEAD1, HEAD2 = MAGIC
 FMT, FMT_LENGTH = 0x80, 89
 SHORTEST, LONGEST = 3, 255
 _FMT = form("FMT", "BBnNZ", "Type,Length,Name,Format,Columns", FMT_LENGTH)
+HOPELESS = 1 << 25  # damaged bytes, beyond `_WORSE` times the good ones, after which the rest is left unread
+_WORSE = 4
+_MOST_CHANGES = 2000  # formats that are declared anew and otherwise; a log has some hundred formats, each once
 _READ_ERRORS = (OSError, EOFError, lzma.LZMAError, zlib.error)
 
 
@@ -28,6 +31,9 @@ def blocks(opener: Callable[[], IO[bytes]], damage: Damage) -> Iterator[list[Rec
     with opener() as stream:
         for data in pieces(stream, damage):
             yield walk.feed(data)
+            if walk.lost > HOPELESS + _WORSE * (walk.place - walk.lost):
+                damage.note("hardly anything but damage, so the rest was left unread", walk.place)
+                break
     yield walk.feed(b"", last=True)
 
 
@@ -59,6 +65,14 @@ class Walk:
         self._hits: list[list[int]] = [[] for _ in range(256)]  # where messages of each type begin in `_buf`
         self._done: list[Records] = []  # cut with a format that has changed since
         self._formats[FMT], self._lengths[FMT] = _FMT, FMT_LENGTH
+        self._told: dict[int, bytes] = {}  # the newest FMT of each type, as it stands in the file
+        self._changes = 0
+        self.lost = 0  # bytes stepped over
+
+    @property
+    def place(self) -> int:
+        """Tell how many bytes were walked over."""
+        return self._base
 
     def feed(self, data: bytes, last: bool = False) -> list[Records]:
         """Take the next bytes, give the messages completed by them."""
@@ -129,6 +143,7 @@ class Walk:
 
     def _lose(self, start: int, stop: int) -> None:
         lost = self._buf[start:stop]
+        self.lost += stop - start
         if lost.strip(b"\0") and lost.strip(b"\xff"):  # pages are padded
             known = lost[:2] == MAGIC and len(lost) > 2
             kind = "messages of an unknown type, bytes" if known and not self._lengths[lost[2]] else "damaged bytes"
@@ -136,6 +151,14 @@ class Walk:
 
     def _define(self, at: int) -> None:
         assert _FMT is not None and _FMT.layout is not None
+        told = self._buf[at : at + FMT_LENGTH]
+        if self._told.get(told[3]) == told:
+            return
+        self._changes += 1
+        if self._changes > _MOST_CHANGES:
+            self._damage.note("formats declared over and over", self._base + at)
+            return
+        self._told[told[3]] = told
         found = Records(_FMT, np.array([at]), np.frombuffer(self._buf, _FMT.layout, 1, at))
         kind, length = int(found.Type[0]), int(found.Length[0])
         if kind == FMT:

@@ -22,6 +22,7 @@ MAGIC = b"\xc1UV1"  # C1 is the one byte that msgpack never uses
 MOST = 1 << 22  # bytes of the longest body; the longest message there is, a mission of 1,000 items, has 200 kB
 CHUNK = 1 << 20
 HOPELESS = 1 << 26  # bytes without a single record after which a file is no recording of a fleet
+SEARCHED = 8  # times the bytes read, and a `HOPELESS` more, are summed in vain before the rest is left unread
 _PREFIX = "application/msgpack;"
 _HEAD = struct.Struct("<4sII")
 _BODY = struct.Struct("<dQQB")
@@ -55,22 +56,25 @@ class FleetLog:
         self.read = 0  # records
         self.bad = 0  # bytes that belong to no sound record
         self.first_bad: int | None = None  # where the first of them is
+        self.tangled = False  # the rest was left unread: too much begins like a record and is none
 
     def records(self) -> Iterator[tuple[int, Record]]:
         """Give the sound records: (place in the file [bytes], record)."""
-        rest, place = b"", 0
+        rest, place, vain = b"", 0, Vain(HOPELESS)
         with self._source.open() as stream:
             while True:
                 chunk = stream.read(CHUNK) or b""
                 told, at = rest + chunk, 0
-                for start, stop in sound(told, last=not chunk):
+                vain.left += SEARCHED * len(chunk)
+                for start, stop in sound(told, not chunk, vain):
                     self._skip(place + at, start - at)
                     at = stop
                     if start < stop:
                         self.read += 1
                         yield place + start, _unpack(told[start:stop])
                 rest, place = told[at:], place + at
-                if not chunk or (not self.read and place > HOPELESS):
+                self.tangled = vain.left < 0
+                if not chunk or self.tangled or (not self.read and place > HOPELESS):
                     return
 
     def _skip(self, place: int, count: int) -> None:
@@ -79,15 +83,23 @@ class FleetLog:
         self.bad += count
 
 
-def sound(told: bytes, last: bool = True) -> Iterator[tuple[int, int]]:
+class Vain:
+    """How many bytes may still be summed for records that are none."""
+
+    def __init__(self, left: int) -> None:
+        self.left = left
+
+
+def sound(told: bytes, last: bool = True, vain: Vain | None = None) -> Iterator[tuple[int, int]]:
     """Find the sound records in some bytes; the last pair is empty and tells where the search must go on.
 
     Args:
         told: any bytes
         last: nothing follows, so that what is not whole never will be
+        vain: lowered by what is summed in vain; below 0 the search ends
     """
-    at = 0
-    while (start := told.find(MAGIC, at)) >= 0:
+    at, vain = 0, Vain(HOPELESS) if vain is None else vain
+    while vain.left >= 0 and (start := told.find(MAGIC, at)) >= 0:
         stop = _stop(told, start)
         if stop > len(told) and not last:
             yield start, start
@@ -97,12 +109,16 @@ def sound(told: bytes, last: bool = True) -> Iterator[tuple[int, int]]:
             at = stop
         else:
             at = start + 1
+            vain.left -= max(-stop, 0)
     kept = len(told) if last else max(at, len(told) - len(MAGIC) + 1)  # the beginning of a magic may be there
     yield kept, kept
 
 
 def _stop(told: bytes, start: int) -> int:
-    """Tell where the record that begins here ends; beyond the bytes: not whole yet, 0: it is none."""
+    """Tell where the record that begins here ends; beyond the bytes: not whole yet.
+
+    0: it is none; less: it is none, and that many bytes were summed to know.
+    """
     after = start + _HEAD.size
     if after > len(told):
         return after
@@ -111,7 +127,7 @@ def _stop(told: bytes, start: int) -> int:
         return 0
     stop = after + int(size)
     if stop <= len(told) and zlib.crc32(memoryview(told)[after:stop]) != crc:
-        return 0
+        return after - stop
     return stop
 
 

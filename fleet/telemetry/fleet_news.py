@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from fleet.codec import Stamp, decode, encoding
+from fleet.codec import Stamp, decode, encoding, timely
 from fleet.contract import (
     COLUMNS,
     MAX_ITEMS,
@@ -60,6 +60,8 @@ class FleetNews:
         if self._log.bad:
             where = f"the first near byte {self._log.first_bad}"
             said.insert(0, f"{self._log.bad} damaged bytes skipped, {where}, {self._log.read} messages read")
+        if self._log.tangled:
+            said.insert(0, "too much of it begins like a record and is none, the rest was left unread; cut it")
         return said
 
     def steps(self, results: bool = False) -> Iterator[tuple[float, list[Any]]]:
@@ -120,6 +122,8 @@ class FleetNews:
         uav = getattr(message, "uav", None)
         if uav is None or record.stamp is None:
             return True
+        if not timely(record.stamp.epoch, record.heard):
+            return False
         highest = self._claims[uav] = max(self._claims.get(uav, record.stamp), record.stamp)
         return record.stamp == highest
 

@@ -5,6 +5,7 @@ import gzip
 import lzma
 import stat
 import threading
+import zlib
 from collections.abc import Callable
 from io import RawIOBase
 from pathlib import Path
@@ -12,7 +13,10 @@ from typing import IO, Any
 
 _OPENERS: dict[str, Callable[..., Any]] = {".xz": lzma.open, ".gz": gzip.open, ".bz2": bz2.open}
 COMPRESSED = tuple(_OPENERS)
-_BROKEN = (EOFError, lzma.LZMAError, OSError)  # what a damaged archive raises
+_BROKEN = (EOFError, lzma.LZMAError, OSError, MemoryError, zlib.error)  # what a damaged archive raises
+RATIO = 30  # a recording compresses to a fifth, at best to a tenth: what unfolds further is no recording
+UNFOLDED = 1 << 24  # bytes a compressed file may unfold to, whatever its size
+LARGEST_UNFOLDED = 1 << 29  # bytes of a compressed file that are read
 
 
 class Source:
@@ -55,14 +59,16 @@ class Source:
         except OSError as error:
             raise OSError(f"{self.path}: cannot be read ({error.strerror}); check its permissions") from None
         opener = _OPENERS.get(self.path.suffix)
-        return Bytes(self, opener(self._raw) if opener else self._raw)
+        if opener is None:
+            return Bytes(self, self._raw)
+        return Bytes(self, opener(self._raw), min(max(UNFOLDED, RATIO * self.size), LARGEST_UNFOLDED))
 
 
 class Bytes(RawIOBase):
-    """The bytes of a source; where its archive is damaged they end, and the source says so."""
+    """The bytes of a source; where its archive is damaged or unfolds without end they end, and the source says so."""
 
-    def __init__(self, source: Source, stream: Any) -> None:
-        self._source, self._stream = source, stream
+    def __init__(self, source: Source, stream: Any, most: int | None = None) -> None:
+        self._source, self._stream, self._left, self._read = source, stream, most, 0
 
     def readable(self) -> bool:
         """Tell that this can be read."""
@@ -74,8 +80,13 @@ class Bytes(RawIOBase):
         if self._source.stop is not None and self._source.stop.is_set():
             return 0
         while filled < len(buffer):
+            wanted = len(buffer) - filled if self._left is None else min(len(buffer) - filled, self._left)
+            if not wanted:
+                size = f"{self._source.size:,} bytes that unfold to more than {self._read >> 20} MiB"
+                self._source.trouble = f"found {size}, the rest was left unread; decompress it yourself if it is yours"
+                break
             try:
-                data = self._stream.read1(len(buffer) - filled)
+                data = self._stream.read1(wanted)
             except _BROKEN as error:
                 self._source.trouble = f"the compressed file is damaged ({error}); what came before is used"
                 break
@@ -83,6 +94,8 @@ class Bytes(RawIOBase):
                 break
             buffer[filled : filled + len(data)] = data
             filled += len(data)
+            self._read += len(data)
+            self._left = None if self._left is None else self._left - len(data)
         return filled
 
     def close(self) -> None:

@@ -13,7 +13,8 @@ from fleet.telemetry.decode import IDS, Decoder, Frames, frames_of
 from fleet.telemetry.opening import Source
 
 CHUNK = 1 << 20
-HOPELESS = 1 << 26  # bytes without a single frame after which a file is no telemetry log
+HOPELESS = 1 << 25  # damaged bytes, beyond `_WORSE` times the good ones, after which the rest is left unread
+_WORSE = 4
 LOOK = 0.1  # share of the work that is done before the first frame is given
 BACK_S = 1.0  # a clock that steps back further was set; time goes on all the same [s]
 BACKLOG_S = 5.0  # arriving later than boot time tells by more than this is a backlog, not a delay [s]
@@ -32,6 +33,7 @@ class Tlog:
         self.skipped: list[str] = []
         self._source = source
         self._looking = True
+        self.tangled: int | None = None  # from which byte on the rest was left unread
 
     @property
     def share(self) -> float:
@@ -47,6 +49,8 @@ class Tlog:
             read = int(self.decoder.counts[s.MESSAGES])
             where = f", the first near byte {self._first_bad}" if self._first_bad is not None else ""
             self.skipped.append(f"{bad} damaged bytes skipped{where}, {read} frames read")
+        if self.tangled is not None:
+            self.skipped.append(f"hardly anything but damage up to byte {self.tangled}, the rest was left unread; cut it")
 
     def _batches(self, decoder: Decoder) -> Iterator[Frames]:
         """Give the frames with their arrival as it stands in the file, made to never fall."""
@@ -76,7 +80,8 @@ class Tlog:
                 if not chunk:
                     counts[s.BAD_BYTES] += len(told) - done
                     return
-                if not counts[s.MESSAGES] and place > HOPELESS:
+                if counts[s.BAD_BYTES] > HOPELESS + _WORSE * (place - counts[s.BAD_BYTES]):
+                    self.tangled = place
                     return
                 rest = told[done:]
 

@@ -13,8 +13,14 @@ _LARGEST = 0xFFFF - 2  # bytes of one row
 _LARGEST_WANTED = 4096  # bytes of one row of a topic in the table; PX4 stays below 2000
 _MOST_TOPICS = 2000  # subscriptions of one file
 _DEEPEST = 8  # formats within formats
-_FORMAT = re.compile(rb"([A-Za-z_]\w{0,99}):((?:\w{1,60}(?:\[\d{1,5}\])? \w{1,60};?){1,999})")
-_FIELD = re.compile(rb"(\w+)(?:\[(\d+)\])? (\w+)")
+_MOST_FIELDS = 999  # of one format
+_MOST_DECLARED = 50_000  # fields of all formats; PX4 declares some 10,000
+_MOST_COLUMNS = 50_000  # numbers in one row of each wanted topic, all topics together
+_MOST_ATTEMPTS = 10_000  # subscriptions looked at, good or not
+_LONGEST_NAME = 100
+_NAME = re.compile(rb"[A-Za-z_]\w{0,99}")
+_FORMAT_TEXT = re.compile(rb"[A-Za-z_]\w{0,99}:[\w \[\];]*")
+_FIELD = re.compile(rb"(\w{1,60})(?:\[(\d{1,5})\])? (\w{1,60})")  # no two parts can match the same bytes
 _KEY = re.compile(rb"(\w+)(?:\[(\d+)\])? ([\w./@-]+)")
 _CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f]")  # escape may colour a text
 
@@ -41,10 +47,16 @@ class Formats:
         self.topics: dict[int, Topic] = {}
         self._wanted = wanted
         self._fields: dict[bytes, list[tuple[bytes, int, bytes]]] = {}
+        self._extents: dict[tuple[bytes, int], tuple[int, int] | None] = {}  # found before, by type and depth left
+        self._declared = self._columns = self._attempts = 0
 
     def is_format(self, body: bytes) -> bool:
-        """Tell whether the bytes declare a format."""
-        return len(body) < 0xFFFF and _FORMAT.fullmatch(body) is not None
+        """Tell whether the bytes declare a format; in a time proportional to their number."""
+        name, colon, fields = body.partition(b":")
+        if not colon or len(body) >= 0xFFFF or _NAME.fullmatch(name) is None:
+            return False
+        parts = _parts(fields)
+        return 0 < len(parts) <= _MOST_FIELDS and all(_FIELD.fullmatch(part) for part in parts)
 
     def is_value(self, body: bytes) -> bool:
         """Tell whether the bytes are a key and a value of the type the key names."""
@@ -60,17 +72,24 @@ class Formats:
         """Tell whether a format of that name was declared."""
         return name in self._fields
 
-    def learn(self, body: bytes) -> None:
-        """Take a format; the first of a name stands."""
+    def learn(self, body: bytes) -> bool:
+        """Take a format; the first of a name stands, and only so many are kept; tell whether it was taken."""
         name, _, fields = body.partition(b":")
-        found = [(kind, max(int(n or 1), 1), field) for kind, n, field in _FIELD.findall(fields)]
-        if len({field for _, _, field in found}) == len(found):
-            self._fields.setdefault(name, found)
+        parts = [match.groups() for part in _parts(fields) if (match := _FIELD.fullmatch(part))]
+        found = [(kind, max(int(n or 1), 1), field) for kind, n, field in parts]
+        unique = len({field for _, _, field in found}) == len(found)
+        if not unique or name in self._fields or self._declared + len(found) > _MOST_DECLARED:
+            return False
+        self._declared += len(found)
+        self._fields[name] = found
+        self._extents.clear()
+        return True
 
     def subscribe(self, body: bytes) -> bool:
         """Take a subscription; tell whether its rows are wanted and can be read."""
         number = int.from_bytes(body[1:3], "little")
-        if number in self.topics or len(self.topics) >= _MOST_TOPICS:
+        self._attempts += 1
+        if number in self.topics or len(self.topics) >= _MOST_TOPICS or self._attempts > _MOST_ATTEMPTS:
             return False
         name = body[3:]
         fields = self._fields[name]
@@ -88,20 +107,76 @@ class Formats:
             if not field.startswith(b"_padding"):
                 break
             padding += n * (self._size(kind, _DEEPEST) or 0)
+        _, columns = self._extent(name, _DEEPEST) or (0, 0)
         wanted = name.decode() in self._wanted and size <= _LARGEST_WANTED
+        wanted = wanted and self._columns + columns <= _MOST_COLUMNS
+        self._columns += columns if wanted else 0
         self.topics[number] = Topic(name.decode(), size - padding, size, stamp_at, wanted)
         return wanted
 
     def _size(self, kind: bytes, depth: int) -> int | None:
         """Give the bytes of a type; None where it is unknown, too large or contains itself."""
+        found = self._extent(kind, depth)
+        return None if found is None else found[0]
+
+    def _extent(self, kind: bytes, depth: int) -> tuple[int, int] | None:
+        """Give the bytes of a type and how many numbers they are; each type is looked into once for each depth."""
         if kind.decode() in SIZES:
-            return SIZES[kind.decode()]
+            return SIZES[kind.decode()], 1
         if depth == 0 or kind not in self._fields:
             return None
-        total = 0
+        at = kind, depth
+        if at not in self._extents:
+            self._extents[at] = self._summed(kind, depth)
+        return self._extents[at]
+
+    def _summed(self, kind: bytes, depth: int) -> tuple[int, int] | None:
+        size = columns = 0
         for part, n, _ in self._fields[kind]:
-            size = self._size(part, depth - 1)
-            total += n * size if size else _LARGEST + 1
-            if total > _LARGEST:
+            found = self._extent(part, depth - 1)
+            if found is None or not found[0]:
                 return None
-        return total
+            size, columns = size + n * found[0], columns + n * found[1]
+            if size > _LARGEST:
+                return None
+        return size, columns
+
+
+def could_be(kind: int, raw: bytearray, begin: int, end: int) -> tuple[bool, int]:
+    """Tell whether bytes may be the body of a message, without copying them, and how many were looked at.
+
+    Args:
+        kind: of the message
+        raw: any bytes
+        begin, end: of the body in them
+    """
+    if kind == ord("F"):
+        text = _FORMAT_TEXT.match(raw, begin, end)
+        stop = text.end() if text else begin
+        return stop == end, stop - begin
+    if kind in b"LC":
+        first = begin + (9 if kind == ord("L") else 11)
+        if first > end or raw[begin] not in b"01234567":
+            return False, 0
+        control = _CONTROL.search(raw, first, end)
+        return control is None, (control.start() if control else end) - first
+    if kind in b"AIPMQORSB":
+        return _short(kind, raw, begin, end), 0
+    return True, 0
+
+
+def _short(kind: int, raw: bytearray, begin: int, end: int) -> bool:
+    """Tell at a glance whether a body may be a subscription, a value or a mark."""
+    if kind == ord("A"):
+        return 3 < end - begin <= 3 + _LONGEST_NAME
+    if kind in b"ORSB":
+        return end - begin == {"O": 2, "R": 2, "S": 8}.get(chr(kind))
+    at = begin + (kind in b"MQ")
+    if at >= end or at + 1 + raw[at] > end:
+        return False
+    return _KEY.fullmatch(raw, at + 1, at + 1 + raw[at]) is not None
+
+
+def _parts(fields: bytes) -> list[bytes]:
+    """Cut the fields of a format apart; the semicolon after the last may be missing."""
+    return fields.removesuffix(b";").split(b";")

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import IO
 
-from fleet.telemetry.ulog_formats import Formats, readable
+from fleet.telemetry.ulog_formats import Formats, could_be, readable
 
 MAGIC = b"ULog\x01\x12\x35"
 HEADER = 16  # bytes: magic, version, start stamp
@@ -34,6 +34,11 @@ _head = struct.Struct("<HB").unpack_from
 _short = struct.Struct("<H").unpack_from
 _stamp = struct.Struct("<Q").unpack_from
 _MOST_PLACES = 8  # damaged places named
+_MOST_SLOW = 2_000_000  # messages that are no plain row; more of them are left unread
+_MOST_WANTED = 1 << 26  # bytes of rows of wanted topics that are kept; a flight of an hour has half of it
+_MOST_SMALL = {kind: (20_000, 1 << 22) for kind in b"CILOP"}  # messages of a kind that pass, and their bytes
+_MOST_SEARCHED = 4_000_000_000  # bytes looked at in vain in search of a message, each place counted as `_PLACE` more
+_PLACE = 1000
 
 
 class Sieve:
@@ -54,6 +59,9 @@ class Sieve:
         self._places = 0
         self._damage: list[int] | None = None  # from, to
         self._in_data = False
+        self._slow = self._wanted = self._searched = 0  # so far, as `_MOST_…`
+        self._small: Counter[int] = Counter()
+        self._small_bytes: Counter[int] = Counter()
 
     # --- what pyulog calls ---
 
@@ -115,6 +123,9 @@ class Sieve:
         yield self._header()
         out, good = bytearray(), self._offset
         while self._fill(3):
+            if why := self._too_much():
+                self._say(f"{why} up to byte {self._offset}, the rest was left unread; cut it")
+                break
             message = self._run()
             if not message and self._fill(3):
                 message = self._next()
@@ -130,6 +141,14 @@ class Sieve:
                 out.clear()
         yield bytes(out)
         self._report()
+
+    def _too_much(self) -> str:
+        """Say why no more of it is read; empty: nothing speaks against it."""
+        if self._wanted > _MOST_WANTED:
+            return f"over {_MOST_WANTED >> 20} MiB of rows of the topics needed"
+        if self._slow > _MOST_SLOW:
+            return f"over {_MOST_SLOW:,} messages that are no rows"
+        return "too much that looks like a message and is none" if self._searched > _MOST_SEARCHED else ""
 
     def _header(self) -> bytes:
         whole = self._fill(HEADER)
@@ -162,6 +181,7 @@ class Sieve:
                 out += raw[at : at + 3 + size]
             at += 3 + size
             self.messages += 1
+        self._wanted += len(out)
         if at > self._at:
             self._tell_damage()
             self._at, self._now_us = at, now
@@ -170,6 +190,7 @@ class Sieve:
 
     def _next(self) -> bytes | None:
         """Step over one message, or over damage; give what may pass, empty where it may not; None for damage."""
+        self._slow += 1
         size, kind = _head(self._raw, self._at)
         end = self._offset + 3 + size
         if self._restarts and end > self._restarts[0]:
@@ -218,7 +239,13 @@ class Sieve:
                     found = at
                     break
                 continue
-            if _is_good(kind, bytes(self._raw[at + 3 : at + 3 + size]), self.formats):
+            good, looked = could_be(kind, self._raw, at + 3, at + 3 + size)
+            self._searched += looked + _PLACE
+            if good and _is_good(kind, bytes(self._raw[at + 3 : at + 3 + size]), self.formats):
+                found = at
+                break
+            self._searched += size if good else 0
+            if self._searched > _MOST_SEARCHED:
                 found = at
                 break
         self._at = max(found, self._at + 1)
@@ -244,13 +271,20 @@ class Sieve:
         if not _is_good(kind, body, self.formats):
             return None
         if kind == ord("F") and not self._in_data:
-            self.formats.learn(body)
+            if not self.formats.learn(body):
+                return b""
         elif kind == ord("A"):
             self._in_data = True
             if not self.formats.subscribe(body):
                 return b""
         elif kind == ord("F"):
             return b""
+        if kind in _MOST_SMALL:
+            self._small[kind] += 1
+            self._small_bytes[kind] += len(body)
+            if self._small[kind] > _MOST_SMALL[kind][0] or self._small_bytes[kind] > _MOST_SMALL[kind][1]:
+                self._dropped[f"messages of kind {chr(kind)}, more than any log has,"] += 1
+                return b""
         return struct.pack("<HB", len(body), kind) + body if kind in _PASSED else b""
 
     def _data(self, body: bytes) -> bytes | None:
@@ -262,6 +296,7 @@ class Sieve:
         if not self._in_time(_stamp(body, 2 + topic.stamp_at)[0]):
             self._dropped[f"rows of {topic.name} with a stamp far off"] += 1
             return b""
+        self._wanted += topic.least + 5
         return struct.pack("<HB", topic.least + 2, _DATA) + body[: topic.least + 2]
 
     def _in_time(self, stamp: int) -> bool:

@@ -1,16 +1,15 @@
 """What aircraft told before, kept in the user's cache folder: a proposal to be checked, never the truth."""
 
-import contextlib
 import logging
-import os
-import tempfile
 from pathlib import Path
 
 import msgspec
 
+from fleet import private
 from fleet.contract import Item
 
 _log = logging.getLogger(__name__)
+_MOST = 1 << 24  # bytes read of one card; 5,000 parameters and 1,000 items have 0.5 MB
 
 
 class Card(msgspec.Struct, frozen=True):
@@ -22,39 +21,55 @@ class Card(msgspec.Struct, frozen=True):
     items: tuple[Item, ...] = ()
 
 
-def folder() -> Path:
-    """Name the folder: in this user's cache, or what PARAUAV_ONBOARD says."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(os.environ.get("PARAUAV_ONBOARD") or Path(base) / "parauav" / "onboard")
-
-
 class Cache:
     """Cards by aircraft.
 
     Args:
-        where: their folder, made when the first one is kept
+        where: their folder, made when the first one is kept; one that others could have changed is left alone
     """
 
     def __init__(self, where: Path | None = None) -> None:
-        self._where = folder() if where is None else where
+        self._refused = ""  # why nothing is read or kept
+        self._said = False
+        try:
+            self._where = private.onboard_folder() if where is None else where
+        except RuntimeError as error:
+            self._refused, self._where = str(error), Path()
+        if not self._refused and self._where.is_dir():
+            self._check()
 
     def read(self, key: str) -> Card | None:
         """Give what an aircraft told before; None where nothing is known or the file is damaged."""
         try:
-            return msgspec.json.decode((self._where / f"{key}.json").read_bytes(), type=Card)
-        except (OSError, msgspec.DecodeError):
+            if self._refused:
+                return None
+            with (self._where / f"{key}.json").open("rb") as file:
+                return msgspec.json.decode(file.read(_MOST), type=Card)
+        except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             return None
 
     def keep(self, key: str, card: Card) -> None:
         """Keep what an aircraft tells now; without a disk nothing is kept."""
         if card == self.read(key):
             return
+        if self._where != Path():
+            self._check()
+        if self._refused:
+            if not self._said:
+                _log.warning("what aircraft told cannot be kept: %s", self._refused)
+            self._said = True
+            return
         try:
-            self._where.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=self._where, suffix=".new", delete=False) as file:
-                file.write(msgspec.json.encode(card))
-            os.replace(file.name, self._where / f"{key}.json")
+            private.write(self._where / f"{key}.json", msgspec.json.encode(card))
         except OSError as error:
             _log.warning("what aircraft told cannot be kept in %s (%s)", self._where, error.strerror)
-            with contextlib.suppress(OSError, UnboundLocalError):
-                os.unlink(file.name)
+
+    def _check(self) -> None:
+        """Make the folder, or see that nobody else can have written there."""
+        try:
+            private.folder(self._where, "PARAUAV_ONBOARD")
+            self._refused = ""
+        except ValueError as error:
+            self._refused = str(error)
+        except OSError as error:
+            self._refused = f"{self._where} ({error.strerror})"

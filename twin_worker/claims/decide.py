@@ -140,6 +140,12 @@ class Claims:
             if self.seen[uav] != Rank(epoch, self.me):
                 self.take(uav, wall_ms)
 
+    def timely(self, latest_ms: int, wall_ms: int) -> dict[int, int]:
+        """Forget claims above the latest epoch there may be; give what is held under one, with its new epoch."""
+        if any(rank.epoch > latest_ms for rank in self.seen.values()):
+            self.seen = {uav: rank for uav, rank in self.seen.items() if rank.epoch <= latest_ms}
+        return {uav: self.take(uav, wall_ms) for uav in [uav for uav in self.held if uav not in self.seen]}
+
     # --- what to do --------------------------------------------------------------------------------------------------
 
     def plan(self, now: float) -> Plan:

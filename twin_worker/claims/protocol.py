@@ -21,7 +21,7 @@ from typing import Any, Protocol
 import msgspec
 
 from fleet import SOURCES
-from fleet.codec import Stamp
+from fleet.codec import EPOCH_AHEAD_MS, Stamp, timely
 from fleet.contract import Claim, Handover, Wanted
 from fleet.presence import Present, read
 from fleet.talk import Bus
@@ -37,7 +37,7 @@ _COPIES_S = 20.0  # for all that one worker is asked for at once [s]
 _COPY_S = 1.4  # for one of them; two that are lost do not have the rest taken without: less than half of `_HAND_S` [s]
 _LEAVE_S = 5.0  # for the others to take everything over at the end [s]
 _MEND_S = 1.0  # between looks for what was left half done [s]
-_MOST_EPOCH = 1 << 62  # beyond is no epoch
+_MOST_AHEAD = 100  # workers whose clocks are complained of
 
 
 class Keeper(Protocol):
@@ -97,6 +97,7 @@ class Claiming:
         self._recalling: list[threading.Thread] = []
         self._stranger = False  # somebody unknown announces: the news of a life may come before that of its last end
         self._mended = float("-inf")
+        self._ahead: set[str] = set()  # workers whose epochs were refused
 
     # --- from any thread ---------------------------------------------------------------------------------------------
 
@@ -125,7 +126,7 @@ class Claiming:
 
     def overheard(self, uav: int, stamp: Stamp | None) -> None:
         """Learn from a result who writes for an aircraft."""
-        if stamp is not None and stamp.epoch < _MOST_EPOCH:
+        if stamp is not None and timely(stamp.epoch):
             with self._lock:
                 self.claims.note(uav, Rank(stamp.epoch, f"{stamp.writer:016x}"))
 
@@ -148,7 +149,7 @@ class Claiming:
 
     def _token(self, name: str, lives: bool) -> None:
         told = read(name)
-        if told is None:
+        if told is None or (lives and not self._timely(told.worker, told.born)):
             return
         with self._lock:
             if lives:
@@ -162,10 +163,10 @@ class Claiming:
             return
         with self._lock:
             self._stranger |= claim.worker not in self.claims.peers and not claim.leaving
-            held = {uav: epoch for uav, epoch in claim.held if 0 <= epoch < _MOST_EPOCH}
+            held = {uav: epoch for uav, epoch in claim.held if self._timely(claim.worker, epoch)}
             lost = self.claims.heard(claim.worker, held, claim.leaving)
             for uav, epoch, worker in claim.seen:
-                if 0 <= epoch < _MOST_EPOCH:
+                if timely(epoch):
                     self.claims.note(uav, Rank(epoch, worker))
             self._keeper.drop(lost)
         if lost:
@@ -199,6 +200,7 @@ class Claiming:
         """Do what is due."""
         if not self.tick():
             return
+        self._set_right()
         if self.claims.unsure:
             self._synchronise()
         with self._lock:
@@ -245,6 +247,23 @@ class Claiming:
         for uav, epoch in renewed.items():
             self._keeper.renew(uav, epoch)
 
+    def _set_right(self) -> None:
+        """Claim anew what our own clock, once set back, no longer allows."""
+        with self._lock:
+            renewed = self.claims.timely(_wall_ms() + EPOCH_AHEAD_MS, _wall_ms())
+        for uav, epoch in renewed.items():
+            self._keeper.renew(uav, epoch)
+
+    def _timely(self, worker: str, epoch: int) -> bool:
+        """Tell whether a worker's epoch may be believed; say once where it is far ahead of our clock."""
+        if timely(epoch):
+            return True
+        if worker not in self._ahead and len(self._ahead) < _MOST_AHEAD:
+            self._ahead.add(worker)
+            found = f"claims over {EPOCH_AHEAD_MS // 60_000} minutes ahead of this clock, which are refused"
+            _log.warning("worker %s: found %s; expected one time for all; set its clock, restart it", worker, found)
+        return False
+
     def _ask(self, wanted: dict[str, list[int]]) -> list[int]:
         """Ask each holder for copies, all at the same time; give what is asked for in vain."""
         now, uavs = time.monotonic(), {uav for mine in wanted.values() for uav in mine}
@@ -276,7 +295,7 @@ class Claiming:
         now = time.monotonic()  # it hands over: the rest will come
         with self._lock:
             self._asked_for = self._asked_for | dict.fromkeys(uavs, now)
-            wanted = twin.uav in uavs and twin.uav not in self.claims.held and 0 <= twin.epoch < _MOST_EPOCH
+            wanted = twin.uav in uavs and twin.uav not in self.claims.held and timely(twin.epoch)
             if not wanted or not self.claims.may_write(time.monotonic()):
                 return
             self.claims.note(twin.uav, Rank(twin.epoch, worker))

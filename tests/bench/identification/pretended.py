@@ -1,17 +1,17 @@
 """Fresh flights of the project's own pretend aircraft in gusty wind, and its true airframe without the gusts.
 
 JSBSim flies, the pretend autopilot steers by the errors of its sensors; no byte is sent. Flights take a while, so they
-are kept in the folder that PARAUAV_BENCH_CACHE names, else in the system's folder for temporary files.
+are kept in the folder that PARAUAV_BENCH_CACHE names, else in the user's cache folder.
 """
 
 import hashlib
 import os
-import tempfile
 from math import atan2, degrees, hypot
 from pathlib import Path
 
 import numpy as np
 
+from fleet import private
 from fleet.frames import ned_to_body
 from fleet.pretend.jsbsim import Aircraft, Truth
 from fleet.pretend.missions import HOME
@@ -43,7 +43,6 @@ def _case(seed: int, k: int) -> Case:
             kept = dict(file)
     else:
         kept = _fly(seed, k)
-        path.parent.mkdir(parents=True, exist_ok=True)
         np.savez(path, **kept)
     x, n = kept["measured"], len(kept["measured"])
     flight = Flight(
@@ -86,7 +85,8 @@ def _fly(seed: int, k: int) -> dict[str, np.ndarray]:
 
 
 def _folder() -> Path:
-    return Path(os.environ.get("PARAUAV_BENCH_CACHE") or Path(tempfile.gettempdir()) / f"parauav-bench-{os.getuid()}")
+    given = os.environ.get("PARAUAV_BENCH_CACHE")
+    return private.folder(Path(given).absolute() if given else private.cache_folder() / "bench", "PARAUAV_BENCH_CACHE")
 
 
 def _sources() -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from fleet import private
 from fleet.bus import connect, open_router
 from fleet.codec import Stamp
 from fleet.contract import Account, Found, Mismatch, Prediction, Sample, Status
@@ -35,7 +36,7 @@ Said = list[tuple[float, Any, Stamp | None]]
 
 def flown(name: str, *options: str) -> Path:
     """Fly simulated aircraft into a recording, kept for the next time."""
-    path = Path(tempfile.gettempdir()) / f"parauav-pictures-{name}.tlog"
+    path = private.folder(private.cache_folder() / "pictures", "pictures") / f"{name}.tlog"
     if not path.is_file():
         command = [sys.executable, "-m", "fleet.cli", "fly", *options, "--seed", "1", "--tlog", str(path)]
         subprocess.run(command, cwd=ROOT, check=True)
