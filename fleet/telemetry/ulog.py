@@ -16,6 +16,7 @@ from fleet.telemetry.ulog_topic import Topic, in_order
 from fleet.telemetry.ulog_words import epoch, firmware, release, said_by_topics, system, vehicle
 
 CHUNK_S = 30.0
+_BLOCK = 1 << 17  # rows laid out at once
 EARLY_S = 1.0  # a row may be this much older than the log's start [s]
 _MOST_WORDS = 10_000  # texts and parameter changes taken from one log
 
@@ -43,6 +44,9 @@ class UlogLog:
         self.firmware = firmware(log.msg_info_dict)
         self.epoch_s = epoch(self._topics)
         self._said = self._collect(log)
+        for topic in self._topics.values():
+            if len(topic) > _BLOCK:
+                topic.strip()
         if not self._topics:
             self.skipped.append("found no topic of the table in it, expected a PX4 log; check the file")
 
@@ -73,7 +77,8 @@ class UlogLog:
         """Give the topics by name, the second instance as `name.1`, rows in order of time."""
         topics: dict[str, Topic] = {}
         early = 0
-        for data in log.data_list:
+        while log.data_list:  # what is copied is given back
+            data = log.data_list.pop(0)
             stamp = data.data["timestamp"].astype(np.int64)
             order = in_order(stamp)
             strays = len(stamp) - len(order)
@@ -174,7 +179,21 @@ def _is_number(value: Any) -> bool:
 
 
 def _lay(row: Row, topic: Topic) -> tuple[np.ndarray, np.ndarray, int] | None:
-    """Give times, values and how many rows were refused; None where the log lacks what the row reads."""
+    """Give times, values and how many rows were refused; None where the log lacks what the row reads.
+
+    Rows are independent of each other, so a long topic is laid out in blocks, whose intermediate results need no room.
+    """
+    blocks = []
+    for begin in range(0, max(len(topic), 1), _BLOCK):
+        laid = _lay_block(row, topic.part(begin, begin + _BLOCK))
+        if laid is None:
+            return None
+        blocks.append(laid)
+    t, values, refused = zip(*blocks, strict=True)
+    return np.concatenate(t), np.concatenate(values), sum(refused)
+
+
+def _lay_block(row: Row, topic: Topic) -> tuple[np.ndarray, np.ndarray, int] | None:
     with np.errstate(all="ignore"):
         try:
             meant = np.ones(len(topic), bool) if row.when is None else np.asarray(row.when(topic), bool)

@@ -38,6 +38,14 @@ class Topic:
             raise AttributeError(name)
         return self._others[name]._like(self.t, "")
 
+    def strip(self) -> None:
+        """Give back the fields; the times stay."""
+        self._data = {}
+
+    def part(self, begin: int, end: int) -> "Topic":
+        """Give some of its rows, the other topics whole."""
+        return Topic(self.t[begin:end], {name: values[begin:end] for name, values in self._data.items()}, self._others)
+
     def __len__(self) -> int:
         return len(self.t)
 
