@@ -392,6 +392,10 @@ class Prediction(Message, frozen=True, kw_only=True):
     path: Annotated[Array, Meta(description="mean position, NED from origin, (n, 3) <f4 [m]")]
     tube: Annotated[Array, Meta(description="half-axes along, cross, vertical; to be held all at once, (n, 3) <f4 [m]")]
     quantile: Annotated[float, Meta(description="share of flights the tube is meant to hold, 0..1")] = 0.9
+    axis_quantile: Annotated[
+        float,
+        Meta(description="share of flights that each half-axis alone holds; 0: as of independent axes"),
+    ] = 0.0
     horizon_s: Annotated[float, Meta(description="confidence horizon: `quantile` of its like stay within 10 % [s]")] = (
         0.0
     )

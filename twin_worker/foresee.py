@@ -210,6 +210,7 @@ def _trusted(twin: Twin, made: Made, trust: Trust) -> Prediction:
         path=Array.of(made.path),
         tube=Array.of(trust.tube),
         quantile=QUANTILE,
+        axis_quantile=trust.alone,
         horizon_s=max(trust.horizon_s - begin, 0.0),
         horizon_open=trust.horizon_open,
         held=held,

@@ -18,7 +18,7 @@ from twin_worker.calibration.miss import AHEAD, LIMIT, QUANTILE, axes_error, fir
 from twin_worker.calibration.quantile import median_passage
 from twin_worker.calibration.revision import Earlier
 from twin_worker.calibration.risk import growth
-from twin_worker.calibration.table import Table, doubt_of
+from twin_worker.calibration.table import INDEPENDENT, Table, doubt_of
 from twin_worker.calibration.written import Tables, load
 
 __all__ = [
@@ -36,7 +36,9 @@ __all__ = [
 ]
 _GROUPS = 8  # groups whose levels are remembered
 _ENDED = 60  # passages remembered per method
-_RENEWED_EVERY_S = 5.38  # between continued rollouts that are scored: no multiple of usual periods, so all ages come [s]
+_RENEWED_EVERY_S = (
+    5.38  # between continued rollouts that are scored: no multiple of usual periods, so all ages come [s]
+)
 _RENEWED_ROWS, _RENEWED_S = 48, 60.0  # of them remembered, and how far ahead they are scored [s]
 _RIPE_S = 60.0  # predictions younger say nothing about medians yet: the early failures come first [s]
 
@@ -74,6 +76,7 @@ class Trust:
         sentence: which table it rests on, and how many of the aircraft's own predictions
         factor: how much wider than the table the tube is, by knot, (13,) [-]
         ratio: what the horizon was sought in, (n,) [-]
+        alone: share of the errors that each half-axis alone holds [-]
     """
 
     tube: np.ndarray
@@ -82,6 +85,7 @@ class Trust:
     sentence: str
     factor: np.ndarray
     ratio: np.ndarray
+    alone: float = INDEPENDENT
 
 
 @dataclass
@@ -109,8 +113,9 @@ class Record:
         ratio = growth(half_axes, length)
         horizon, open_end = first_passage(now.horizon * ratio, made.ahead)
         own = f", adapted by {now.own} of its own" if now.own else ""
+        own += "; at the bound of adaptation: the tube may hold fewer than it is meant to" if now.bounded else ""
         tube = now.at(made.ahead)[:, None] * half_axes
-        return Trust(tube, horizon, open_end, said + own, now.tube, ratio)
+        return Trust(tube, horizon, open_end, said + own, now.tube, ratio, table.alone)
 
     def _factors(self, group: str, table: Table) -> Factors:
         """Give the factors in force, reckoned anew for every prediction that was kept."""

@@ -8,7 +8,6 @@ import numba as nb
 import numpy as np
 import scipy.linalg
 
-
 _WORST = 20.0  # errors count as no larger, scaled units
 
 
