@@ -24,6 +24,7 @@ LIMIT_CPU_S = 180.0  # processor time of one job; the first compiles, too [s]
 LIMIT_S = 900.0  # wall time of one job, which is longer only where it waits for what never comes [s]
 _NICE = 15  # how far it yields
 _PATIENCE_S = 1.0  # with the end of process and thread [s]
+_ENDING_S = 30.0  # for a process that has closed its pipe to end by itself; it yields in that, too [s]
 Work = Callable[[Job], Answer]
 
 
@@ -128,16 +129,16 @@ class Background:
         with self._lock:
             process, pipe = self._process, self._pipe
             self._process = self._pipe = None
-            if process is None or pipe is None:
-                return None
-            if process.is_alive():
-                process.join(0.0 if self._closed else _PATIENCE_S)  # one that died tells its own exit code
-            if process.is_alive():
-                process.kill()
-                process.join(_PATIENCE_S)
-            if self._thread is None or self._thread is threading.current_thread() or not self._thread.is_alive():
-                pipe.close()  # else the thread still reads from it, until the end that it sees now
-            return process.exitcode
+        if process is None or pipe is None:
+            return None
+        if not self._closed:
+            process.join(_ENDING_S)  # one that is about to end tells its own exit code
+        if process.is_alive():
+            process.kill()
+            process.join(_PATIENCE_S)
+        if self._thread is None or self._thread is threading.current_thread() or not self._thread.is_alive():
+            pipe.close()  # else the thread still reads from it, until the end that it sees now
+        return process.exitcode
 
     def _why(self, code: int | None) -> str:
         """Say why there is no answer."""
