@@ -408,8 +408,8 @@ class Prediction(Message, frozen=True, kw_only=True):
         float, Meta(description="age of the rollout that is continued from the newest position; 0: a new rollout [s]")
     ] = 0.0
     coverage_renewed: Annotated[
-        float, Meta(description="as `held`, of continued rollouts alone, up to 60 s, 0..1; nan before any")
-    ] = float("nan")
+        float | None, Meta(description="as `held`, of continued rollouts alone, up to 60 s, 0..1; null before any")
+    ] = None
     coverage_renewed_n: Annotated[int, Meta(description="past predictions behind `coverage_renewed`")] = 0
     calibration: Annotated[str, Meta(description="table that tube and horizon rest on, and how far adapted")] = ""
     coast_s: Annotated[float, Meta(description="time flown by the twin alone since the last sample [s]")] = 0.0

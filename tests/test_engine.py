@@ -142,7 +142,7 @@ def test_a_renewed_prediction_is_as_wide_as_the_age_of_its_rollout_demands(twin:
     ahead = base.ahead.numpy().astype(float)
     grown = Array.of(np.outer(np.sqrt(ahead) + 0.1, [3.0, 2.0, 1.0]))
     twin.base = msgspec.structs.replace(base, tube=grown, horizon_s=30.0)
-    for age in (0.5, 3.0, 9.0):
+    for age in (2.0, 5.0, 9.0):
         on(twin, age, np.zeros(3))
         (made,) = renew(twin)
         at, half = made.ahead.numpy().astype(float), made.tube.numpy() / [3.0, 2.0, 1.0]
@@ -176,9 +176,8 @@ def test_renewed_predictions_are_scored_and_their_coverage_is_published(heard: t
     coverage, n = twin.record.coverage_renewed
     assert 4 <= n <= 9 and 0.0 <= coverage <= 1.0
     assert (made[-1].coverage_renewed, made[-1].coverage_renewed_n) == pytest.approx((coverage, n))
-    ages = {round(m.rollout_age_s, 1) for m in made}
-    assert 0.0 in ages and max(ages) > 4.0
-    assert [m.rollout_age_s for m in made if m.rollout_age_s == 0.0][1:] == [0.0] * (len(made) // 10)
+    ages = [m.rollout_age_s for m in made]
+    assert 6 <= ages.count(0.0) <= 10 and max(ages) > 4.0
 
 
 def test_a_renewal_after_the_origin_has_moved_is_in_the_frame_of_its_path(twin: Twin) -> None:

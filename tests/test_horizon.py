@@ -326,7 +326,7 @@ def test_another_origin_of_the_local_frame_is_no_path_flown():
 
 def test_renewed_predictions_are_scored_by_themselves_and_adapt_nothing():
     record = bare()
-    assert np.isnan(record.coverage_renewed[0]) and record.coverage_renewed[1] == 0
+    assert record.coverage_renewed == (None, 0)
     line = np.column_stack([V * TIMES, 0 * TIMES, 0 * TIMES - 100.0])
     tube = np.full((91, 3), 5.0)
     for t in np.arange(0.0, 60.0, 0.5):  # every second one is 6 m aside from 10 s ahead on

@@ -229,9 +229,10 @@ class Record:
         return self._ledger.coverage
 
     @property
-    def coverage_renewed(self) -> tuple[float, int]:
-        """Give the same of continued rollouts alone."""
-        return self._renewed.coverage if self._renewed is not None else (float("nan"), 0)
+    def coverage_renewed(self) -> tuple[float | None, int]:
+        """Give the same of continued rollouts alone; None before any."""
+        share, n = self._renewed.coverage if self._renewed is not None else (0.0, 0)
+        return (share if n else None), n
 
     def t10(self, method: str) -> tuple[float | None, float | None, int]:
         """Give the median first passage of 10 % [s], the share still within, and how many predictions that is.
