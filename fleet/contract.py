@@ -397,6 +397,10 @@ class Prediction(Message, frozen=True, kw_only=True):
     path: Annotated[Array, Meta(description="mean position, NED from origin, (n, 3) <f4 [m]")]
     tube: Annotated[Array, Meta(description="half-axes along, cross, vertical; to be held all at once, (n, 3) <f4 [m]")]
     quantile: Annotated[float, Meta(description="share of flights the tube is meant to hold, 0..1")] = 0.9
+    axis_quantile: Annotated[
+        float,
+        Meta(description="share of flights that each half-axis alone holds; 0: as of independent axes"),
+    ] = 0.0
     horizon_s: Annotated[float, Meta(description="confidence horizon: `quantile` of its like stay within 10 % [s]")] = (
         0.0
     )
@@ -405,6 +409,13 @@ class Prediction(Message, frozen=True, kw_only=True):
         float("nan")
     )
     held_n: Annotated[int, Meta(description="past predictions behind `held`")] = 0
+    rollout_age_s: Annotated[
+        float, Meta(description="age of the rollout that is continued from the newest position; 0: a new rollout [s]")
+    ] = 0.0
+    coverage_renewed: Annotated[
+        float | None, Meta(description="as `held`, of continued rollouts alone, up to 60 s, 0..1; null before any")
+    ] = None
+    coverage_renewed_n: Annotated[int, Meta(description="past predictions behind `coverage_renewed`")] = 0
     calibration: Annotated[str, Meta(description="table that tube and horizon rest on, and how far adapted")] = ""
     coast_s: Annotated[float, Meta(description="time flown by the twin alone since the last sample [s]")] = 0.0
     seq: Annotated[int, Meta(description="mission item the prediction starts on; -1 none")] = -1

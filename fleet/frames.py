@@ -123,4 +123,5 @@ def rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
 @nb.njit(cache=True)
 def wrap(angle: Any) -> Any:
     """Wrap an angle, or an array of them, to (-pi, pi] [rad]; a non-finite angle stays non-finite."""
-    return (angle + pi) % (2 * pi) - pi
+    turned = (angle + pi) % (2 * pi) - pi
+    return turned + 2 * pi * (turned <= -pi)

@@ -7,16 +7,18 @@ import made_up
 import numpy as np
 import pytest
 from made_up import GROUP, V
+from scipy.stats import norm
 
 from twin_worker.calibration.__main__ import main
 from twin_worker.calibration.check import claimed, figures, left_out
+from twin_worker.calibration.conform import factors_of
 from twin_worker.calibration.fit import fit, fit_sigma
 from twin_worker.calibration.groups import airframe_class, group_of, wider
 from twin_worker.calibration.miss import AHEAD, axes_error, first_passage, path_length, track_frame
 from twin_worker.calibration.quantile import censored_quantile, masses, median_passage, survival, weighted_quantile
 from twin_worker.calibration.revision import Earlier
 from twin_worker.calibration.scored import Scored, joined
-from twin_worker.calibration.table import KNOTS, Doubt, doubt_of, law_of_growth, untaught
+from twin_worker.calibration.table import INDEPENDENT, KNOTS, Doubt, doubt_of, law_of_growth, untaught
 from twin_worker.calibration.written import Source, Tables, load, read_tables, write
 
 
@@ -106,6 +108,28 @@ def test_nine_of_ten_are_held_at_every_look_ahead(table):
 def test_what_is_left_out_says_the_same(past):
     got = figures(past, left_out(past, GROUP))
     assert got["coverage"] == pytest.approx(0.9, abs=0.04)
+
+
+@pytest.mark.parametrize(("together", "alone"), [(False, 0.9 ** (1 / 3)), (True, 0.9)])
+def test_how_much_each_axis_alone_holds_is_measured_with_the_factors(together, alone):
+    """Normal errors in each axis, of one size in all three or of three."""
+    rng = np.random.default_rng(9)
+    size = np.abs(rng.standard_normal((20_000, 1, 1 if together else 3))) * np.ones(3)
+    factor, found = factors_of(size, np.ones(20_000))
+    assert found == pytest.approx(alone, abs=0.004)
+    assert factor == pytest.approx(np.full(3, norm.ppf((1 + alone) / 2)), abs=0.05)
+    assert (size <= factor).all(axis=2).mean() == pytest.approx(0.9, abs=0.005)
+
+
+def test_a_table_tells_how_much_an_axis_alone_holds_also_from_a_file(table, tmp_path):
+    assert 0.94 < table.alone <= INDEPENDENT  # made up of independent axes
+    write(tmp_path / "one.json", [replace(table, alone=0.93)], [], "today", "test")
+    assert read_tables(tmp_path / "one.json").by_group[GROUP].alone == 0.93
+    text = (tmp_path / "one.json").read_text()
+    assert '"alone": 0.93' in text
+    (tmp_path / "one.json").write_text(text.replace('"alone": 0.93', '"alone": 0.5'))
+    with pytest.raises(ValueError, match=r"found alone 0.5 .* expected 0.9 to 1"):
+        read_tables(tmp_path / "one.json")
 
 
 def test_a_table_is_not_honest_of_errors_twice_as_large(table):

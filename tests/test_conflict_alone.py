@@ -173,6 +173,12 @@ def test_a_wind_stronger_than_the_airspeed_is_told(wind: tuple[float, float]) ->
     assert result.probability > 0.99 and "item 1" in result.danger and "headway" in result.danger
 
 
+@pytest.mark.parametrize("odd", [np.inf, -np.inf, np.nan])
+def test_without_an_estimate_of_the_wind_no_mission_is_judged(odd: float) -> None:
+    result = judge((FAR,), (odd, 0.0))
+    assert result.probability == 0.0 and not result.danger
+
+
 def test_a_wind_from_behind_carries_there_but_not_back() -> None:
     assert "the return to launch" in judge((FAR,), (25.0, 0.0)).danger
     forever = item(2, 17, north=2000.0, param3=80.0)

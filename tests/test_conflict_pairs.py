@@ -12,6 +12,7 @@ from scipy.stats import norm
 
 from fleet.contract import Alert, AlertKind, Array, Prediction
 from fleet.frames import Origin, to_geodetic, to_ned
+from twin_worker.calibration.conform import factors_of
 from twin_worker.conflict.forecast import axis_z, forecast
 from twin_worker.conflict.separation import Separation
 from twin_worker.conflict.traffic import Traffic
@@ -53,6 +54,22 @@ def test_a_straight_crossing_has_its_closed_form(miss: float, above: float, sigm
     found = probability(*crossing(miss, above, sigma, at))
     given_up = found == 0.0 and closed < 0.1  # 32 draws without a hit: half of what an alert needs, at most
     assert given_up or found == pytest.approx(closed, abs=0.06)
+
+
+@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("miss", [0.0, 60.0, 150.0])
+def test_the_probability_is_that_of_the_errors_the_region_was_calibrated_on(miss: float, together: bool) -> None:
+    """Monte Carlo: normal errors in each axis, of one size in all three or of three; one overtakes the other."""
+    rng, sigma, n = np.random.default_rng(4), np.array([60.0, 70.0, 3.0]), 40_000
+    size = np.abs(rng.standard_normal((2, n, 1 if together else 3))) * np.ones(3)
+    error = rng.choice([-1.0, 1.0], (2, n, 3)) * size * sigma
+    factor, alone = factors_of(size[0][:, None], np.ones(n))
+    assert (size[0] <= factor).all(axis=1).mean() == pytest.approx(0.9, abs=0.01)  # it is the region's quantile
+    half = {"half": factor * sigma, "axis_quantile": alone}
+    a, b = straight(1, **half), straight(2, (-900.0, miss, -100.0), (30.0, 0.0, 0.0), **half)
+    apart = error[1] - error[0] + np.array([0.0, miss, 0.0])  # when it passes, whenever that is
+    lost = (np.abs(apart[:, 1]) < 50.0) & (np.abs(apart[:, 2]) < 20.0)
+    assert probability(a, b) == pytest.approx(lost.mean(), abs=0.02)
 
 
 def test_certain_and_impossible() -> None:
@@ -249,6 +266,13 @@ def test_a_forecast_is_the_prediction_on_whole_steps() -> None:
     draws = found.draws()
     held = (np.abs(draws - found.path) <= found.sigma * Z).all(axis=2)  # path is north: along is north
     assert held.mean() == pytest.approx(0.9, abs=0.03)
+
+
+def test_a_half_axis_is_as_many_sigma_as_an_axis_alone_holds() -> None:
+    assert axis_z(0.9) == pytest.approx(2.114, abs=1e-3) and axis_z(0.9, 0.9) == pytest.approx(1.645, abs=1e-3)
+    assert axis_z(0.9, 0.94) == pytest.approx(norm.ppf(0.97))
+    for odd in (0.0, 0.5, 0.99, 1.0, NAN, INF):  # cannot be of a region that holds 0.9
+        assert axis_z(0.9, odd) == axis_z(0.9)
 
 
 def test_covariance_turns_with_the_path() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fleet.contract import Array, Prediction, Sample
-from fleet.frames import to_geodetic
+from fleet.frames import Origin, to_geodetic
 from fleet.memory_bus import MemoryBus
 from twin_worker import twin as loop
 from twin_worker.__main__ import BEHIND, _get_ready
@@ -25,7 +25,7 @@ from twin_worker.engine.rates import OVER_S, Rates
 from twin_worker.engine.stand_in import said_already, stand_in_for
 from twin_worker.horizon import AHEAD
 from twin_worker.predict import LEAST_AHEAD_S
-from twin_worker.renew import LATEST_S, OVERDUE_S, renew
+from twin_worker.renew import LATEST_S, OVERDUE_S, renew, widened
 from twin_worker.twin import Twin, advance
 from twin_worker.worker import Held, Worker, _advance_all
 
@@ -236,6 +236,62 @@ def test_a_renewed_prediction_begins_where_the_aircraft_is_and_comes_back_to_the
     assert apart[0] == pytest.approx(off, abs=0.05) and np.abs(apart[-1]).max() < 0.1
     assert base.ahead.numpy()[-1] - 2.5 - 5.0 < far <= base.ahead.numpy()[-1] - 2.5
     assert made.tube.shape == made.path.shape == (len(made.ahead.numpy()), 3)
+
+
+def test_a_renewed_prediction_is_as_wide_as_the_age_of_its_rollout_demands(twin: Twin) -> None:
+    """Half-axes of a rollout whose error is a random walk: c sqrt(look-ahead), and so much more for what fades."""
+    base = twin.prediction
+    ahead = base.ahead.numpy().astype(float)
+    grown = Array.of(np.outer(np.sqrt(ahead) + 0.1, [3.0, 2.0, 1.0]))
+    twin.base = msgspec.structs.replace(base, tube=grown, horizon_s=30.0)
+    for age in (2.0, 5.0, 9.0):
+        on(twin, age, np.zeros(3))
+        (made,) = renew(twin)
+        at, half = made.ahead.numpy().astype(float), made.tube.numpy() / [3.0, 2.0, 1.0]
+        fade = np.exp(-at / 10.0)
+        wanted = np.sqrt((np.sqrt(at + age) + 0.1) ** 2 - (np.sqrt(age) + 0.1) ** 2 * fade * (2.0 - fade))
+        wanted = np.maximum(wanted, np.sqrt(at) + 0.1)
+        assert half == pytest.approx(np.tile(wanted[:, None], 3), rel=0.02, abs=0.02)  # straight between look-aheads
+        assert (half[at >= 5.0, 0] > np.sqrt(at[at >= 5.0]) + 0.1).all()
+        assert made.rollout_age_s == pytest.approx(age) and made.horizon_s == pytest.approx(30.0 - age)
+
+
+def test_errors_of_a_random_walk_are_held_as_often_by_renewed_tubes_as_by_new_ones() -> None:
+    rng, n, age = np.random.default_rng(7), 4000, 6
+    walk = np.cumsum(rng.standard_normal((n, len(AHEAD[:61]), 3)), axis=1)
+    half = np.outer(np.sqrt(np.arange(61.0) + 1.0), np.full(3, 2.114))  # of 0.9 in all three at once
+    tube = np.empty((50, 3), np.float32)
+    widened(AHEAD[:61], half, float(age), tube)
+    fade = np.exp(-AHEAD[:50] / 10.0)[:, None]
+    error = walk[:, age : age + 50] - fade * walk[:, [age]]
+    held = (np.abs(error) <= tube).all(axis=2).mean(axis=0)
+    as_new = (np.abs(error) <= half[:50]).all(axis=2).mean(axis=0)
+    assert held[1:] == pytest.approx(np.full(49, 0.9), abs=0.1) and (held[1:] > 0.88).all()
+    assert as_new[20:].min() < 0.88 < held[20:].min()
+
+
+def test_renewed_predictions_are_scored_and_their_coverage_is_published(heard: tuple, twin: Twin) -> None:
+    twin.pace = Pace(predict=5.0, identify=1000.0, renew=0.5)
+    twin.identify_t = twin.data_t
+    rest = f.shifted([m for m in heard if isinstance(m, Sample) and m.t > heard[-1].t - 40.0], 40.0, 1e9)
+    made = [m for message in rest for m in advance(twin, (message,)) if isinstance(m, Prediction)]
+    coverage, n = twin.record.coverage_renewed
+    assert 4 <= n <= 9 and 0.0 <= coverage <= 1.0
+    assert (made[-1].coverage_renewed, made[-1].coverage_renewed_n) == pytest.approx((coverage, n))
+    ages = [m.rollout_age_s for m in made]
+    assert 6 <= ages.count(0.0) <= 10 and max(ages) > 4.0
+
+
+def test_a_renewal_after_the_origin_has_moved_is_in_the_frame_of_its_path(twin: Twin) -> None:
+    twin.base = twin.prediction
+    on(twin, 2.0, np.array([3.0, -4.0, 1.0]))
+    (before,) = renew(copy.deepcopy(twin))
+    far = to_geodetic(twin.origin, np.array([51e3, 0.0, 0.0]))
+    twin.origin = Origin(*map(int, far))
+    (made,) = renew(twin)
+    assert made.origin == before.origin == twin.base.origin
+    assert made.path.numpy() == pytest.approx(before.path.numpy(), abs=0.1)
+    assert twin.record.coverage_renewed[1] == 0 and not twin.record._renewed  # scored in the twin's own frame alone
 
 
 def test_nothing_is_renewed_that_is_old_void_or_lost(twin: Twin) -> None:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from made_up import GROUP, LINE, V
 
+from twin_worker.calibration import adapt
 from twin_worker.calibration.fit import fit
 from twin_worker.calibration.ledger import ROWS
 from twin_worker.calibration.written import Tables
@@ -289,3 +290,54 @@ def test_another_grid_is_refused_with_a_sentence():
     made = Made(0.0, "paper", PLAIN, AHEAD + 3.0, LINE, V)
     with pytest.raises(ValueError, match=r"^record: found 91 look-aheads up to 183 s, expected the first of AHEAD$"):
         record.keep(made, record.trust(made))
+
+
+def test_errors_that_outgrow_all_adaptation_are_held_less_often_and_the_prediction_says_so():
+    """No coverage is guaranteed: levels and half-axes are bounded."""
+    record, grown = bare(), 1.0
+    assert "bound" not in record.trust(Made(0.0, "paper", PLAIN, AHEAD, LINE, V)).sentence
+    for t in np.arange(0.0, 400.0, 5.0):
+        kept(record, t, path=moved(t))
+        grown *= 1.15
+        at = np.arange(t - 3.0, t + 5.01, 0.1)
+        flown = np.column_stack([V * at, np.full(len(at), grown * (-1.0) ** int(t / 5)), np.full(len(at), -100.0)])
+        record.answer(at, flown)
+    assert record.held[0] < 0.85
+    said = record.trust(Made(400.0, "paper", PLAIN, AHEAD, moved(400.0), V)).sentence
+    assert "at the bound of adaptation: the tube may hold fewer" in said
+    assert "whatever the flight does" not in (adapt.__doc__ or "") and "No coverage is guaranteed" in (
+        adapt.__doc__ or ""
+    )
+
+
+def test_another_origin_of_the_local_frame_is_no_path_flown():
+    """The aircraft flies on at V; its positions are told from an origin 51 km away from t = 20 s on."""
+    record, far = bare(), np.array([51e3, 0.0, 0.0])
+    kept(record)
+    line = np.column_stack([V * TIMES, 0 * TIMES, 0 * TIMES - 100.0])
+    record.answer(TIMES[TIMES <= 20.0], line[TIMES <= 20.0])
+    record.forget(moved=True)
+    kept(record, 20.0, path=moved(20.0) - far + [0.0, 100.0, 0.0])  # 100 m aside of where it flies
+    for until in np.arange(21.0, 60.0):
+        now = (until - 4.0 < TIMES) & (until >= TIMES)
+        record.answer(TIMES[now], line[now] - far)
+    assert record._ledger.passed[1] and record._ledger.followed[1] < 2.0
+
+
+def test_renewed_predictions_are_scored_by_themselves_and_adapt_nothing():
+    record = bare()
+    assert record.coverage_renewed == (None, 0)
+    line = np.column_stack([V * TIMES, 0 * TIMES, 0 * TIMES - 100.0])
+    tube = np.full((91, 3), 5.0)
+    for t in np.arange(0.0, 60.0, 0.5):  # every second one is 6 m aside from 10 s ahead on
+        aside = np.where(AHEAD >= 10.0, 6.0, 0.0) * (len(record._renewed.t0[record._renewed.live]) % 2 if t else 0)
+        record.keep_renewed(t, "paper", moved(t) + np.outer(aside, [0.0, 1.0, 0.0]), tube)
+    assert record.waits and record.held[1] == 0
+    for until in np.arange(1.0, 185.0):
+        now = (until - 4.0 < TIMES) & (until >= TIMES)
+        record.answer(TIMES[now], line[now])
+    coverage, n = record.coverage_renewed
+    assert n == 12 and coverage == pytest.approx((60.0 + 9.0) / 120.0, abs=0.01) and not record.waits
+    assert np.isnan(record.held[0]) and not record._levels and not record.scored
+    record.keep_renewed(10.0, "paper", moved(10.0), tube)  # the clock was set back
+    assert record.coverage_renewed[1] == 0

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from twin_worker.imm import STEP, imm
+from twin_worker.imm import STEP, imm, turn_on
+from twin_worker.track import STEP as TRACK_STEP
+from twin_worker.track import Track
 
 AHEAD = np.arange(0.0, 61.0)
 N = 24
@@ -67,3 +69,22 @@ def test_a_step_in_position_gives_numbers():
     p, v = straight()
     p[12:] += 1e5
     assert np.isfinite(imm(p, v, AHEAD)).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_leap_that_no_aircraft_flies_begins_the_track_anew(seed):
+    """As where the clock jumps: rows of two times on one grid, positions and velocities far beyond any flight."""
+    rng = np.random.default_rng(seed)
+    n, at = 121, int(rng.integers(10, 90))
+    t = TRACK_STEP * np.arange(n)
+    clean = np.outer(t, [18.0, 9.0, 0.0]) + np.array([100.0, 50.0, -120.0])
+    p, v = clean.copy(), np.tile([18.0, 9.0, 0.0], (n, 1))
+    leap = 10.0 ** rng.uniform(10.0, 13.0) * rng.standard_normal(3)
+    p[: at + 1] += leap
+    if seed % 2:
+        v[at] += leap
+    path = turn_on(Track(t, p, v, np.full((n, 3), np.nan), np.ones(n, bool), ""), AHEAD)
+    assert path is not None
+    assert np.linalg.norm(path[5] - (clean[-1] + 5.0 * np.array([18.0, 9.0, 0.0]))) < 5.0
+    v[-1] = np.nan
+    assert turn_on(Track(t, p, v, np.full((n, 3), np.nan), np.ones(n, bool), ""), AHEAD) is None

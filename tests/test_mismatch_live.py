@@ -1,11 +1,16 @@
 """Mismatch live: when a worker looks, what it says and when, and that nothing of it can stop the predictions."""
 
+import copy
+import os
+import signal
+import threading
 from contextlib import nullcontext
 from dataclasses import replace
 
 import flights as f
 import msgspec
 import numpy as np
+import odd_jobs
 import pytest
 from diagnosed import made
 
@@ -214,7 +219,7 @@ def test_the_worker_publishes_answers_and_shows_what_was_found(holder, monkeypat
     assert row.mismatch == "named actuator_lag of the elevator"
 
 
-def test_a_defect_of_the_diagnosis_leaves_the_predictions(holder):
+def test_a_defect_of_the_diagnosis_leaves_the_predictions_and_is_said(holder, monkeypatch):
     class Broken(Hand):
         def answer(self) -> Answer | None:
             raise RuntimeError("broken")
@@ -225,11 +230,82 @@ def test_a_defect_of_the_diagnosis_leaves_the_predictions(holder):
     for m in f.messages(f.turn(6.0), uav=2):
         holder.bus.publish(m)
     holder.turn()
-    assert made_ and holder.diagnosis is None and "diagnosis met a defect" in holder.state().sentence
+    assert made_ and "diagnosis met a defect (broken); it is tried again in 60 s" in holder.state().sentence
+    holder.diagnosis._hand = hand = Hand()
+    holder.turn()
+    assert not hand.jobs  # not yet
+    holder._diagnose_from = -np.inf
+    holder.turn()
+    assert hand.jobs and not holder.state().sentence
+
+
+def test_a_defect_met_by_one_aircraft_leaves_the_diagnosis_of_the_others(looking, twin):
+    live, hand, twin = looking
+    other = copy.copy(twin)
+    other.uav = 2
+    live.watch(1).base = None
+    live.watch(1).told = "no message"  # what is looked at raises
+    live.watch(1).past = {}
+    held = [(twin, nullcontext()), (other, nullcontext())]
+    assert list(live.turn(held)) == []
+    assert [job.uav for job in hand.jobs] == [2]
+    (said,) = live.failed([1, 2])
+    assert said.startswith("uav-1: its diagnosis met a defect (AttributeError") and "tried again in 60 s" in said
+
+
+def test_a_defect_in_taking_an_answer_is_that_aircrafts_alone_and_passes(looking, monkeypatch):
+    live, hand, twin = looking
+    turned(live, twin)
+    hand.say(made())
+    monkeypatch.setattr("twin_worker.mismatch.watch.message", None)
+    assert turned(live, twin) == [] and "TypeError" in live.failed([1])[0]
+    monkeypatch.undo()
+    watch = live.watch(1)
+    watch.next_t = -np.inf
+    turned(live, twin)
+    assert len(hand.jobs) == 1  # left alone for a while
+    watch.off_until = -np.inf
+    turned(live, twin)
+    hand.say(made())
+    assert turned(live, twin) and live.failed([1]) == []
+
+
+def test_an_answer_waits_for_an_aircraft_that_is_worked_on(looking):
+    """And nobody waits for it: the lock is held for as long as an identification takes."""
+    live, hand, twin = looking
+    turned(live, twin)
+    hand.say(made())
+    lock = threading.Lock()
+    with lock:
+        assert list(live.turn([(twin, lock)])) == []
+    (found,) = live.turn([(twin, lock)])
+    assert found.outcome is Found.SUSPECTED
+
+
+def test_a_defect_is_retried_less_and_less_often():
+    watch, waits = Watch(base=BASE), []
+    for _ in range(9):
+        watch.take(Answer(1, 0.0, 1000.0, failed="its process was killed by signal 9"))
+        waits.append(watch.off_until - 1000.0)
+    assert waits[:3] == [60.0, 120.0, 240.0] and waits[-1] == 3600.0 and "signal 9" in watch.failed
+    watch.take(Answer(1, 0.0, 5000.0))
+    assert watch.failures == 0 and not watch.failed
 
 
 def test_without_a_diagnosis_nothing_is_answered(holder):
     assert holder.bus.ask(Mismatch) == [] and holder.state().rows[0].mismatch == ""
+
+
+def worked(hand: Background, uav: int, rows: dict | None = None) -> Answer:
+    """Give a job and wait for its answer."""
+    empty = {"attitude": (np.array([1.0, 2.0]), np.zeros((2, 6)))}
+    hand.give(Job(uav, rows or empty, {}, UNKNOWN, BASE))
+    hand._thread.join(300.0)
+    assert not hand._thread.is_alive()
+    answer = hand.answer()
+    assert answer is not None and answer.uav == uav
+    hand._free_at = 0.0
+    return answer
 
 
 def test_the_background_process_answers_keeps_its_budget_and_ends(twin):
@@ -237,29 +313,47 @@ def test_the_background_process_answers_keeps_its_budget_and_ends(twin):
     try:
         hand.give(Job(1, rows_of(twin.history, twin.history.newest - 5.0), {}, UNKNOWN, BASE))
         assert not hand.free
-        assert hand._pipe.poll(60.0)
+        hand._thread.join(300.0)
         answer = hand.answer()
         assert answer.uav == 1 and "expected 25 s" in answer.refused
         assert not hand.free  # the little time it took is a millionth of a core only after a while
         assert hand.answer() is None
     finally:
         hand.close()
-    assert hand._process is None
+    assert hand._process is None and not hand.free
 
 
-def test_a_background_process_that_dies_is_started_again(twin):
-    job = Job(1, rows_of(twin.history, twin.history.newest - 5.0), {}, UNKNOWN, BASE)
-    hand = Background(share=1.0)
+def test_a_job_that_dies_hangs_or_raises_is_told_and_the_next_is_worked_out():
+    hand = Background(1.0, odd_jobs.odd, limit_cpu_s=2.0, limit_s=300.0)
     try:
-        hand.give(job)
-        hand._process.kill()
-        hand._process.join(10.0)
-        while hand.answer() is None and hand._busy:
-            pass
-        hand._free_at = 0.0
-        assert hand.free
-        hand.give(job)
-        assert hand._pipe.poll(60.0) and hand.answer() is not None
+        said = {uav: worked(hand, uav) for uav in (odd_jobs.RAISES, odd_jobs.ENDS, odd_jobs.KILLED, odd_jobs.SPINS)}
+        assert said[odd_jobs.RAISES].failed == "KeyError: 'nothing of the kind'"
+        assert "odd_jobs.py" in said[odd_jobs.RAISES].details
+        assert said[odd_jobs.ENDS].failed == "its process ended with exit code 3"
+        assert said[odd_jobs.KILLED].failed == "its process was killed by signal 9"
+        assert said[odd_jobs.SPINS].failed == "found no answer after 2 s of processor time"
+        assert all((one.begin, one.end) == (1.0, 2.0) for one in said.values())
+        assert not worked(hand, odd_jobs.FINE).failed
+        hand._limit_s = 0.5  # of a process that lives already
+        assert worked(hand, odd_jobs.HANGS).failed == "found no answer after 0 s"
+        hand._limit_s = 300.0
+        assert not worked(hand, odd_jobs.FINE).failed
+    finally:
+        hand.close()
+
+
+def test_who_gives_a_job_never_waits_for_the_process_to_take_it():
+    """A job of 20 MB, and a process that does not run: the pipe holds a fraction of it."""
+    hand = Background(1.0, odd_jobs.deaf, limit_s=300.0)
+    rows = {"attitude": (np.arange(500_000.0), np.zeros((500_000, 6)))}
+    try:
+        worked(hand, odd_jobs.FINE)
+        os.kill(hand._process.pid, signal.SIGSTOP)
+        hand.give(Job(7, rows, {}, UNKNOWN, BASE))  # would wait for ever
+        assert not hand.free and hand.answer() is None and hand._thread.is_alive()
+        os.kill(hand._process.pid, signal.SIGCONT)
+        hand._thread.join(300.0)
+        assert hand.answer().end == 500_000
     finally:
         hand.close()
 

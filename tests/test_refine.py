@@ -57,6 +57,18 @@ def test_cost_is_the_sum_of_squared_errors_of_free_runs():
     assert squares[4] == 200 - 4  # a segment's first row is its start
 
 
+def test_a_run_that_diverges_costs_more_than_one_that_stays():
+    y, u = flight(200)
+    W, ok = np.ones(4), np.ones(200, bool)
+    wild = np.hstack([1000.0 * np.eye(4), truth()[:, 4:]])
+    cost, g, H, squares = normal_equations(wild, y, u, ok, W, 50)
+    assert cost == pytest.approx(400.0 * 4 * (200 - 4), rel=0.05)  # the largest error in every state of every row
+    assert squares[4] == 200 - 4 and np.isfinite(g).all() and np.isfinite(H).all()
+    assert cost > 100.0 * normal_equations(truth(), y, u, ok, W, 50)[0]
+    ok[60:90] = False
+    assert normal_equations(wild, y, u, ok, W, 50)[3][4] == (~ok[:0]).sum() + 200 - 30 - 4
+
+
 def test_the_gradient_is_the_slope_of_the_cost():
     y, u = flight(150)
     D, W, ok = biased(), np.ones(4), np.ones(150, bool)

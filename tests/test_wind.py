@@ -59,3 +59,20 @@ def test_a_steep_dive_and_a_long_silence_stay_finite():
     filt = flown(30.0)
     filt.update(filt.t + 1e6, np.array([5.0, 5.0, 60.0]), VA, 1.0)
     assert np.isfinite([*filt.wind, filt.scale, filt.sigma]).all()
+
+
+def test_a_wind_that_cannot_be_is_never_told():
+    """Airspeed and velocity as telemetry lets them through, whatever the first rows say, and estimates of others."""
+    for seed in range(20):
+        rng, filt = np.random.default_rng(seed), WindFilter()
+        for k in range(80):
+            wild = 10.0 ** rng.uniform(1.0, 5.0) if rng.random() < 0.3 else 1.0
+            filt.update(k / 5, np.clip(20.0 * wild * rng.standard_normal(3), -1e5, 1e5), min(VA * wild, 1e5), k)
+            assert np.hypot(*filt.wind[:2]) < 150.0
+    filt = flown(60.0)
+    before = filt.wind
+    for odd in (np.inf, np.nan, 1e4):
+        filt.blow(filt.t, np.array([odd, 0.0, 0.0]))
+        filt.jump(np.array([odd, 0.0, 0.0]), 1.0, 0.1)
+    filt.jump(np.zeros(3), np.inf, 0.1)
+    assert np.array_equal(filt.wind, before) and np.isfinite(filt.P).all()

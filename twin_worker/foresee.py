@@ -197,6 +197,7 @@ def _state(twin: Twin, otherwise: State) -> State:
 def _trusted(twin: Twin, made: Made, trust: Trust) -> Prediction:
     """Publish a path with its tube and up to when the 90 % error stays below 10 % of the path."""
     held, n = twin.record.held
+    coverage, coverage_n = twin.record.coverage_renewed
     begin = float(made.ahead[0])
     assert twin.origin is not None
     return Prediction(
@@ -209,9 +210,12 @@ def _trusted(twin: Twin, made: Made, trust: Trust) -> Prediction:
         path=Array.of(made.path),
         tube=Array.of(trust.tube),
         quantile=QUANTILE,
+        axis_quantile=trust.alone,
         horizon_s=max(trust.horizon_s - begin, 0.0),
         horizon_open=trust.horizon_open,
         held=held,
         held_n=n,
+        coverage_renewed=coverage,
+        coverage_renewed_n=coverage_n,
         calibration=trust.sentence,
     )

@@ -18,7 +18,7 @@ from twin_worker.calibration.miss import AHEAD, LIMIT, QUANTILE, axes_error, fir
 from twin_worker.calibration.quantile import median_passage
 from twin_worker.calibration.revision import Earlier
 from twin_worker.calibration.risk import growth
-from twin_worker.calibration.table import Table, doubt_of
+from twin_worker.calibration.table import INDEPENDENT, Table, doubt_of
 from twin_worker.calibration.written import Tables, load
 
 __all__ = [
@@ -36,6 +36,10 @@ __all__ = [
 ]
 _GROUPS = 8  # groups whose levels are remembered
 _ENDED = 60  # passages remembered per method
+_RENEWED_EVERY_S = (
+    5.38  # between continued rollouts that are scored: no multiple of usual periods, so all ages come [s]
+)
+_RENEWED_ROWS, _RENEWED_S = 48, 60.0  # of them remembered, and how far ahead they are scored [s]
 _RIPE_S = 60.0  # predictions younger say nothing about medians yet: the early failures come first [s]
 
 
@@ -72,6 +76,7 @@ class Trust:
         sentence: which table it rests on, and how many of the aircraft's own predictions
         factor: how much wider than the table the tube is, by knot, (13,) [-]
         ratio: what the horizon was sought in, (n,) [-]
+        alone: share of the errors that each half-axis alone holds [-]
     """
 
     tube: np.ndarray
@@ -80,6 +85,7 @@ class Trust:
     sentence: str
     factor: np.ndarray
     ratio: np.ndarray
+    alone: float = INDEPENDENT
 
 
 @dataclass
@@ -94,6 +100,8 @@ class Record:
     _earlier: Earlier = field(default_factory=Earlier)
     _levels: dict[str, Levels] = field(default_factory=dict)
     _joined: tuple[tuple[str, float], Factors] | None = None
+    _renewed: Ledger | None = None  # continued rollouts; none before the first
+    _renewed_due: float = -np.inf  # the next of them is remembered from then on [s since 1970]
 
     def trust(self, made: Made) -> Trust:
         """Wrap a prediction in its tube and say up to when it stays within 10 %."""
@@ -105,8 +113,9 @@ class Record:
         ratio = growth(half_axes, length)
         horizon, open_end = first_passage(now.horizon * ratio, made.ahead)
         own = f", adapted by {now.own} of its own" if now.own else ""
+        own += "; at the bound of adaptation: the tube may hold fewer than it is meant to" if now.bounded else ""
         tube = now.at(made.ahead)[:, None] * half_axes
-        return Trust(tube, horizon, open_end, said + own, now.tube, ratio)
+        return Trust(tube, horizon, open_end, said + own, now.tube, ratio, table.alone)
 
     def _factors(self, group: str, table: Table) -> Factors:
         """Give the factors in force, reckoned anew for every prediction that was kept."""
@@ -128,7 +137,7 @@ class Record:
             raise ValueError(f"record: found {n} look-aheads up to {made.ahead[-1]:g} s, expected the first of AHEAD")
         if made.t < self._ledger.newest:  # the clock was set back: nothing of before can be answered
             self.forget()
-            self._ledger = Ledger()
+            self._ledger, self._renewed = Ledger(), None
         if made.t - self._ledger.newest < EVERY_S or n < 2:
             return
         self._earlier.add(made.t, made.ahead, made.path)
@@ -137,9 +146,35 @@ class Record:
         book.tube[r, :n], book.factor[r], book.horizon[r] = trust.tube, trust.factor, trust.horizon_s
         book.ratio[r], book.ratio[r, :n] = trust.ratio[-1], trust.ratio
 
-    def forget(self) -> None:
-        """Follow no prediction beyond now: an event (mode, mission, clock) has made them meaningless."""
+    def keep_renewed(self, t: float, method: str, path: np.ndarray, tube: np.ndarray) -> None:
+        """Remember a continued rollout for scoring, at most one every few seconds; it adapts nothing.
+
+        Args:
+            t: look-ahead 0 [s since 1970]
+            method: as in `Prediction`
+            path, tube: NED and half-axes over the first n of `AHEAD`, (n, 3) [m]
+        """
+        if self._renewed is None or t < self._renewed.newest:
+            self._renewed, self._renewed_due = Ledger(_RENEWED_ROWS, int(AHEAD.searchsorted(_RENEWED_S)) + 1), t
+        book = self._renewed
+        n = min(len(path), book.score.shape[1])
+        if t < self._renewed_due or n < 2:
+            return
+        self._renewed_due = max(self._renewed_due, t - _RENEWED_EVERY_S) + _RENEWED_EVERY_S
+        r = book.add(t, method, "", path[:n], 0.0)
+        book.tube[r, :n] = tube[:n]
+
+    def forget(self, *, moved: bool = False) -> None:
+        """Follow no prediction beyond now: an event (mode, mission, clock) has made them meaningless.
+
+        Args:
+            moved: the origin of the local frame is another from now on
+        """
         self._enter(self._ledger.end())
+        for book in filter(None, (self._ledger, self._renewed)):
+            book.end()
+            if moved:
+                book.restart()
         self._earlier.clear()
 
     def answer(self, t: np.ndarray, flown: np.ndarray) -> int:
@@ -155,6 +190,8 @@ class Record:
             return 0
         live = self._ledger.live.copy()
         r, j = self._ledger.answer(t, flown)
+        if self._renewed is not None:
+            self._renewed.answer(t, flown)
         for group in set(self._ledger.group[r].tolist()):
             if group not in self._levels and len(self._levels) >= _GROUPS:
                 del self._levels[next(iter(self._levels))]
@@ -179,7 +216,7 @@ class Record:
     @property
     def waits(self) -> bool:
         """Tell whether any prediction waits for answers."""
-        return bool(self._ledger.live.any())
+        return bool(self._ledger.live.any()) or (self._renewed is not None and bool(self._renewed.live.any()))
 
     @property
     def waiting(self) -> tuple[float, ...]:
@@ -189,10 +226,13 @@ class Record:
     @property
     def held(self) -> tuple[float, int]:
         """Give the measured share of look-aheads inside the tube so far (nan before any) and the predictions behind."""
-        score = self._ledger.score[:, 1:].copy()  # at once: another thread may read while this one scores
-        known = np.isfinite(score)
-        n = int(known.any(axis=1).sum())
-        return (float((score[known] <= 1.0).mean()) if n else float("nan")), n
+        return self._ledger.coverage
+
+    @property
+    def coverage_renewed(self) -> tuple[float | None, int]:
+        """Give the same of continued rollouts alone; None before any."""
+        share, n = self._renewed.coverage if self._renewed is not None else (0.0, 0)
+        return (share if n else None), n
 
     def t10(self, method: str) -> tuple[float | None, float | None, int]:
         """Give the median first passage of 10 % [s], the share still within, and how many predictions that is.

@@ -14,6 +14,7 @@ from twin_worker.track import Track
 STEP = 0.5  # filter step [s]
 _ROWS = 24  # steps of the past the filter runs over
 _TURN = 0.3  # turn rate of the two turning models [rad/s]
+_FASTEST = 1e3  # faster rows, and rows farther apart, are no flight of one aircraft [m/s]
 _STAY = np.array([[0.97, 0.015, 0.015], [0.06, 0.93, 0.01], [0.06, 0.01, 0.93]])  # model switching per step
 
 
@@ -44,6 +45,8 @@ def _filter(rate: float, noise: float, start: np.ndarray) -> KalmanFilter:
 def turn_on(flown: Track, ahead: np.ndarray) -> np.ndarray | None:
     """Predict from the end of a track, NED, (k, 3) [m]; None while less than four steps of it are unbroken.
 
+    Where the clock jumps, rows of two times lie on one grid: what is before the last leap is left out.
+
     Args:
         flown: newest flight
         ahead: wanted look-ahead times, (k,) [s]
@@ -51,8 +54,18 @@ def turn_on(flown: Track, ahead: np.ndarray) -> np.ndarray | None:
     every = round(STEP / TRACK_STEP)
     whole = flown.whole()
     rows = slice((len(whole) - 1) % every, None, every)
-    p, v = whole.p[rows][-_ROWS:], whole.v[rows][-_ROWS:]
+    p, v = _after_leap(whole.p[rows][-_ROWS:], whole.v[rows][-_ROWS:])
     return imm(p, v, ahead) if len(p) >= 4 else None
+
+
+def _after_leap(p: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cut positions and velocities, (n, 3), to those after the last row that no aircraft can fly; nan is none."""
+    flown = np.linalg.norm(v, axis=1) < _FASTEST
+    flown[1:] &= np.linalg.norm(np.diff(p, axis=0), axis=1) < _FASTEST * STEP
+    leaps = np.flatnonzero(~flown)
+    first = int(leaps[-1]) if len(leaps) else 0
+    first += int(len(leaps) > 0 and not np.linalg.norm(v[first]) < _FASTEST)  # after a leap in position it flies on
+    return p[first:], v[first:]
 
 
 def imm(p: np.ndarray, v: np.ndarray, ahead: np.ndarray) -> np.ndarray:

@@ -8,6 +8,8 @@ import numba as nb
 import numpy as np
 import scipy.linalg
 
+_WORST = 20.0  # errors count as no larger, scaled units
+
 
 @nb.njit(cache=True, nogil=True)
 def free_run(D: np.ndarray, x0: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
@@ -30,7 +32,8 @@ def normal_equations(
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
     """Sum cost, gradient, Gauss-Newton matrix and residual square sums over segments of `length` samples.
 
-    Each segment starts at its measured state; S = d y_hat / d par follows S' = A S + d(D z)/d par.
+    Each segment starts at its measured state; S = d y_hat / d par follows S' = A S + d(D z)/d par. A run that leaves
+    +-50 has diverged: each of its measured rows from there on costs the largest error, `_WORST`, and has no slope.
     D (n, q); y (N, n); u (N, m); ok (N,) bool; W (n,) weights.
     """
     n, q = D.shape
@@ -41,15 +44,15 @@ def normal_equations(
     z, x, x_next = np.zeros(q), np.zeros(n), np.zeros(n)
     A, S, S_next = D[:, :n].copy(), np.zeros((n, total)), np.zeros((n, total))
     z[q - 1] = 1.0
-    running = False
+    running = diverged = False
     for k in range(len(y)):
         if k % length == 0 or not running:
-            running = ok[k]
+            running, diverged = ok[k], False
             x[:] = y[k]
             S[:] = 0.0
         elif ok[k]:
             for i in range(n):
-                e = min(max(y[k, i] - x[i], -20.0), 20.0)
+                e = _WORST if diverged else min(max(y[k, i] - x[i], -_WORST), _WORST)
                 cost += W[i] * e * e
                 squares[i] += e * e
                 for a in range(total):
@@ -72,9 +75,11 @@ def normal_equations(
             x_next[i] = min(max(s, -50.0), 50.0)
         x[:] = x_next
         S[:] = S_next
-        if np.abs(x).max() >= 50.0:
+        if not np.abs(x).max() < 50.0:
+            diverged = True
+        if diverged:
+            x[:] = 0.0
             S[:] = 0.0
-            running = False
     for a in range(total):
         for b in range(a):
             H[b, a] = H[a, b]

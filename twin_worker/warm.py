@@ -27,7 +27,7 @@ from twin_worker.linearise import linearise
 from twin_worker.plant import settled
 from twin_worker.predict import held
 from twin_worker.preprocess import Grid
-from twin_worker.renew import shifted
+from twin_worker.renew import shifted, widened
 from twin_worker.unseen import Unseen
 from twin_worker.verify import verify
 from twin_worker.wind import WindFilter
@@ -104,6 +104,7 @@ def _go_on() -> None:
     """Renew a prediction, feed the wind filter, and see whether it flies."""
     ahead, path = (Array.of(values).numpy() for values in (np.arange(5.0), np.zeros((5, 3))))
     shifted(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
+    widened(ahead, path, 1.0, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     moves(np.zeros((3, 3)))  # type: ignore[call-arg]
     WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, 0.0)
 

@@ -14,6 +14,8 @@ _SIGMA = 1.0  # sideslip and sensors in one ground-velocity component [m/s]
 _GATE = 25.0  # squared normalised innovation beyond which a row is ignored
 _SURPRISE_S = 60.0  # innovations are averaged over as much [s]
 _CALM, _ROUGH = 0.05, 10.0  # least and most mean squared innovation that is believed [-]
+_FASTEST = 1e3  # speeds through the air or over ground beyond are noise [m/s]
+_STRONGEST = 150.0  # wind beyond is noise: the filter begins anew [m/s]
 _START = np.array([0.03, 0.03, 6.0, 6.0, DRIFT, DRIFT, GUST, GUST])
 
 
@@ -88,27 +90,38 @@ class WindFilter:
     """
 
     def __init__(self) -> None:
-        self.x, self.P = np.array([1.0, *np.zeros(7)]), np.diag(_START**2)
-        self._rows = 0
-        self._surprise = 1.0
         self.t = -np.inf
+        self._reset()
 
     def update(self, t: float, ground: Iterable[float], Va: float, psi: float) -> None:
         """Take one row: ground velocity NED (3,) [m/s], reported airspeed [m/s], heading [rad]."""
         dt = min(t - self.t, 5.0) if isfinite(self.t) else 0.2
-        if dt <= 0 or Va < 3.0:
+        north, east, down = map(float, ground)
+        if dt <= 0 or not 3.0 <= Va < _FASTEST or not hypot(north, east, down) < _FASTEST:
             return
         self.t = t
-        north, east, down = map(float, ground)
         level = Va * sqrt(max(1 - (down / Va) ** 2, 0.25))
         self._rows += 1
         gate = inf if self._rows < 50 else _GATE
         along, across = level * cos(psi), level * sin(psi)
         surprise = _take(self.x, self.P, dt, along, across, north, east, gate)  # type: ignore[call-arg]
         self._surprise += dt / _SURPRISE_S * (min(surprise, _GATE) / 2 - self._surprise)
+        if not self._believable():
+            self._reset()
+
+    def _believable(self) -> bool:
+        """Tell whether the estimate is a wind; false for nan."""
+        return hypot(self.x[2] + self.x[4], self.x[3] + self.x[5]) < _STRONGEST and bool(np.isfinite(self.P).all())
+
+    def _reset(self) -> None:
+        """Set the estimate back to no wind; its time stays."""
+        self.x, self.P = np.array([1.0, *np.zeros(7)]), np.diag(_START**2)
+        self._rows, self._surprise = 0, 1.0
 
     def blow(self, t: float, wind: np.ndarray) -> None:
-        """Believe this wind at time `t` [s since 1970], NED, (3,) [m/s]."""
+        """Believe this wind at time `t` [s since 1970], NED, (3,) [m/s]; one that cannot be changes nothing."""
+        if not hypot(*wind[:2]) < _STRONGEST:
+            return
         self.t = t
         self.x[2:6] = *wind[:2], 0.0, 0.0  # mean, and no drift from it
 
@@ -119,7 +132,11 @@ class WindFilter:
             wind: added, NED, (3,) [m/s]
             scale: true over reported airspeed from now on, over what it was [-]
             doubt: standard deviation, as a share of the change
+
+        A change that cannot be is left out.
         """
+        if not (hypot(*wind[:2]) < _STRONGEST and 0.0 < scale < inf):
+            return
         x, P = self.x, self.P
         x[2:4] += wind[:2]
         P[[2, 3], [2, 3]] += (doubt * wind[:2]) ** 2

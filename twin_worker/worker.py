@@ -48,6 +48,7 @@ _SWEEP_S = 0.015  # of telemetry is taken in at once [s]
 _LATE_S = 0.12, 0.2  # between sweeps, from which telemetry counts as late: least and most [s]
 _LATE, _HEAVY = 1.2, 0.25  # that in periods of renewal; what heavy work may take of it, CPU [-]
 _END_S = 1.0  # for a thread to end what it has begun; one that is late is left behind [s]
+_OFF_S = 60.0  # after a defect of the diagnosis that is no aircraft's [s]
 _NEW_S = 2.0  # an aircraft that came so lately is predicted before any other work begins [s]
 
 
@@ -71,7 +72,8 @@ class Worker:
         self.pace = pace or Pace()
         self._late = min(max(_LATE * self.pace.renew, _LATE_S[0]), _LATE_S[1])  # who renews often wants short sweeps
         self.quota = Quota(most=_HEAVY * self._late)
-        self.sentence = ""
+        self.sentence = self._undiagnosed = ""
+        self._diagnose_from = float("-inf")  # no diagnosis is begun before [s, monotonic]
         self.rates = Rates()
         self.beside = Beside()
         self.learner = Learner(self._whole, self._publish, self.rates, self.beside)
@@ -224,15 +226,17 @@ class Worker:
 
     def _diagnose(self) -> None:
         """Let the diagnosis go on in the background, and publish what it found."""
-        if self.diagnosis is None:
+        if self.diagnosis is None or time.monotonic() < self._diagnose_from:
             return
         held = {one.twin.uav: one for one in self.holding()}
         try:
             for found in self.diagnosis.turn([(one.twin, one.lock) for one in held.values()]):
                 self._publish(found, held[found.uav])
-        except Exception:  # a defect of the diagnosis must not stop the predictions
-            _log.exception("the diagnosis met a defect and is off; report it")
-            self.sentence, self.diagnosis = "the diagnosis met a defect and is off; restart the worker", None
+            self._undiagnosed = ""
+        except Exception as error:  # a defect of the diagnosis must not stop the predictions
+            self._undiagnosed = f"the diagnosis met a defect ({error}); it is tried again in {_OFF_S:.0f} s, report it"
+            self._diagnose_from = time.monotonic() + _OFF_S
+            _log.exception(self._undiagnosed)
 
     def _found(self, held: Held) -> Mismatch | None:
         watch = self.diagnosis and self.diagnosis.watches.get(held.twin.uav)
@@ -249,6 +253,9 @@ class Worker:
         said = [f"{shed} messages shed: too many UAVs for this worker"] if shed else []
         said += self.rates.said(self.pace, len(self.holding()), time.monotonic())
         said += [held.failed for held in self.holding() if held.failed]
+        if self.diagnosis is not None:
+            said += [self._undiagnosed] if self._undiagnosed else []
+            said += self.diagnosis.failed(held.twin.uav for held in self.holding())
         done = {work.value: n for work, n in self.rates.total.items()}
         sentence = self.sentence or " ".join(said[:3])
         return FleetState(t=time.time(), rows=tuple(rows), sentence=sentence, done=done, shed=shed)

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from fleet.frames import wrap
 from fleet.telemetry.dataflash_records import Records
 from fleet.telemetry.dialects.dataflash import ANGLES, PARTS, RATES, ROWS, TABLE, believable, field_of
 from fleet.telemetry.dialects.row import Row
@@ -177,7 +178,7 @@ def rates_between(t: np.ndarray, angles: np.ndarray) -> Series:
         times (n - 1,) at most [s]; p, q, r [rad/s]
     """
     dt = np.diff(t)
-    turn = (np.diff(angles, axis=0) + np.pi) % (2 * np.pi) - np.pi
+    turn = wrap(np.diff(angles, axis=0))
     near = dt <= NEAR_S
     phi_dot, theta_dot, psi_dot = (turn[near] / dt[near, None]).T
     phi, theta = (angles[:-1, :2] + 0.5 * turn[:, :2])[near].T

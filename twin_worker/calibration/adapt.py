@@ -1,10 +1,14 @@
 """Adapt tube and horizon to one aircraft by what became of its own past predictions.
 
 The factor on a table's half-axes is a quantile of the aircraft's own scores, the table counting as a few more of
-them; its level moves up at each miss and down a little at each hit, so that in the long run the wanted share holds
-whatever the flight does. Short look-aheads are answered first: what they say in common moves the longer ones too.
+them; its level moves up at each miss and down a little at each hit, within bounds. Short look-aheads are answered
+first: what they say in common moves the longer ones too.
 
-Source: Gibbs & Candes 2021, "Adaptive conformal inference under distribution shift".
+No coverage is guaranteed. The long-run share of the source holds for levels without bounds whose region is infinite
+from level 1 on; a region that is published must be finite. So an aircraft whose errors outgrow all that was seen is
+covered less, which `Trust.sentence` says while a bound is met; `Prediction.held` publishes the measured share.
+
+Source: Gibbs & Candes 2021, "Adaptive conformal inference under distribution shift", proposition 4.1.
 """
 
 from dataclasses import dataclass, field
@@ -79,11 +83,13 @@ class Factors:
         tube: on the table's half-axes, by knot, (13,) [-]
         horizon: on the largest half-axes, where the horizon is sought [-]
         own: predictions of this aircraft behind them [-]
+        bounded: a level or factor of the tube stands at its upper bound: misses cannot widen the tube as they should
     """
 
     tube: np.ndarray
     horizon: float
     own: int
+    bounded: bool = False
 
     def at(self, ahead: np.ndarray) -> np.ndarray:
         """Give the factor on half-axes by look-ahead, (n,) [-]."""
@@ -101,7 +107,8 @@ def factors(ledger: Ledger, group: str, table: Table, levels: Levels) -> Factors
     tube = _join(table.scores * pooled, scores.T, weight.T, levels.tube)
     horizon = _horizon(ledger, rows, table.risks * pooled, levels.horizon)
     own = int((weight > 0).any(axis=1).sum())
-    return Factors(np.clip(tube, _LEAST_FACTOR, _MOST_FACTOR), horizon, own)
+    bounded = bool((levels.tube >= _MOST_LEVEL).any() or (tube >= _MOST_FACTOR).any())
+    return Factors(np.clip(tube, _LEAST_FACTOR, _MOST_FACTOR), horizon, own, bounded)
 
 
 def _join(atoms: np.ndarray, scores: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:

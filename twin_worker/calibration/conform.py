@@ -12,8 +12,11 @@ from twin_worker.calibration.miss import QUANTILE
 from twin_worker.calibration.quantile import weighted_quantile
 
 
-def factors_of(ratio: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Give the factors that hold `QUANTILE` of the next predictions too, (3,); nan where nothing is known.
+def factors_of(ratio: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, float]:
+    """Give the factors that hold `QUANTILE` of the next predictions too, (3,), and the share that one axis holds.
+
+    That share is `QUANTILE` where all axes err at once and its cube root where they are independent; both are nan where
+    nothing is known.
 
     Args:
         ratio: errors along, cross, vertical over their sigma, nan where not known, (s, k, 3) [-]
@@ -22,11 +25,11 @@ def factors_of(ratio: np.ndarray, weight: np.ndarray) -> np.ndarray:
     known = np.isfinite(ratio).all(axis=2)
     n = int(known.any(axis=1).sum())
     if not n:
-        return np.full(3, np.nan)
+        return np.full(3, np.nan), float("nan")
     x, w = ratio[known].T.copy(), np.broadcast_to(weight[:, None], known.shape)[known]
     highest = np.max([_rank(row, w) for row in x], axis=0)
     level = weighted_quantile(highest[None], w[None], np.array([min(QUANTILE * (n + 1) / n, 1.0)]))
-    return np.maximum(weighted_quantile(x, np.tile(w, (3, 1)), np.tile(level, 3)), 1e-3)
+    return np.maximum(weighted_quantile(x, np.tile(w, (3, 1)), np.tile(level, 3)), 1e-3), float(level[0])
 
 
 def _rank(x: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.optimize import minimize
 
 from twin_worker.calibration.conform import factors_of
-from twin_worker.calibration.miss import AHEAD, first_passage
+from twin_worker.calibration.miss import AHEAD, QUANTILE, first_passage
 from twin_worker.calibration.quantile import censored_quantile, weighted_quantile
 from twin_worker.calibration.risk import critical, growth
 from twin_worker.calibration.scored import Scored
-from twin_worker.calibration.table import KNOTS, LEVELS, Doubt, Table, at_look_aheads, untaught
+from twin_worker.calibration.table import INDEPENDENT, KNOTS, LEVELS, Doubt, Table, at_look_aheads, untaught
 
 _NEAR = 1.2  # look-aheads within this factor of a knot speak for it [-]
 _SPEAKERS = 3  # as many of them, evenly: neighbours say much the same
@@ -80,9 +80,12 @@ def fit(scored: Scored, group: str) -> Table:
         others = scored.part(~left).doubt
         apart = _raw(group, *(fit_sigma(others, error[~left]) if not left.all() else sigma))
         ratio[left] = error[left] / apart.sigma(scored.part(left).doubt, AHEAD)
-    factor = _known(np.array([factors_of(ratio[:, near(knot)], weight) for knot in KNOTS]))
+    factors, levels = zip(*(factors_of(ratio[:, near(knot)], weight) for knot in KNOTS), strict=True)
+    factor = _known(np.array(factors))
+    told = [level for level in levels if np.isfinite(level)] or [INDEPENDENT]
+    alone = float(np.clip(np.mean(told), QUANTILE, INDEPENDENT))
     flights = len(set(scored.flight.tolist()))
-    table = replace(_raw(group, *sigma), factor=factor, starts=len(scored), flights=flights)
+    table = replace(_raw(group, *sigma), factor=factor, starts=len(scored), flights=flights, alone=alone)
     return _with_risks(replace(table, scores=_scores(table, ratio, weight)), scored, weight)
 
 

@@ -18,31 +18,35 @@ _STRIDES = int(1.3 * AHEAD[-1] / _STRIDE_S)  # remembered
 
 
 class Ledger:
-    """Predictions in a ring of `ROWS`, one array per quantity, n = 91 look-aheads."""
+    """Predictions in a ring, one array per quantity, over the first n of `AHEAD`.
 
-    def __init__(self) -> None:
-        n = len(AHEAD)
-        self.t0 = np.full(ROWS, -np.inf)  # [s since 1970]
-        self.group = np.full(ROWS, "", dtype=object)
-        self.method = np.full(ROWS, "", dtype=object)
-        self.size = np.zeros(ROWS, int)  # look-aheads of each
-        self.path = np.zeros((ROWS, n, 3))  # NED [m]
-        self.along = np.zeros((ROWS, n, 2), np.float32)  # unit vector along it
-        self.tube = np.ones((ROWS, n, 3), np.float32)  # half-axes as published [m]
-        self.factor = np.ones((ROWS, len(KNOTS)))  # how much wider than the table that was [-]
-        self.ratio = np.zeros((ROWS, n), np.float32)  # largest half-axes of the table over path length so far [-]
-        self.horizon = np.zeros(ROWS)  # as published [s]
-        self.score = np.full((ROWS, n), np.nan, np.float32)  # largest error over its half-axis [-]
-        self.next = np.zeros(ROWS, int)  # first look-ahead not yet flown
-        self.live = np.zeros(ROWS, bool)  # more answers are to come
-        self.followed = np.zeros(ROWS)  # within 10 % up to here, unless passed [s]
-        self.passed = np.zeros(ROWS, bool)
-        self.watched = np.zeros(ROWS, bool)  # neither passed nor lost from sight
-        self.claimed = np.zeros(ROWS, bool)  # its horizon has neither held nor failed yet
+    Args:
+        rows: predictions remembered
+        n: look-aheads of each
+    """
+
+    def __init__(self, rows: int = ROWS, n: int = len(AHEAD)) -> None:
+        self.t0 = np.full(rows, -np.inf)  # [s since 1970]
+        self.group = np.full(rows, "", dtype=object)
+        self.method = np.full(rows, "", dtype=object)
+        self.size = np.zeros(rows, int)  # look-aheads of each
+        self.path = np.zeros((rows, n, 3))  # NED [m]
+        self.along = np.zeros((rows, n, 2), np.float32)  # unit vector along it
+        self.tube = np.ones((rows, n, 3), np.float32)  # half-axes as published [m]
+        self.factor = np.ones((rows, len(KNOTS)))  # how much wider than the table that was [-]
+        self.ratio = np.zeros((rows, n), np.float32)  # largest half-axes of the table over path length so far [-]
+        self.horizon = np.zeros(rows)  # as published [s]
+        self.score = np.full((rows, n), np.nan, np.float32)  # largest error over its half-axis [-]
+        self.next = np.zeros(rows, int)  # first look-ahead not yet flown
+        self.live = np.zeros(rows, bool)  # more answers are to come
+        self.followed = np.zeros(rows)  # within 10 % up to here, unless passed [s]
+        self.passed = np.zeros(rows, bool)
+        self.watched = np.zeros(rows, bool)  # neither passed nor lost from sight
+        self.claimed = np.zeros(rows, bool)  # its horizon has neither held nor failed yet
         self.until = -np.inf  # flown up to here [s since 1970]
-        self._least = np.ones(ROWS)  # least path length [m]
-        self._begun = np.full(ROWS, np.nan)  # odometer at t0 [m]
-        self._before = np.zeros(ROWS)  # relative error at the look-ahead before [-]
+        self._least = np.ones(rows)  # least path length [m]
+        self._begun = np.full(rows, np.nan)  # odometer at t0 [m]
+        self._before = np.zeros(rows)  # relative error at the look-ahead before [-]
         self._odometer = np.empty((0, 2))  # time, and length flown until then [s since 1970, m]
         self._stride_from = np.zeros(3)  # where the odometer stands
         self._at = -1  # newest row
@@ -54,7 +58,7 @@ class Ledger:
 
     def add(self, t0: float, method: str, group: str, path: np.ndarray, speed: float) -> int:
         """Begin to follow a prediction over the first n of `AHEAD`, path (n, 3); give its row, to be completed."""
-        r = self._at = (self._at + 1) % ROWS
+        r = self._at = (self._at + 1) % len(self.t0)
         n = len(path)
         self.t0[r], self.method[r], self.group[r], self.size[r] = t0, method, group, n
         self.path[r, :n], self.along[r, :n] = path, track_frame(path, AHEAD[:n])
@@ -62,6 +66,18 @@ class Ledger:
         self.followed[r], self.passed[r], self.watched[r], self.claimed[r] = 0.0, False, True, True
         self._least[r], self._begun[r], self._before[r] = least_length(speed), np.nan, 0.0
         return r
+
+    @property
+    def coverage(self) -> tuple[float, int]:
+        """Give the share of answered look-aheads inside the tube (nan before any), and the predictions behind it."""
+        score = self.score[:, 1:].copy()  # at once: another thread may read while this one scores
+        known = np.isfinite(score)
+        n = int(known.any(axis=1).sum())
+        return (float((score[known] <= 1.0).mean()) if n else float("nan")), n
+
+    def restart(self) -> None:
+        """Measure the path flown anew: positions are in another frame from now on."""
+        self._odometer = self._odometer[:0]
 
     def end(self) -> np.ndarray:
         """Follow no prediction any further; give the rows this ended."""

@@ -17,6 +17,7 @@ KNOTS = np.array([1.0, 2, 3, 5, 8, 12, 18, 27, 40, 60, 80, 120, 180])  # look-ah
 COLUMN = np.searchsorted(AHEAD, KNOTS)  # of each in AHEAD
 ATOMS = 20  # values a distribution is written as, in the middles of as many equal shares
 LEVELS = (np.arange(ATOMS) + 0.5) / ATOMS
+INDEPENDENT = QUANTILE ** (1 / 3)  # share that each axis alone holds where errors of the axes are independent [-]
 _LAW = {  # expected spread of along, cross, vertical: base [m], growth [m/s^power], power
     "dynamics": ((0.3, 0.3, 0.3), (0.4, 0.15, 0.15), 1.2),
     "hybrid": ((0.3, 0.3, 0.3), (0.4, 0.15, 0.15), 1.2),
@@ -44,6 +45,7 @@ class Table:
         scores: largest error over its half-axis, `ATOMS` quantiles [-]
         risks: critical factors of the horizon, `ATOMS` quantiles [-]
         held_out: what it did on flights left out of it, by name
+        alone: share of the errors that the half-axis of each axis alone holds, `QUANTILE` to its cube root [-]
     """
 
     group: str
@@ -56,6 +58,7 @@ class Table:
     scores: np.ndarray
     risks: np.ndarray
     held_out: dict[str, float] = field(default_factory=dict)
+    alone: float = INDEPENDENT
 
     def sigma(self, doubt: "Doubt", ahead: np.ndarray) -> np.ndarray:
         """Give what errors to expect, growing beyond the last knot, (..., n, 3) [m]."""

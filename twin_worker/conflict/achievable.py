@@ -71,7 +71,12 @@ def ability(params: Mapping[str, float], altitude_m: float) -> Ability:
 
 
 def achievable(now: Now, able: Ability) -> Finding:
-    """Judge the legs ahead; give the one that is least achievable. A leg of unknown airspeed ends the judgement."""
+    """Judge the legs ahead; give the one that is least achievable. A leg of unknown airspeed ends the judgement.
+
+    Without an estimate of the wind nothing is judged.
+    """
+    if not np.isfinite(now.wind).all():
+        return Finding(AlertKind.NOT_ACHIEVABLE, 0.0, "", _OVER)
     at, from_p = now.t, now.way.start if np.isfinite(now.way.start).all() else now.p
     worst: tuple[float, str, np.ndarray, float] | None = None
     for leg in now.way.legs[:_LEGS]:

@@ -1,9 +1,14 @@
 """One prediction as what alerts are judged on: Gaussian positions on a grid of times that all aircraft share.
 
-The tube's half-axes (along, cross, vertical) are read as z standard deviations of three independent normal errors.
-The tube holds `quantile` of flights in all three at once, so one axis alone must hold quantile^(1/3):
+The tube holds `quantile` q of flights within all three half-axes (along, cross, vertical) at once; it is a box, not an
+ellipsoid. How much each axis alone holds, L, depends on how errors of the axes go together and is measured where the
+tube is calibrated (`axis_quantile`). A half-axis is then z standard deviations of a normal error:
 
-    z = Phi^-1((1 + q^(1/3)) / 2)        2.11 for q = 0.9
+    z = Phi^-1((1 + L) / 2),    q <= L <= q^(1/3):  1.64 where all axes err at once, 2.11 where they are independent
+
+for q = 0.9. Without a measurement they count as independent, the upper bound: for normal errors of whatever correlation
+a box holds no less than the product of what its axes hold.
+Source: Sidak 1967, "Rectangular confidence regions for the means of multivariate normal distributions".
 
 Errors of one prediction are taken as one draw for its whole length (an aircraft that is late stays late), along and
 cross turned to NED by the direction of the path at each time. The covariance grows with the look-ahead, so what is far
@@ -64,9 +69,15 @@ class Forecast(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def axis_z(quantile: float) -> float:
-    """Give the half-axis of a tube that holds `quantile`, in standard deviations of one axis."""
-    return float(norm.ppf((1 + quantile ** (1 / 3)) / 2))
+def axis_z(quantile: float, alone: float = 0.0) -> float:
+    """Give the half-axis of a tube that holds `quantile`, in standard deviations of one axis.
+
+    Args:
+        quantile: share that all three half-axes hold at once
+        alone: share that each of them alone holds; beyond what is possible, as 0, the axes count as independent
+    """
+    independent = quantile ** (1 / 3)
+    return float(norm.ppf((1 + (alone if quantile <= alone < independent else independent)) / 2))
 
 
 def forecast(made: Prediction) -> Forecast | None:
@@ -83,7 +94,7 @@ def forecast(made: Prediction) -> Forecast | None:
         return None
     at = STEP * np.arange(first, last + 1)
     mean = straight(at, t, path)
-    sigma = np.maximum(straight(at, t, tube) / axis_z(made.quantile), _LEAST)
+    sigma = np.maximum(straight(at, t, tube) / axis_z(made.quantile, made.axis_quantile), _LEAST)
     along = track_frame(mean, at - at[0]) if len(at) > 1 else np.array([[1.0, 0.0]])
     return Forecast(made, first, mean, along, sigma)
 

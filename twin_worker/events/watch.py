@@ -109,6 +109,6 @@ def _frame(twin: "Twin") -> None:
     if away > _FAR_M and abs(place[-1, 0]) <= 9e8 and abs(place[-1, 1]) <= 1.8e9:
         twin.origin = Origin(*(int(x) for x in place[-1]))
         twin.ground.height = float("nan")
-        twin.record.forget()
+        twin.record.forget(moved=True)
         twin.contest.forget()
         note(twin, Event.ORIGIN, twin.history.newest, f"it is {away * 1e-3:.0f} km from where it was first heard")

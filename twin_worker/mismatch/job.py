@@ -61,6 +61,8 @@ class Answer:
         report: the diagnosis; None where nothing called for one
         pushes: what the effects found do to the aircraft, row by row
         refused: why there is neither, or empty
+        failed: what defect of ours ended it without a result, or empty
+        details: where that was met, for the log
         cpu_s: processor time it took [s]
     """
 
@@ -71,6 +73,8 @@ class Answer:
     report: Report | None = None
     pushes: Push | None = None
     refused: str = ""
+    failed: str = ""
+    details: str = ""
     cpu_s: float = 0.0
 
 
@@ -87,11 +91,20 @@ def rows_of(history: History, start: float, past: Rows | None = None) -> Rows:
     return out
 
 
+def failed(job: Job, why: str, *, cpu_s: float = 0.0, details: str = "") -> Answer:
+    """Answer a job that a defect has ended."""
+    return replace(_unanswered(job), failed=why, cpu_s=cpu_s, details=details)
+
+
+def _unanswered(job: Job) -> Answer:
+    t = job.rows["attitude"][0]
+    return Answer(job.uav, float(t[0]) if len(t) else 0.0, float(t[-1]) if len(t) else 0.0)
+
+
 def work(job: Job) -> Answer:
     """Look at the newest residuals, and diagnose where they call for it; what cannot be is refused in a sentence."""
     begun = time.process_time()
-    t = job.rows["attitude"][0]
-    found = Answer(job.uav, float(t[0]) if len(t) else 0.0, float(t[-1]) if len(t) else 0.0)
+    found = _unanswered(job)
     try:
         found = _work(job, found)
     except (ValueError, np.linalg.LinAlgError) as error:

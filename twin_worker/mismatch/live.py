@@ -1,9 +1,12 @@
 """Diagnose the aircraft of one worker in turn, the most urgent first, without ever making a prediction wait."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import logging
+from _thread import LockType
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from types import MappingProxyType
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from fleet.contract import Found, Mismatch
 from twin_worker.diagnose.baseline import Baseline
@@ -14,6 +17,8 @@ from twin_worker.mismatch.job import Answer, Job
 from twin_worker.mismatch.told import judged
 from twin_worker.mismatch.watch import Watch
 
+_log = logging.getLogger(__name__)
+T = TypeVar("T")
 ALL = -1  # instead of a UAV id
 Held = tuple[Twin, AbstractContextManager]  # a twin, and the lock it changes under
 
@@ -44,6 +49,7 @@ class Live:
     def __init__(self, hand: Hand, bases: Mapping[int, Baseline] = MappingProxyType({}), *, adapt: bool = True) -> None:
         self._hand, self._bases, self._adapt = hand, bases, adapt
         self.watches: dict[int, Watch] = {}
+        self._waiting: Answer | None = None  # for an aircraft whose lock is held
 
     def watch(self, uav: int) -> Watch:
         """Give what is known of one aircraft."""
@@ -53,26 +59,63 @@ class Live:
         return self.watches[uav]
 
     def turn(self, held: Sequence[Held]) -> Iterator[Mismatch]:
-        """Take an answer that has arrived, and begin the most urgent job where one may begin."""
-        if (answer := self._hand.answer()) is not None:
-            yield from self._take(answer, {twin.uav: (twin, lock) for twin, lock in held})
+        """Take an answer that has arrived, and begin the most urgent job where one may begin.
+
+        A defect met by one aircraft is that aircraft's alone: it is said, logged, and left for a while.
+        """
+        twins = {twin.uav: (twin, lock) for twin, lock in held}
+        if (answer := self._waiting or self._hand.answer()) is not None:
+            self._waiting = answer if _locked(twins.get(answer.uav)) else None
+            if self._waiting is not None:  # it is identified just now: the telemetry of the others does not wait for it
+                return
+            uav, t = answer.uav, answer.end
+            yield from self._isolated(uav, t, lambda: self._take(answer, twins)) or ()
         if not self._hand.free:
             return
-        due = [(urgent, twin) for twin, _ in held if (urgent := self.watch(twin.uav).wants(twin)) is not None]
+        due = []
+        for twin, _ in held:
+            urgent = self._isolated(twin.uav, twin.history.newest, partial(self._urgency, twin))
+            if urgent is not None:
+                due.append((urgent, twin))
         if due:
             twin = max(due, key=lambda one: one[0])[1]
-            self._hand.give(self.watch(twin.uav).job(twin))
+            job = self._isolated(twin.uav, twin.history.newest, lambda: self.watch(twin.uav).job(twin))
+            if job is not None:
+                self._hand.give(job)
 
-    def _take(self, answer: Answer, held: dict[int, Held]) -> Iterator[Mismatch]:
+    def failed(self, uavs: Iterable[int]) -> list[str]:
+        """Say what defects the diagnoses of these aircraft met last."""
+        return [self.watches[uav].failed for uav in uavs if uav in self.watches and self.watches[uav].failed]
+
+    def _urgency(self, twin: Twin) -> float | None:
+        return self.watch(twin.uav).wants(twin)
+
+    def _isolated(self, uav: int, t: float, do: Callable[[], T]) -> T | None:
+        """Do something for one aircraft at data time `t`; None where that met a defect."""
+        try:
+            return do()
+        except Exception as error:
+            watch = self.watch(uav)
+            watch.give_up(uav, t, f"{type(error).__name__}: {error}")
+            _log.exception("%s", watch.failed)
+            return None
+
+    def _take(self, answer: Answer, held: dict[int, Held]) -> list[Mismatch]:
         watch = self.watch(answer.uav)
         told = watch.take(answer)
+        if answer.failed:
+            _log.error("%s", "\n".join(filter(None, (watch.failed, answer.details))))
         if told is None or answer.uav not in held:
-            return
+            return []
         twin, lock = held[answer.uav]
         if self._adapt:
             with lock:
                 told = watch.told = _adapted(twin, told, answer)
-        yield told
+        return [told]
+
+
+def _locked(held: Held | None) -> bool:
+    return held is not None and isinstance(held[1], LockType) and held[1].locked()
 
 
 def _adapted(twin: Twin, told: Mismatch, answer: Answer) -> Mismatch:

@@ -20,6 +20,7 @@ LOOK_S, WHOLE_S = 8.0, 25.0  # between looks at the residuals, and between diagn
 LEAST_S = 45.0  # flight before anything is compared with a model [s]
 _AGAIN_S = 5.0  # before a finding is looked at again, to be confirmed [s]
 _RETRY_S = 30.0  # after a refusal [s]
+_OFF_S, _OFF_MOST_S = 60.0, 3600.0  # after a defect, doubled each time, and at most [s]
 _SAME_S = 20.0  # two findings of one effect whose onsets lie farther apart are two [s]
 _GONE = 2  # looks in a row that find nothing, after which it is over
 _SOUND = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST, Outcome.STARVED)
@@ -35,6 +36,8 @@ class Watch:
         past: telemetry of that past; None before there was enough
         told: what was published last
         why: why there is no baseline, or no diagnosis
+        failed: what defect of ours ended the newest diagnosis, or empty
+        failures: how many diagnoses in a row a defect has ended
     """
 
     card: Card = UNKNOWN
@@ -42,9 +45,12 @@ class Watch:
     past: Rows | None = None
     told: Mismatch | None = None
     why: str = ""
+    failed: str = ""
+    failures: int = 0
     begun: float = float("nan")  # when it was first heard [s since 1970]
     past_t: float = float("-inf")  # end of the own past [s since 1970]
     next_t: float = float("-inf")  # no look before [s since 1970]
+    off_until: float = float("-inf")  # nor before this, after a defect [s since 1970]
     whole_t: float = float("-inf")  # end of the newest flight diagnosed
     last: Report | None = None  # the newest diagnosis, and its flight's begin
     last_begin: float = 0.0
@@ -57,7 +63,13 @@ class Watch:
             self.__init__(self.card, self.base)  # type: ignore[misc]
         if self.begun != self.begun and np.isfinite(newest):
             self.begun = float(min(twin.history.rows("attitude")[0], default=newest))
-        if newest < self.next_t or twin.lost or twin.ground.landed or twin.vehicle not in WINGS or twin.origin is None:
+        if (
+            newest < max(self.next_t, self.off_until)
+            or twin.lost
+            or twin.ground.landed
+            or twin.vehicle not in WINGS
+            or twin.origin is None
+        ):
             return None
         if self.base is None and self.past is None:
             if self._steady_s(twin) < PAST_S:
@@ -83,7 +95,10 @@ class Watch:
 
     def take(self, answer: Answer) -> Mismatch | None:
         """Take an answer; give what is to be published, None where nothing is new."""
-        self.why = answer.refused
+        if answer.failed:
+            self.give_up(answer.uav, answer.end, answer.failed)
+            return None
+        self.why, self.failed, self.failures = answer.refused, "", 0
         if answer.refused:
             self.next_t = answer.end + _RETRY_S
             return None
@@ -102,6 +117,12 @@ class Watch:
             return None  # one look that sees less takes nothing back
         self.told = told
         return told
+
+    def give_up(self, uav: int, t: float, why: str) -> None:
+        """Leave the aircraft alone for a while: a defect ended its diagnosis at data time `t`; longer each time."""
+        again_s = min(_OFF_S * 2.0**self.failures, _OFF_MOST_S)
+        self.failures, self.off_until = self.failures + 1, t + again_s
+        self.failed = f"uav-{uav}: its diagnosis met a defect ({why}); it is tried again in {again_s:.0f} s, report it"
 
     def _confirmed(self, report: Report, begin: float) -> bool:
         """Tell whether the diagnosis before said the same."""

@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 
 from fleet.contract import Array
+from fleet.frames import wrap
 from viewer.events import Event
 from viewer.forecast import Forecast
 from viewer.timeline.stood import Stood, stood
@@ -142,7 +143,7 @@ class Tape:
             return self.x[0].astype(float)
         (t0, t1), (a, b) = self.t[k - 1 : k + 1], self.x[k - 1 : k + 1].astype(float)
         step = b - a
-        step[3:6] = (step[3:6] + np.pi) % (2 * np.pi) - np.pi
+        step[3:6] = wrap(step[3:6])
         return a + step * float(np.clip((t - t0) / (t1 - t0), 0.0, 1.0))
 
     def path(self, begin: float, end: float) -> np.ndarray:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from fleet.frames import wrap
 from fleet.telemetry.dialects.row import HIGHEST, Row
 
 DEG = pi / 180  # [rad/deg]
@@ -34,7 +35,7 @@ _NAV_TOO = (213, 42702, 42703)  # set yaw and speed, script time, attitude time
 
 
 def _angles(m: Any) -> tuple[Any, ...]:
-    return (m.Roll * DEG, m.Pitch * DEG, ((m.Yaw + 180.0) % 360.0 - 180.0) * DEG)
+    return (m.Roll * DEG, m.Pitch * DEG, wrap(m.Yaw * DEG))
 
 
 def _gyro(m: Any) -> tuple[Any, ...]:
