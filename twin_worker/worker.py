@@ -85,6 +85,7 @@ class Worker:
         self._held = self._twins.held
         self.claiming = Claiming(bus, uavs, self._twins)
         self._news = threading.Event()
+        self._renewing = threading.Lock()  # held while late predictions are renewed: the sweep waits for that
 
     def listen(self) -> None:
         """Subscribe, answer queries, and ask for what was said before this worker came."""
@@ -173,7 +174,8 @@ class Worker:
         """Advance every twin once; give how many messages were taken in."""
         taken, begun = 0, time.monotonic()
         for held in self._in_turn():
-            waiting = len(held.inbox)
+            with self._renewing:
+                waiting = len(held.inbox)
             taken += waiting
             if not waiting and not begun - held.arrived > _SILENT_S and not held.lock.locked():
                 continue  # as it is with most in most sweeps
@@ -279,7 +281,8 @@ class Worker:
         """Look after aircraft whose twins are late, on a thread of its own: it waits for no other work."""
         while not stop.wait(LOOK_S):
             try:
-                stand_in_for(self.holding(), self._publish)
+                with self._renewing:
+                    stand_in_for(self.holding(), self._publish)
             except ConnectionError:  # the session is closed: we are leaving
                 return
             except Exception:  # a defect met once must not end the renewals

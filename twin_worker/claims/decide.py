@@ -3,10 +3,11 @@
 A worker knows the others by their liveliness tokens and what they hold by their announcements. An aircraft belongs to
 its `owner`. The owner asks a live holder for a copy of its twin, and takes what nobody live holds. Every taking raises
 the aircraft's epoch; of two writers the higher `Rank` is believed, by readers and by both: who held it before goes on
-writing until it hears of the higher claim, so that nobody waits. Who has a token lives, however late its words come: the router
-takes the token of a process that is frozen or cut off after a lease, and a process that is given little CPU time keeps
-it, since the keep-alives of its session need next to none. Who has a token and says nothing for seconds while others do
-passes for dead, too: its session lives, but nobody speaks there.
+writing until it hears of the higher claim, so that nobody waits.
+
+Who has a token lives, however late its announcements come. The router withdraws the token of a process that is frozen
+or cut off when its lease is over; a process that is given little CPU time keeps it, since the keep-alives of its
+session need next to none. Who has a token and announces nothing for seconds, while others do, passes for dead, too.
 
     unsure    after a pause, and with no router in sight: writes nothing and claims nothing until it has asked the
               others what they hold

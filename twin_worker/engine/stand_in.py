@@ -41,9 +41,9 @@ def stand_in_for(holding: list[Held], publish: Callable[[Message, Held], None]) 
     """Renew the predictions of all whose twins were not reached in time: for want of CPU time, or locked."""
     for held in holding:
         pace = held.twin.pace
-        if time.monotonic() - held.published > max(OLD_S, _LATE * min(pace.predict, pace.renew)):
-            if (made := stand_in(held)) is not None:
-                publish(made, held)
+        late = time.monotonic() - held.published > max(OLD_S, _LATE * min(pace.predict, pace.renew))
+        if late and (made := stand_in(held)) is not None:
+            publish(made, held)
 
 
 def said_already(result: Message, held: Held) -> bool:

@@ -34,10 +34,12 @@ LIMITS = {  # by fault: what is measured, and the most that is allowed
     "restart_router": {"owners_changed": 0},
     "delay": {"owners_changed": 0},
     "blink": {"owners_changed": 0},
+    "busy": {"owners_changed": 0},
     "starve": {"owners_changed": 0, "gap_s": 3.0},
     "starve_all": {"owners_changed": 0, "gap_s": 3.0},
 }
 _WARM = 0.95  # share of the aircraft that must have a model before the first fault [-]
+_USUAL_S = 15.0  # between predictions of an aircraft, at most, before the first fault [s]
 ANNOUNCED_S = 1.2  # after which everyone has said what it holds now [s]
 RANDOM = ("kill", "freeze", "leave", "join", "cut", "stall", "delay", "blink", "restart_router")
 
@@ -112,6 +114,9 @@ def _run(args: argparse.Namespace) -> int:
             settle(site)
             begun = time.monotonic()
             until(lambda: len(site.reader.fits) >= _WARM * args.uavs or time.monotonic() - begun > args.warm, 1e6, "")
+            until(
+                lambda: not site.reader.silent(set(range(args.uavs)), _USUAL_S), args.warm, "a prediction of everyone"
+            )
             print(f"{args.uavs} aircraft, {args.workers} workers: begun", file=sys.stderr, flush=True)
             steps = at_random(site, args.random, rng) if args.random else one_by_one(site, args.only, args.repeat, rng)
             rows = list(steps)

@@ -1,6 +1,8 @@
 """The faults, one a function: done to one worker or to the router, measured at the reader."""
 
 import signal
+import subprocess
+import sys
 import time
 from typing import Any
 
@@ -186,6 +188,19 @@ def starve_all(site: Site, _: Worker, seconds: float = 25.0) -> dict[str, Any]:
     return _starved(site, pids, seconds)
 
 
+def busy(site: Site, _: Worker, seconds: float = 20.0) -> dict[str, Any]:
+    """Let two other processes use all the processor time they can get for a while."""
+    uavs, changes, begun = set(range(site.uavs)), site.reader.moved, time.monotonic()
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
+    try:
+        wait(seconds)
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
+    return {"owners_changed": site.reader.moved - changes, "gap_s": site.reader.gap(uavs, begun)}
+
+
 def _starved(site: Site, pids: list[int], seconds: float) -> dict[str, Any]:
     """Limit processes for some time [s]; give how many owners changed, and how many predictions there are left."""
     uavs = set(range(site.uavs))
@@ -215,7 +230,7 @@ def _starved(site: Site, pids: list[int], seconds: float) -> dict[str, Any]:
 
 ALL = {
     one.__name__: one
-    for one in (calm, kill, freeze, leave, join, restart_router, cut, stall, delay, blink, starve, starve_all)
+    for one in (calm, kill, freeze, leave, join, restart_router, cut, stall, delay, blink, busy, starve, starve_all)
 }
 ON_THE_WAY = (cut, stall, delay)  # for a worker that has a way of its own
 ENDS = (kill, leave)  # for a worker that is not spared
