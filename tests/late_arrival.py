@@ -116,7 +116,7 @@ class Judge:
         """Take a message of the gateway or the worker at arrival `now` [s]."""
         if isinstance(message, Sample):
             self._begun = min(self._begun, now)
-            if now - self._sampled > 1.0 and np.isfinite(self._sampled):
+            if now - self._sampled > 1.0 and self.made:
                 self._resumed = self._predicted = now
             self._sampled = now
         elif isinstance(message, Status) and message.clock_advance_s != self._advance:
