@@ -20,6 +20,7 @@ from fleet.metrics import served
 from fleet.telemetry.ids import Ids
 from fleet.telemetry.intake import MOST_UAVS
 from fleet.telemetry.warm import warm_up
+from gateway.apart import divided, played_apart
 from gateway.board import posted
 from gateway.gate import gates_of
 from gateway.link import Link
@@ -72,6 +73,7 @@ _log = logging.getLogger(__name__)
 def run(args: argparse.Namespace) -> int:
     """Open the links, join the bus, work until told to stop or the recordings end."""
     specs = [read_spec(text, args.offset) for text in args.link or [DEFAULT_LINK]]
+    specs, files = divided(specs)
     specs += [read_forward(text) for text in args.forward]
     if args.most_uavs < 1:
         raise ValueError(f"--most-uavs: found {args.most_uavs}, expected at least 1; write e.g. 250")
@@ -83,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
     gc.freeze()
     gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
     with connect(entry(args, GATEWAY), patient=budget is not None) as bus, contextlib.ExitStack() as held:
+        held.enter_context(played_apart(files, args, _log.warning))
         links: list[Link] = []
         ids = Ids()
         for spec in specs:

@@ -11,7 +11,7 @@ from conftest import LONG_FILES, ROOT
 PACKAGES = ("fleet", "gateway", "twin_worker", "viewer")
 
 ROOMS = (  # inside fleet a room imports only from rooms above it, and from itself
-    ("frames", "heap", "interrupt", "plain"),
+    ("frames", "heap", "interrupt", "plain", "private"),
     ("logs",),
     ("contract",),
     ("access",),
@@ -213,7 +213,7 @@ def test_the_house_keeps_its_law(rule: Callable[..., Iterator[str]], pytestconfi
 
 SHARED = (  # what concealer and finder may both stand on: words, frames, formats; nothing that flies or decides
     *("fleet", "fleet.contract", "fleet.cli", "fleet.children", "fleet.commands", "fleet.frames", "fleet.mission"),
-    *("fleet.codec", "fleet.config", "fleet.plain", "fleet.logs", "fleet.interrupt"),
+    *("fleet.codec", "fleet.config", "fleet.plain", "fleet.logs", "fleet.interrupt", "fleet.private"),
 )
 AUTOPILOT = "fleet.autopilots"  # flies the pretend aircraft; the finder has no use for it, but draws beside who has
 

@@ -50,7 +50,7 @@ class Tlog:
             where = f", the first near byte {self._first_bad}" if self._first_bad is not None else ""
             self.skipped.append(f"{bad} damaged bytes skipped{where}, {read} frames read")
         if self.tangled is not None:
-            self.skipped.append(f"hardly anything but damage up to byte {self.tangled}, the rest was left unread; cut it")
+            self.skipped.append(f"hardly anything but damage to byte {self.tangled}, the rest was left unread; cut it")
 
     def _batches(self, decoder: Decoder) -> Iterator[Frames]:
         """Give the frames with their arrival as it stands in the file, made to never fall."""

@@ -36,8 +36,8 @@ _stamp = struct.Struct("<Q").unpack_from
 _MOST_PLACES = 8  # damaged places named
 _MOST_SLOW = 2_000_000  # messages that are no plain row; more of them are left unread
 _MOST_WANTED = 1 << 27  # bytes of rows of wanted topics that are kept: half an hour at the highest rates, else two
-_MOST_SMALL = {kind: (20_000, 1 << 22) for kind in b"CILOP"}  # messages of a kind that pass, and their bytes
-_MOST_SEARCHED = 4_000_000_000  # bytes looked at in vain in search of a message, each place counted as `_PLACE` more
+_MOST_SMALL = dict.fromkeys(b"CILOP", (20000, 1 << 22))  # messages of a kind that pass, and their bytes
+_MOST_SEARCHED = 2_000_000_000  # bytes looked at in vain in search of a message, each place counted as `_PLACE` more
 _PLACE = 1000
 
 
