@@ -9,6 +9,7 @@ import time
 from collections import deque
 from contextlib import AbstractContextManager
 
+from fleet.logs import untimed
 from fleet.plain import plain
 
 PARENT = "PARAUAV_PARENT"  # process id of the parent that started this process as its child
@@ -56,9 +57,10 @@ class Children(AbstractContextManager):
 
     def _listen(self, name: str, child: subprocess.Popen[str]) -> None:
         assert child.stdout is not None
-        for line in child.stdout:
-            if line.strip():
-                self._words[name].append(plain(line.rstrip()))
+        with child.stdout:
+            for line in child.stdout:
+                if line.strip():
+                    self._words[name].append(untimed(plain(line.rstrip())))  # who says them again says when
 
     def words(self) -> list[str]:
         """Give each child's last line."""

@@ -33,11 +33,12 @@ def parser_for(prog: str, summary: str, examples: str) -> argparse.ArgumentParse
 
 def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
     """Run a command; an expected failure becomes one sentence and exit code 2, Ctrl-C a clean 0."""
-    begin(prog, as_json=getattr(args, "log_json", False))
+    logs = hasattr(args, "log_json")
+    begin(prog, as_json=logs and args.log_json)
     try:
         return run(args)
     except (ValueError, OSError) as error:
-        fail(prog, str(error))
+        fail(prog, str(error), logged=logs)
         return 2
     except KeyboardInterrupt:
         return 0
