@@ -10,6 +10,7 @@ from collections import deque
 from contextlib import AbstractContextManager
 
 from fleet.interrupt import PARENT, deferred
+from fleet.logs import untimed
 from fleet.plain import plain
 
 _PATIENCE_S = 8.0  # between the request to stop and the end of patience [s]
@@ -72,9 +73,10 @@ class Children(AbstractContextManager):
 
     def _listen(self, name: str, child: subprocess.Popen[str]) -> None:
         assert child.stdout is not None
-        for line in child.stdout:
-            if line.strip():
-                self._words[name].append(plain(line.rstrip()))
+        with child.stdout:
+            for line in child.stdout:
+                if line.strip():
+                    self._words[name].append(untimed(plain(line.rstrip())))  # who says them again says when
 
     def words(self) -> list[str]:
         """Give each child's last line."""

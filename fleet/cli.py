@@ -36,11 +36,12 @@ def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
 
     A command that runs until it is stopped handles Ctrl-C itself (`stop_on_signal`) and returns 0.
     """
-    begin(prog, as_json=getattr(args, "log_json", False))
+    logs = hasattr(args, "log_json")
+    begin(prog, as_json=logs and args.log_json)
     try:
         code = interruptible(lambda: run(args))
     except (ValueError, OSError) as error:
-        fail(prog, str(error))
+        fail(prog, str(error), logged=logs)
         return 2
     if code == INTERRUPTED and not os.environ.get(PARENT):  # else the parent says so
         fail(prog, "interrupted")

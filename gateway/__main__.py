@@ -15,6 +15,7 @@ from fleet.bars import shown
 from fleet.bus import connect
 from fleet.cli import guarded, parser_for, stop_on_signal
 from fleet.config import entry, router_arguments
+from fleet.heap import give_back
 from fleet.logs import log_arguments, say
 from fleet.metrics import served
 from fleet.telemetry.ids import Ids
@@ -39,6 +40,7 @@ SWITCH_S = 5e-4  # how long a receiving thread waits while messages are made [s]
 COLD_S = 2.0  # compiling that takes longer is said [s]
 COLD = "compiling the decoder for this machine, once; links open when that is done"
 GARBAGE = 50_000  # objects made before cycles are looked for; messages make thousands a tick, and no cycles
+LARGE = 1 << 20  # batches of a flood are larger; what serves every tick is smaller [bytes]
 DEFAULT_LINK = "udpin:127.0.0.1:14550"
 EXAMPLES = """
   gateway                                              listen on loopback, port 14550
@@ -84,6 +86,7 @@ def run(args: argparse.Namespace) -> int:
     compiled()
     gc.freeze()
     gc.set_threshold(GARBAGE, *gc.get_threshold()[1:])
+    give_back(LARGE)
     with connect(entry(args, GATEWAY), patient=budget is not None) as bus, contextlib.ExitStack() as held:
         held.enter_context(played_apart(files, args, _log.warning))
         links: list[Link] = []

@@ -75,6 +75,14 @@ class Keeper:
         past.size += size
         self.size += size - past.trim(wire.t - self._seconds, self._share)
 
+    def forget(self, uavs: Iterable[int]) -> None:
+        """Forget aircraft; the others may then keep more."""
+        with self._lock:
+            for uav in uavs:
+                if (past := self._pasts.pop(uav, None)) is not None:
+                    self.size -= past.size
+            self._share = self._most // max(len(self._pasts), 1)
+
     def answer(self, uav: int | None, settings: dict[str, str], payload: bytes) -> Answers:
         """Answer a question on the bus.
 

@@ -11,7 +11,7 @@ from fleet.telemetry.heard import Heard
 from gateway.spec import Spec
 
 QUEUE = 20_000  # batches between receiving and decoding
-QUEUE_BYTES = 64 << 20  # in them
+QUEUE_BYTES = 24 << 20  # in them
 POLL_S = 0.2  # how soon a receiving thread notices the end [s]
 _T0 = time.time() - time.monotonic()
 

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Collection, Hashable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -80,6 +80,14 @@ class Publisher:
             return
         self._repeated = mono
         self._send(list(self._again.values()))
+
+    def forget(self, uavs: Collection[int]) -> None:
+        """Forget aircraft: nobody is answered about them any more."""
+        with self._lock:
+            for kind, latest in self._latest.items():
+                self._latest[kind] = {who: one for who, one in latest.items() if getattr(one[0], "uav", -1) not in uavs}
+        self._again = {who: wire for who, wire in self._again.items() if who[1] not in uavs}
+        self.history.forget(uavs)
 
     def _send(self, wires: Sequence[Wire], stamp: Stamp | None = None) -> None:
         self._again.update({(wire.kind, wire.uav): wire for wire in wires if wire.kind in AGAIN})

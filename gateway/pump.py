@@ -25,6 +25,7 @@ from gateway.record.recorder import Recorder, Tapped
 
 TICK_S = 0.1  # between two publications of a live link [s]
 NAP_S = 0.02  # at an empty queue [s]
+AT_ONCE = 4 << 20  # bytes heard between two publications; in a flood these come sooner than a tick
 ACCOUNT_S = 1.0  # between two counts [s]
 
 
@@ -60,10 +61,11 @@ class Pump:
         self.forward = Forward(links, stations, listen_only)
         self._gates = gates_of([link.spec for link in links], stations) if gates is None else gates
         self._heard: set[int] = set()  # links with something to forward
+        self._fresh = 0  # bytes heard since the last publication
         self._stations = range(len(links) - stations, len(links))
         self.tally = Tally(links, recorder)
         self.publisher = Publisher(bus, results=any(link.spec.results for link in links))
-        claims: dict[int, Craft] = {}
+        claims = self._claims = dict[int, Craft]()
         self.intakes = [
             Intake(link.spec.offset, claims, most, gate.admit) for link, gate in zip(links, self._gates, strict=True)
         ]
@@ -86,7 +88,7 @@ class Pump:
             while self._open and not stop.is_set():
                 self._drain(tick, stop)
                 mono = time.monotonic()
-                if mono >= tick:
+                if mono >= tick or self._fresh >= AT_ONCE:
                     self._tick(mono)
                     tick = max(tick + TICK_S, time.monotonic() + TICK_S / 2)  # the queue always gets its turn
                 if mono >= account:
@@ -104,6 +106,7 @@ class Pump:
         if batch.heard is not None:
             self.tally.add(batch.link, batch.heard)
             intake.listen(batch.heard)
+            self._fresh += batch.size
             self._heard.add(batch.link)
         if batch.gone is not None:
             self._pass_on()
@@ -120,8 +123,12 @@ class Pump:
             self._open.discard(batch.link)
 
     def _drain(self, until: float, stop: threading.Event) -> None:
-        """Work through the queue until the next tick is due; `until` is on the monotonic clock [s]."""
-        while (left := until - time.monotonic()) > 0 and self._open:
+        """Work through the queue until the next tick is due, or `AT_ONCE` is there.
+
+        Args:
+            until: on the monotonic clock [s]
+        """
+        while (left := until - time.monotonic()) > 0 and self._open and self._fresh < AT_ONCE:
             try:
                 self.take(self._queue.get_nowait())
             except queue.Empty:
@@ -138,6 +145,7 @@ class Pump:
 
     def _tick(self, mono: float) -> None:
         self._pass_on()
+        self._fresh = 0
         for number in self._live:
             intake, link, gate, now = self.intakes[number], self.links[number], self._gates[number], wall()
             news = intake.pack(now)
@@ -154,8 +162,15 @@ class Pump:
         if self._recorder is not None:
             self._recorder.hear(number, Heard.of([(wall(), ("sent", where), data)]))
 
+    def _forget(self, now: float) -> None:
+        """Forget who is silent, as far as the intakes of live links do; `now` is fleet time [s since 1970]."""
+        gone = {uav for number in self._live for uav in self.intakes[number].forget(now)}
+        if gone := gone - self._claims.keys():
+            self.publisher.forget(gone)
+
     def _tell(self) -> None:
         now = wall() if self._live else self._recorded
+        self._forget(wall())
         self.forward.tidy(wall())
         shares = [onboard.share for onboard in self._onboards]
         account = self.tally.account(now, self.intakes, self._players, self.publisher.way, shares)

@@ -5,6 +5,7 @@ from collections import defaultdict
 
 from talker import Ears
 
+from fleet import logs
 from gateway.__main__ import COLD
 from gateway.link import Batch
 from gateway.spec import read_spec
@@ -14,7 +15,14 @@ PATIENCE_S = 60.0  # an upper bound; every wait ends with its condition
 
 def beside_compiling(errors: str) -> str:
     """Give what a gateway said on standard error, but for what it says of compiling on a cold or busy machine."""
-    return errors.replace(f"gateway: {COLD}\n", "")
+    return "".join(line for line in untimed(errors) if line != f"gateway: {COLD}\n")
+
+
+def untimed(log: str) -> list[str]:
+    """Give the lines of a log without their times; every line has one."""
+    found = [logs.untimed(line) for line in log.splitlines(keepends=True)]
+    assert all(one != line for one, line in zip(found, log.splitlines(keepends=True), strict=True)), log
+    return found
 
 
 class FakeLink:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from cable import Cable
 from conftest import ROOT, unused_port
+from fake_link import untimed
 from pretend_feed import HOSTILE, PretendFleet
 
 from fleet.bus import connect, open_router
@@ -82,7 +83,7 @@ class Viewer:
         env = {**os.environ, "PYTHONPATH": str(ROOT)}
         self.process = subprocess.Popen(command, cwd=ROOT, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
         line = self.process.stdout.readline().decode()
-        assert line == f"viewer: http://127.0.0.1:{self.port}\n", line + self.process.stdout.read().decode()
+        assert untimed(line) == [f"viewer: http://127.0.0.1:{self.port}\n"], line + self.process.stdout.read().decode()
 
     def cpu_s(self) -> float:
         """Give the processor time it has used [s]."""
@@ -350,4 +351,4 @@ def test_a_taken_port_is_a_sentence(router: str, free_port: int) -> None:
         env = {**os.environ, "PYTHONPATH": str(ROOT)}
         ended = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=30, check=False)
     assert ended.returncode == 2 and ended.stdout == ""
-    assert ended.stderr.startswith(f"viewer: --port: found {free_port} taken")
+    assert untimed(ended.stderr)[0].startswith(f"viewer: --port: found {free_port} taken")

@@ -18,7 +18,7 @@ from conftest import ROOT, unused_port
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import Talker
 
-from fleet import cli
+from fleet import cli, logs
 from fleet.bus import connect
 from fleet.commands.status import fleet_rows
 from fleet.contract import Account, FleetState, Mission, Model, Outcome, Params, Prediction, Sample, State, Status
@@ -171,7 +171,7 @@ def test_what_makes_no_sense_is_refused_in_one_sentence(
     else:
         with process("fleet.cli", "up", *ports, *options) as up:
             code, _, errors = ended(up)
-    last = errors.splitlines()[-1]
+    last = logs.untimed(errors.splitlines()[-1])
     assert code == 2
     assert last.startswith("fleet up: ") and (REFUSED | REFUSED_LATER)[options] in last and ";" in last
     assert "Traceback" not in errors

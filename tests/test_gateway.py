@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 from conftest import ROOT, unused_port
-from fake_link import FakeLink, beside_compiling
+from fake_link import FakeLink, beside_compiling, untimed
 from talker import ITEMS, T0, Aircraft, Talker
 
 from fleet.bus import connect
@@ -251,7 +251,7 @@ def start(*arguments):
 def test_the_gateway_stops_cleanly(router, number):
     child = start("-m", "gateway", "--router", router, "--link", f"udpin:127.0.0.1:{udp_port()}")
     with child:
-        assert child.stdout.readline().startswith("gateway: udpin")
+        assert untimed(child.stdout.readline())[0].startswith("gateway: udpin")
         child.send_signal(number)
         _, errors = child.communicate(timeout=PATIENCE_S)
     assert (child.returncode, beside_compiling(errors)) == (0, "")

@@ -20,7 +20,7 @@ from fleet.memory_bus import MemoryBus
 from fleet.telemetry.heard import Heard
 from fleet.telemetry.ids import Ids
 from gateway.link import Batch, wall
-from gateway.links import receive
+from gateway.links import receive, tcp_listener
 from gateway.links.opening import open_link
 from gateway.links.outbox import MOST, Outbox
 from gateway.onboard import Onboard
@@ -145,6 +145,44 @@ def test_tcpin_has_many_callers_and_says_who_left():
         assert {line.next().gone, line.next().gone} >= {left}
         line.link.send(left, ANSWER, 5)
         assert line.link.unsent == 5
+
+
+def test_tcpin_full_of_silent_callers_lets_the_next_one_in_and_keeps_who_speaks():
+    with contextlib.ExitStack() as held, Line(f"tcpin:127.0.0.1:{unused_port()}") as line:
+        where = ("127.0.0.1", line.link.port)
+
+        def call():
+            caller = held.enter_context(socket.create_connection(where, PATIENCE_S))
+            until(lambda: caller.getsockname() in line.link.greets)
+            return caller
+
+        first, speaker = call(), call()
+        silent = [call() for _ in range(tcp_listener.MOST - 2)]
+        speaker.sendall(HELLO)
+        assert line.hear(len(HELLO)) == (speaker.getsockname(), HELLO)
+        for oldest in (first, *silent[:5]):
+            rightful = call()
+            assert oldest.recv(1) == b"" and line.next().gone == oldest.getsockname()
+            rightful.sendall(HELLO)
+            assert line.hear(len(HELLO)) == (rightful.getsockname(), HELLO)
+        speaker.sendall(HELLO)
+        assert line.hear(len(HELLO)) == (speaker.getsockname(), HELLO)
+        assert len(line.link.greets) == tcp_listener.MOST
+
+
+def test_tcpin_refuses_the_next_caller_where_all_speak(monkeypatch, caplog):
+    monkeypatch.setattr(tcp_listener, "MOST", 2)
+    monkeypatch.setattr(tcp_listener, "SPEAKING_S", PATIENCE_S)
+    with contextlib.ExitStack() as held, Line(f"tcpin:127.0.0.1:{unused_port()}") as line:
+        where = ("127.0.0.1", line.link.port)
+        callers = [held.enter_context(socket.create_connection(where, PATIENCE_S)) for _ in range(2)]
+        for caller in callers:
+            caller.sendall(HELLO)
+            assert line.hear(len(HELLO)) == (caller.getsockname(), HELLO)
+        for _ in range(3):
+            assert held.enter_context(socket.create_connection(where, PATIENCE_S)).recv(1) == b""
+        assert set(line.link.greets) == {caller.getsockname() for caller in callers}
+    assert caplog.text.count("one more was refused") == 1  # a flood of callers is no flood of log lines
 
 
 def test_tcp_calls_again_when_the_far_end_goes_and_counts_what_it_could_not_send():

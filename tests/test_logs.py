@@ -4,14 +4,18 @@ import json
 import logging
 import subprocess
 import sys
+import threading
+import time
 import urllib.request
+from datetime import datetime
 
 import pytest
 from conftest import ROOT, unused_port
 from prometheus_client.parser import text_string_to_metric_families
 
+from fleet.children import Children
 from fleet.contract import FleetRow, FleetState, State
-from fleet.logs import Lines, Words
+from fleet.logs import Lines, Words, fail, say, tell, timed, untimed
 from fleet.memory_bus import MemoryBus
 from fleet.metrics import served
 from tests.bench.security.bombs import ESCAPES
@@ -31,10 +35,44 @@ def record(message: str, *, defect: bool = False) -> logging.LogRecord:
 
 
 def test_people_read_a_sentence_that_steers_no_terminal() -> None:
-    assert Words("gateway").format(record("the router is away")) == "gateway: the router is away"
-    said = Words("gateway").format(record(f"uav-7 says {ESCAPES}"))
+    assert untimed(Words("gateway").format(record("the router is away"))) == "gateway: the router is away"
+    said = untimed(Words("gateway").format(record(f"uav-7 says {ESCAPES}")))
     assert said.isprintable() and said.startswith("gateway: uav-7 says ?]0;owned??[2J")
     assert "ZeroDivisionError: by a stranger" in Words("gateway").format(record("x", defect=True))
+
+
+def test_every_line_of_a_log_begins_with_its_time(capsys) -> None:
+    assert timed("gateway: there", 0.0625) == "1970-01-01T00:00:00.062Z gateway: there"
+    later = record("the router is away")
+    later.created = 86_400.0
+    assert Words("gateway").format(later) == "1970-01-02T00:00:00.000Z gateway: the router is away"
+    begun = time.time() - 0.001
+    for one in (say, tell, fail):
+        one("gateway", "a\x1b sentence")
+    said = "".join(capsys.readouterr()).splitlines()
+    assert [untimed(line) for line in said] == ["gateway: a? sentence"] * 3
+    assert all(begun <= datetime.fromisoformat(line.split()[0]).timestamp() <= time.time() for line in said)
+    fail("fleet status", "nobody answers", logged=False)  # an answer is no line of a log
+    assert capsys.readouterr().err == "fleet status: nobody answers\n"
+
+
+@pytest.mark.parametrize("module", ["gateway", "twin_worker", "viewer"])
+def test_a_refusal_in_a_log_has_its_time(module: str) -> None:
+    command = [sys.executable, "-m", module, "--router", f"tcp/127.0.0.1:{unused_port()}"]
+    command += {"gateway": ["--link=nonsense"], "viewer": ["--port=99999"]}.get(module, [])
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    (line,) = done.stderr.splitlines()
+    assert untimed(line) != line and untimed(line).startswith(f"{module}: ")
+
+
+def test_what_a_child_says_again_has_one_time() -> None:
+    with Children() as children:
+        children.start("one", "gateway", "--link=nonsense")
+        ended = threading.Event()
+        while not children.failed():
+            ended.wait(0.02)
+        ((code, sentence),) = children.failed()
+    assert code == 2 and sentence.startswith("gateway: --link: found 'nonsense'")
 
 
 def test_machines_read_one_line_of_json() -> None:

@@ -9,7 +9,7 @@ import threading
 
 import pytest
 from conftest import ROOT, unused_port
-from fake_link import beside_compiling
+from fake_link import beside_compiling, untimed
 from pymavlink import mavutil
 from talker import T0, Talker
 from test_gateway import PATIENCE_S, Ear, udp_port
@@ -88,7 +88,7 @@ def test_a_gateway_that_records_begins_without_a_router_and_joins_it_later(tmp_p
     with subprocess.Popen(
         command, cwd=ROOT, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as child:
-        assert child.stdout.readline().startswith("gateway: ")
+        assert untimed(child.stdout.readline())[0].startswith("gateway: ")
         radio = threading.Thread(target=fly)
         radio.start()
         try:

@@ -138,6 +138,18 @@ def test_a_disk_that_takes_no_more_is_said_and_counted_and_later_tried_again(tmp
         assert tape.write(records, AGAIN_S + 0.1) == 0 and tape.trouble == ""
 
 
+def test_a_disk_that_takes_nothing_is_left_without_empty_files(tmp_path):
+    records = bytes(1000)
+    with Tape("a", Budget(tmp_path, MORE)) as tape:
+        with files_no_longer_than(500):
+            for k in range(10):
+                assert tape.write(records, k * (AGAIN_S + 0.1)) == 1000
+                assert "make room" in tape.trouble and not list(tmp_path.iterdir())
+        assert tape.write(records, 10 * (AGAIN_S + 0.1)) == 0  # there is room again
+    (path,) = tmp_path.iterdir()
+    assert path.stat().st_size == 1000
+
+
 def test_a_full_disk_loses_nothing_silently(tmp_path, monkeypatch, caplog):
     full = threading.Event()
 

@@ -20,6 +20,7 @@ import numpy as np
 import scipy.stats
 
 from fleet.cli import guarded, parser_for
+from fleet.logs import tell
 from twin_worker.experiment import FIRST, NAMES, Experiment, Plan, experiments
 from twin_worker.flown import MODES, Flown, flown
 from twin_worker.paper_figures import draw
@@ -90,7 +91,7 @@ def text(first: str, rows: dict[str, dict[str, Any]]) -> str:
 def _run(args: argparse.Namespace) -> int:
     flights: list[Flown] = []
     for path in args.files:
-        print(f"paper: reading {path.name}", file=sys.stderr, flush=True)
+        tell("paper", f"reading {path.name}")
         flights += flown(path)
     if not flights:
         raise ValueError("paper: found no flight with attitude, velocity, position and servo rows; name another FILE")
@@ -120,9 +121,9 @@ def _carried_out(tried: Iterable[Experiment | str], total: int, first: str) -> l
         else:
             done.append(one)
         if (k + 1) % _SAY_EVERY == 0:
-            print(f"paper: {first}, {k + 1} of {total} experiments", file=sys.stderr, flush=True)
+            tell("paper", f"{first}, {k + 1} of {total} experiments")
     for sentence, count in refused.items():
-        print(f"paper: {count} not done, {sentence}", file=sys.stderr)
+        tell("paper", f"{count} not done, {sentence}")
     return done
 
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from fleet.cli import guarded, parser_for
 from fleet.contract import Message, Model, Outcome, Prediction
+from fleet.logs import tell
 from fleet.telemetry.recordings import replay_messages
 from twin_worker.calibration.quantile import survival
 from twin_worker.conflict.traffic import Traffic
@@ -59,7 +60,7 @@ def replay(messages: Iterable[Message], progress: str = "") -> dict[str, dict[st
         start = begun.setdefault(message.uav, message.t)
         if progress and message.t - start >= said + _SAY_EVERY_S:
             said = message.t - start
-            print(f"{progress}: {said:.0f} s of flight, {len(begun)} UAVs", file=sys.stderr, flush=True)
+            tell(progress, f"{said:.0f} s of flight, {len(begun)} UAVs")
         tally = tallies.setdefault(message.uav, Tally())
         for result in run((message,), twins, traffic):
             _take(tally, result, start)

@@ -1,5 +1,6 @@
 """The door of the page: who may come in, and what they are given first. All that bends the page library is here."""
 
+import asyncio
 import contextlib
 import gzip
 import http
@@ -7,7 +8,7 @@ import io
 import logging
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -34,7 +35,18 @@ ICONS = (  # of the page's tabs, buttons and commands
     Icon.MOVIE,
     Icon.TABLE,
 )
+PORTS = {"http": "80", "https": "443"}  # a browser leaves these out
+REFUSED = (  # messages that no page of ours sends
+    _messages.FileTransferStartUpload,
+    _messages.FileTransferPart,
+    _messages.ShareUrlRequest,
+    _messages.ShareUrlDisconnect,
+)
+VIOLATION = 1008  # close code of a connection that broke a rule (RFC 6455, 7.4.1)
 Answering = Callable[[Any, Request], Response | None]
+Handling = Callable[[Any], Awaitable[None]]
+
+_log = logging.getLogger(__name__)
 
 
 def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
@@ -53,8 +65,8 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
     _read_icons()
     with quiet(), _guarded({*HOME, host.strip("[]").lower(), *filter(None, [name.lower()])}, anyone=_is_any(host)):
         server = viser.ViserServer(host=host, port=port, verbose=False)
-    for share in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
-        server._websock_server.unregister_handler(share)
+    for kind in REFUSED:
+        server._websock_server.unregister_handler(kind)
     if port and server.get_port() != port:
         with quiet():
             server.stop()
@@ -89,8 +101,9 @@ def _guarded(names: set[str], *, anyone: bool) -> Iterator[None]:
     """Put our own doorman before the library's, while it opens its server."""
     original = sockets.serve
 
-    def guarded(*args: Any, process_request: Answering, **options: Any) -> Any:
-        return original(*args, process_request=doorman(process_request, names, anyone=anyone), **options)
+    def guarded(handler: Handling, *args: Any, process_request: Answering, **options: Any) -> Any:
+        answer = doorman(process_request, names, anyone=anyone)
+        return original(checked(handler), *args, process_request=answer, **options)
 
     sockets.serve = guarded  # type: ignore[assignment,misc]
     try:
@@ -102,8 +115,10 @@ def _guarded(names: set[str], *, anyone: bool) -> Iterator[None]:
 def doorman(inner: Answering, names: set[str], *, anyone: bool) -> Answering:
     """Wrap what answers a request: strangers are refused, the page carries its rules and its first words.
 
-    A page of another site that runs in the operator's browser may neither open our socket (its `Origin` is another) nor
-    reach us under a name of its own (its `Host` is none of ours).
+    A page of another site that runs in the operator's browser may neither open our socket (scheme, host and port of its
+    `Origin` are not those of the page asked for) nor reach us under a name of its own (its `Host` is none of ours).
+    The scheme is the one a reverse proxy names in `X-Forwarded-Proto`, which no script of a page can set; without it,
+    http, and under `--name` https as well.
 
     Args:
         inner: the library's own answer
@@ -117,7 +132,7 @@ def doorman(inner: Answering, names: set[str], *, anyone: bool) -> Answering:
         origin = request.headers.get("Origin")
         if not anyone and host not in names:
             return _refusal(f"viewer: found host {host[:80]!r}, expected {sorted(names)}; start it with --name")
-        if origin is not None and _name(origin.partition("://")[2]) != host:
+        if origin is not None and not _is_own(origin, request, proxied=host in names and host not in HOME):
             return _refusal("viewer: found a request of another site, expected this page's own; open the page itself")
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return inner(connection, request)
@@ -126,6 +141,66 @@ def doorman(inner: Answering, names: set[str], *, anyone: bool) -> Answering:
         return inner(connection, request)
 
     return answer
+
+
+def _is_own(origin: str, request: Request, *, proxied: bool) -> bool:
+    """Tell whether an origin is that of the page asked for.
+
+    Args:
+        origin: scheme://host[:port] of the page that asks
+        request: what it asks
+        proxied: whether the page may be shown by a reverse proxy that does not name its scheme
+    """
+    scheme, _, address = origin.lower().partition("://")
+    host = request.headers.get("Host", "").lower()
+    forwarded = request.headers.get("X-Forwarded-Proto", "").lower()
+    schemes = {forwarded} if forwarded else {"http", "https"} if proxied else {"http"}
+    return scheme in schemes & PORTS.keys() and _with_port(address, scheme) == _with_port(host, scheme)
+
+
+def _with_port(address: str, scheme: str) -> tuple[str, str]:
+    """Give host and port; the port of the scheme where there is none."""
+    rest = address.rpartition("]")[2]  # of an IPv6 address in brackets
+    return _name(address), rest.partition(":")[2] or PORTS[scheme]
+
+
+def checked(handler: Handling) -> Handling:
+    """Wrap what serves a websocket: a message that is malformed or refused ends its connection, with one log line."""
+
+    async def serve_one(connection: Any) -> None:
+        asyncio.get_running_loop().set_exception_handler(_log_defect)
+        receive = connection.recv
+
+        async def receive_checked(*args: Any, **options: Any) -> Any:
+            raw = await receive(*args, **options)
+            if fault := _fault(raw):
+                _log.warning("page: found %s, expected a message of this page; connection closed", fault)
+                await connection.close(VIOLATION, "viewer: message refused")
+                return await receive(*args, **options)  # raises: it is closed
+            return raw
+
+        connection.recv = receive_checked
+        await handler(connection)
+
+    return serve_one
+
+
+def _fault(raw: object) -> str:
+    """Say what is wrong with a message; nothing: an empty string."""
+    if not isinstance(raw, bytes):
+        return "text"
+    try:
+        message = _messages.Message.deserialize(raw)
+    except Exception as error:  # made by a stranger: whatever the library meets in it
+        return f"{len(raw)} bytes that are no message ({type(error).__name__})"
+    return f"a {type(message).__name__}" if isinstance(message, REFUSED) else ""
+
+
+def _log_defect(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Log in one line what a task of the library met: the values in a message may be a stranger's."""
+    del loop
+    error = context.get("exception")
+    _log.warning("page: %s", f"a message failed ({type(error).__name__}: {error})" if error else context["message"])
 
 
 def _name(address: str) -> str:

@@ -1,12 +1,12 @@
 """Fly recordings through the twins as if live, and score every prediction against what then happened."""
 
 import argparse
-import sys
 from pathlib import Path
 
 from fleet.children import run_until
 from fleet.cli import stop_on_signal
 from fleet.interrupt import INTERRUPTED
+from fleet.logs import tell
 
 EXAMPLES = """
   fleet assess flight.tlog
@@ -70,6 +70,6 @@ def run(args: argparse.Namespace) -> int:
     options += ["--without-params"] if args.without_params else []
     code = run_until(stop, "twin_worker.assess", *options, "--", *map(str, args.file))
     if stop.is_set():
-        print("assess: stopped; what was not finished is not written", file=sys.stderr)
+        tell("assess", "stopped; what was not finished is not written")
         return INTERRUPTED
     return code

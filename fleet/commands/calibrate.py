@@ -1,12 +1,12 @@
 """Calibrate an aircraft's simulation on nominal flights, for `fleet diagnose`."""
 
 import argparse
-import sys
 from pathlib import Path
 
 from fleet.children import run_until
 from fleet.cli import stop_on_signal
 from fleet.interrupt import INTERRUPTED
+from fleet.logs import tell
 
 EXAMPLES = """
   fleet calibrate monday/*.tlog --airframe skywalker --out skywalker.json
@@ -37,6 +37,6 @@ def run(args: argparse.Namespace) -> int:
     ]
     code = run_until(stop, "twin_worker.diagnose.learn", *options, "--", *map(str, args.file))
     if stop.is_set():
-        print("calibrate: stopped; no model was written", file=sys.stderr)
+        tell("calibrate", "stopped; no model was written")
         return INTERRUPTED
     return code

@@ -1,12 +1,12 @@
 """Find where a flight and its simulation part ways, what physics was left out, and prove it on data held out."""
 
 import argparse
-import sys
 from pathlib import Path
 
 from fleet.children import run_until
 from fleet.cli import stop_on_signal
 from fleet.interrupt import INTERRUPTED
+from fleet.logs import tell
 
 _LONGEST_S = 1e6
 
@@ -78,6 +78,6 @@ def run(args: argparse.Namespace) -> int:
     simulated = ["--against", *map(str, args.against)] if args.against else []
     code = run_until(stop, "twin_worker.diagnose", *options, *simulated, "--", *map(str, args.file))
     if stop.is_set():
-        print("diagnose: stopped; what was not finished is not written", file=sys.stderr)
+        tell("diagnose", "stopped; what was not finished is not written")
         return INTERRUPTED
     return code

@@ -7,6 +7,7 @@ from threading import Event
 from typing import TYPE_CHECKING
 
 from fleet.cli import id_range, stop_on_signal
+from fleet.logs import say
 
 if TYPE_CHECKING:
     from fleet.pretend.faults.fault import Fault
@@ -76,14 +77,14 @@ def run(args: argparse.Namespace) -> int:
     uavs = [
         PretendUav(i, args.seed, wind=args.wind, turbulence=level, **kind, faults=faulty.get(i, ())) for i in args.uavs
     ]
-    print("fly: compiling the autopilot, once", flush=True)
+    say("fly", "compiling the autopilot, once")
     PretendUav(args.uavs[0], args.seed).step(0.2)
     if args.tlog is not None:
         _record(uavs, args, stop)
         return 0
-    print(f"fly: {len(uavs)} aircraft in the air, talking to {host}:{port}", flush=True)
+    say("fly", f"{len(uavs)} aircraft in the air, talking to {host}:{port}")
     worst = drive.to_udp(uavs, (host, port), seconds=args.seconds, loss=args.loss, seed=args.seed, stop=stop)
-    print(f"fly: stopped; at worst {worst * 1e3:.0f} ms behind real time", flush=True)
+    say("fly", f"stopped; at worst {worst * 1e3:.0f} ms behind real time")
     return 0
 
 
@@ -145,4 +146,4 @@ def _record(uavs: "Sequence[PretendUav]", args: argparse.Namespace, stop: Event)
             progress=lambda t: bar.update(task, completed=t),
             stop=stop,
         )
-    print(f"fly: {frames} frames of {len(uavs)} aircraft in {args.tlog}", flush=True)
+    say("fly", f"{frames} frames of {len(uavs)} aircraft in {args.tlog}")

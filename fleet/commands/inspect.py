@@ -16,6 +16,7 @@ from fleet.bars import shown
 from fleet.children import run_to_end
 from fleet.commands.schema import fields_of, parts_of, summary
 from fleet.interrupt import deferred
+from fleet.logs import tell
 from fleet.sheet import table
 from fleet.telemetry.findings import Facts, File, Findings, findings
 from fleet.telemetry.recordings import Recording
@@ -75,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         from fleet.page import Sheet, write  # loads matplotlib: not for --help
 
         for made in write(args.plot, [Sheet(*sheet) for sheet in sheets]):
-            print(f"fleet inspect: wrote {made}", file=sys.stderr)
+            tell("fleet inspect", f"wrote {made}")
     return 1 if any(file.sentences or not file.aircraft or "sentence" in (file.twin or {}) for file in told) else 0
 
 
@@ -108,7 +109,7 @@ def read(path: Path, offset: int = 0) -> Heard:
 
 
 def _say(line: str) -> None:
-    print(f"fleet inspect: {line}", file=sys.stderr, flush=True)
+    tell("fleet inspect", line)
 
 
 def _size(path: Path) -> int:

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +10,7 @@ from threading import Event
 from fleet.children import run_until
 from fleet.cli import id_range, stop_on_signal
 from fleet.interrupt import INTERRUPTED
+from fleet.logs import tell
 
 EXAMPLES = """
   fleet paper identify --out figures --json paper.json
@@ -108,6 +108,6 @@ def _judge(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
         command = ["twin_worker.assess", f"--methods={_BESIDE}", f"--every={_EVERY_S}", f"--jobs={args.jobs}"]
     code = run_until(stop, *command, *options, *map(str, files))
     if stop.is_set():
-        print("paper: stopped; what was not finished is not written", file=sys.stderr)
+        tell("paper", "stopped; what was not finished is not written")
         return INTERRUPTED
     return code

@@ -2,11 +2,11 @@
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from fleet.cli import stop_on_signal
+from fleet.logs import tell
 
 EXAMPLES = """
   fleet prove --flights 12                                  a demonstration of some minutes
@@ -60,7 +60,7 @@ def _examined(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _say(words: str) -> None:
-    print(f"prove: {words}", file=sys.stderr, flush=True)
+    tell("prove", words)
 
 
 def _check(args: argparse.Namespace) -> None:

@@ -2,7 +2,6 @@
 
 import argparse
 import math
-import sys
 import threading
 import time
 from collections import Counter
@@ -19,6 +18,7 @@ from fleet.cli import stop_on_signal
 from fleet.codec import Stamp, encode, encoding
 from fleet.config import entry, router_arguments
 from fleet.contract import TOPICS, Sample
+from fleet.logs import tell
 from fleet.talk import Bus
 from fleet.telemetry.fleet_log import Record
 
@@ -49,9 +49,9 @@ def run(args: argparse.Namespace) -> int:
         recorder = Recorder(bus, file)
         recorder.listen()
         _record(recorder, args, stop)
-    print(f"fleet record: {recorder.words()}; {args.file} is complete", file=sys.stderr)
+    tell("fleet record", f"{recorder.words()}; {args.file} is complete")
     if recorder.dropped:
-        print(f"fleet record: {recorder.dropped} messages dropped, the disk could not follow", file=sys.stderr)
+        tell("fleet record", f"{recorder.dropped} messages dropped, the disk could not follow")
     return 1 if recorder.dropped else 0
 
 
@@ -157,4 +157,4 @@ def _record(recorder: Recorder, args: argparse.Namespace, stop: threading.Event)
                 live.update(Text(f"recording {args.file.name}: {recorder.words()}"), refresh=True)
             elif recorder.seconds >= due and not over:
                 due += _PLAIN_S
-                print(f"fleet record: {recorder.words()}", file=sys.stderr, flush=True)
+                tell("fleet record", recorder.words())

@@ -1,8 +1,8 @@
 """Play recordings into a running fleet, as if they were flown now."""
 
 import argparse
-import sys
 import threading
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
@@ -10,6 +10,7 @@ from fleet.bars import shown
 from fleet.children import run_until
 from fleet.cli import stop_on_signal
 from fleet.config import passed_on, router_arguments
+from fleet.logs import tell
 from fleet.telemetry.airing import MOST_ON_A_LINK, Airing, address, shared
 from fleet.telemetry.ids import Ids
 from fleet.telemetry.pace import read_speed
@@ -63,13 +64,13 @@ def _send(args: argparse.Namespace) -> int:
     stop = stop_on_signal()
     pairs = zip(airings, places, strict=True)
     threads = [threading.Thread(target=airing.send, args=(to, stop), name=airing.name) for airing, to in pairs]
-    with shown(airings, lambda line: print(f"fleet replay: {line}", file=sys.stderr, flush=True)):
+    with shown(airings, partial(tell, "fleet replay")):
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
     for airing in airings:
-        print(f"fleet replay: {airing.trouble or f'{airing.name}: {airing.words()}'}", file=sys.stderr)
+        tell("fleet replay", airing.trouble or f"{airing.name}: {airing.words()}")
     return 1 if any(airing.trouble for airing in airings) else 0
 
 

@@ -22,6 +22,7 @@ from fleet.commands.replay import link
 from fleet.commands.status import as_objects, fleet_rows, table
 from fleet.config import entry, passed_on, router_arguments
 from fleet.contract import FleetRow, FleetState, State
+from fleet.logs import tell, timed
 from fleet.plain import plain
 from fleet.talk import Bus
 
@@ -170,9 +171,9 @@ def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threadi
     if args.summary:
         args.summary.write_text(json.dumps(as_objects(rows), indent=1) + "\n")
     for _, sentence in failed:
-        print(f"fleet up: {sentence}", file=sys.stderr)
+        tell("fleet up", sentence)
     if stop.is_set():
-        print("fleet up: stopping", file=sys.stderr)
+        tell("fleet up", "stopping")
     return (2 if all(code == 2 for code, _ in failed) else 1) if failed else 0
 
 
@@ -195,7 +196,7 @@ class _Show:
             news.insert(0, lines[0])
         self._said.update(news)
         for line in news:
-            print(line, file=sys.stderr, flush=True)
+            print(timed(plain(line)), file=sys.stderr, flush=True)
 
 
 def _lines(

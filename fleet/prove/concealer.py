@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from fleet.cli import guarded
+from fleet.logs import tell
 from fleet.pretend.conceal.exam import exam
 from fleet.prove.seal import seal
 
@@ -15,7 +16,7 @@ _EVERY = 10
 def _progress(name: str, done: int, of: int) -> None:
     """Say how far it is; the order of flights says nothing."""
     if done % _EVERY == 0 or done == of:
-        print(f"prove: {done} of {of} flights flown", file=sys.stderr, flush=True)
+        tell("prove", f"{done} of {of} flights flown")
 
 
 def _run(args: argparse.Namespace) -> int:

@@ -28,11 +28,22 @@ class Craft:
         uav: UAV id
         system, component: MAVLink ids
         source: who sends what it says
+        number: in the flock, of one that was forgotten; None: a new one
     """
 
-    def __init__(self, flock: Flock, uav: int, system: int, component: int, source: Hashable = None) -> None:
+    def __init__(
+        self,
+        flock: Flock,
+        uav: int,
+        system: int,
+        component: int,
+        source: Hashable = None,
+        *,
+        number: int | None = None,
+    ) -> None:
         self.uav, self.system, self.component, self.source = uav, system, component, source
-        self.flock, self.number = flock, flock.add(uav)
+        self.flock = flock
+        self.number = flock.add(uav) if number is None else number
         self.link = Link.LIVE
         self.autopilot, self.mode, self.armed = "generic", "", False
         self.kind = heartbeat.UNKNOWN  # of vehicle, as its heartbeat tells

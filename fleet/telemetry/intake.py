@@ -25,6 +25,10 @@ MOST_UAVS = 2_000  # over all links
 SECOND = "second sender for a live id"
 NOT_YET = "no aircraft heartbeat yet"
 MOST_EARLY = 4096  # messages of one system kept until its first heartbeat; a recording may begin anywhere
+MOST_EARLY_ALL = 32_768  # the same of all systems of a link, some 25 MB
+EARLY_S = 15.0  # how long they are kept: heartbeats come every second [s]
+FORGET_S = 30.0  # silence after which an aircraft that was not heard for `KNOWN_S` is forgotten [s]
+KNOWN_S = 30.0  # an aircraft heard for so long stays, lost, until its place is needed [s]
 
 News = Sample | Status | Mission | Params | Alert
 EARLY = MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # said once, so worth keeping; rows come again
@@ -64,6 +68,9 @@ class Intake:
         self._born: dict[int, int] = {}  # in this batch: by system, the frame of its first heartbeat
         self._rivals: set[int] = set()  # systems whose UAV id another link holds
         self._early: dict[int, list[tuple[float, Any]]] = {}  # before the first heartbeat, by system id
+        self._early_n = 0  # of all of them
+        self._numbered: list[Craft] = []  # by number in the flock, forgotten ones too: a system keeps its number
+        self._met: dict[int, float] = {}  # when each was met, by system id [s since 1970]
 
     def hear(self, arrival: float, data: bytes, source: Hashable = None) -> None:
         """Take bytes that arrived together; they are worked through at the next `flush`.
@@ -134,13 +141,40 @@ class Intake:
             self.digest(joined(self._sorted))
             self._sorted.clear()
 
+    def forget(self, now: float) -> list[int]:
+        """Forget who is silent at `now` [s since 1970]; gives their UAV ids.
+
+        An aircraft heard for less than `KNOWN_S` is forgotten after `FORGET_S` of silence, any other once its place is
+        needed.
+        """
+        for system in [system for system, kept in self._early.items() if now - kept[0][0] > EARLY_S]:
+            self.refused[NOT_YET] += len(self._pop_early(system))
+        gone = []
+        for system, craft in list(self.crafts.items()):
+            brief = craft.heard - self._met[system] < KNOWN_S and now - craft.heard > FORGET_S
+            if brief or self._claims.get(craft.uav) is None:
+                self._drop(system, craft)
+                gone.append(craft.uav)
+        return gone
+
+    def _drop(self, system: int, craft: Craft) -> None:
+        """Forget one aircraft; its number is kept for whoever next uses its system id."""
+        del self.crafts[system], self._met[system]
+        if self._claims.get(craft.uav) is craft:
+            del self._claims[craft.uav]
+        self._collisions.pop(craft.uav, None)
+        self._rivals.discard(system)
+        self._speakers[(system << 8) + craft.component] = -1
+        self.flock.reset(craft.number)
+        self._numbered[craft.number] = Craft(self.flock, craft.uav, system, craft.component, number=craft.number)
+
     def take(self, now: float) -> list[News]:
         """Hand over what had arrived up to `now` of what was digested; `now` is fleet time [s since 1970]."""
         return unpacked(self._take(now))
 
     def _take(self, now: float) -> list[News | Wire]:
         news: list[News | Wire] = [alert for one in self._collisions.values() for alert in one.take(now)]
-        samples, crafts, due = self.flock.take(now), list(self.crafts.values()), set(self.flock.due(now))
+        samples, crafts, due = self.flock.take(now), self._numbered, set(self.flock.due(now))
         for number in sorted(due.union(samples)):
             craft = crafts[number]
             if self._claims.get(craft.uav) is craft:
@@ -163,12 +197,12 @@ class Intake:
         mine = np.flatnonzero(owner >= 0)
         if len(mine):
             self.flock.counts.note(owner[mine], kinds(frames)[mine], frames.arrival[mine], frames.at[mine, SEQ])
-            lay(frames, owner, list(self.crafts.values()), self.flock)
-            time(frames, owner, [craft.timing for craft in self.crafts.values()])
+            lay(frames, owner, self._numbered, self.flock)
+            time(frames, owner, [craft.timing for craft in self._numbered])
 
     def _owners(self, frames: Frames) -> np.ndarray:
         """Tell whose each frame is: number of the aircraft, -1: nobody's, (n,)."""
-        crafts = list(self.crafts.values())
+        crafts = self._numbered
         number = {sender: k for k, sender in enumerate(frames.senders)}
         rightful = [self._claims.get(craft.uav, craft) is craft for craft in crafts]
         pairs = zip(crafts, rightful, strict=True)
@@ -219,22 +253,42 @@ class Intake:
         holder = self._claims.get(uav)
         if system == 0 or uav < 0:
             self.refused["id out of range"] += 1
-        elif holder is None and len(self._claims) >= self._most:
+        elif holder is None and len(self._claims) >= self._most and not self._make_room(arrival):
             self.refused[f"more than {self._most} aircraft; raise --most-uavs"] += 1
         elif holder is not None and arrival - holder.heard < LOST_S:
             self._rivals.add(system)
             self._alarm(holder, arrival, source)
         else:
             self._rivals.discard(system)
-            craft = Craft(self.flock, uav, system, message.get_srcComponent(), source)
+            craft = self._take_in(uav, system, message.get_srcComponent(), source)
             self.crafts[system] = self._claims[uav] = craft
+            self._met[system] = self.flock.counts.state[craft.number, HEARD] = arrival
             self._speakers[(system << 8) + craft.component] = craft.number
             self._born[system] = i
             craft.meet(message)
-            for early_arrival, early in self._early.pop(system, ()):
+            for early_arrival, early in self._pop_early(system):
                 if early.get_srcComponent() == craft.component:
                     craft.queue(early_arrival, craft.hear, early)
             craft.queue(arrival, craft.hear, message)
+
+    def _take_in(self, uav: int, system: int, component: int, source: Hashable) -> Craft:
+        """Make an aircraft, with the number its system id had before, if any."""
+        number = next((one.number for one in self._numbered if one.system == system), None)
+        craft = Craft(self.flock, uav, system, component, source, number=number)
+        if number is None:
+            self._numbered.append(craft)
+        else:
+            self._numbered[number] = craft
+            self.flock.look[number] = -np.inf
+        return craft
+
+    def _make_room(self, arrival: float) -> bool:
+        """Take the place of the aircraft silent for longest, on whatever link, if that is longer than `FORGET_S`."""
+        longest = min(self._claims.values(), key=lambda craft: craft.heard)
+        if arrival - longest.heard <= FORGET_S:
+            return False
+        del self._claims[longest.uav]  # its own intake forgets it
+        return True
 
     def _may_speak(self, craft: Craft, source: Hashable, arrival: float, count: int = 1) -> bool:
         """Tell whether this is the one sender of its id; another takes over once that one is silent."""
@@ -271,11 +325,18 @@ class Intake:
 
     def _keep_early(self, arrival: float, message: Any) -> None:
         """Keep what a system says before it says what it is, in case it turns out to be an aircraft."""
-        kept = self._early.setdefault(message.get_srcSystem(), [])
-        if len(kept) < MOST_EARLY and message.get_type() in EARLY:
-            kept.append((arrival, message))
+        system = message.get_srcSystem()
+        room = len(self._early.get(system, ())) < MOST_EARLY and self._early_n < MOST_EARLY_ALL
+        if room and message.get_type() in EARLY:
+            self._early.setdefault(system, []).append((arrival, message))
+            self._early_n += 1
         else:
             self.refused[NOT_YET] += 1
+
+    def _pop_early(self, system: int) -> list[tuple[float, Any]]:
+        kept = self._early.pop(system, [])
+        self._early_n -= len(kept)
+        return kept
 
 
 def unpacked(news: list[News | Wire]) -> list[News]:

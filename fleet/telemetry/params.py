@@ -1,6 +1,7 @@
 """Autopilot parameters, collected from PARAM_VALUE whoever asked for them."""
 
 import struct
+import sys
 from math import isfinite
 from typing import Any
 
@@ -54,7 +55,7 @@ class ParamBook:
             self._refused[name] = None
             self.values.pop(name, None)
         elif self.values.get(name) != value:
-            self.values[name] = value
+            self.values[sys.intern(name)] = value  # the aircraft of a fleet have the same names
             self._refused.pop(name, None)
             self._changed = True
 

@@ -4,6 +4,7 @@ Source: recvmmsg(2), udp(7), socket(7), cmsg(3); structures as in <sys/socket.h>
 """
 
 import ctypes
+import mmap
 import socket
 import sys
 import time
@@ -16,8 +17,9 @@ import numpy as np
 from fleet.telemetry.heard import Heard, tight
 from gateway.link import wall
 
-MOST = 1024  # datagrams taken at once
+MOST = 256  # datagrams taken at once; of the longest ones they are 16 MB
 LONGEST = 65_536  # no datagram is longer [bytes]
+_PAGE = 4096  # what a datagram of a usual size touches of its slot at most [bytes]
 _ADDRESS = 28  # bytes of an IPv6 socket address; IPv4 takes 16
 _STAMPS = 35  # SO_TIMESTAMPNS: the system says when a datagram came, however late it is fetched
 _STAMP = 4  # numbers of such a word: length, kind, seconds, nanoseconds
@@ -82,7 +84,7 @@ class _Message(ctypes.Structure):
 
 
 class Bulk:
-    """One call for up to `MOST` datagrams; memory nobody wrote to costs nothing."""
+    """One call for up to `MOST` datagrams; memory nobody wrote to costs nothing, that of long ones is given back."""
 
     def __init__(self, sock: socket.socket) -> None:
         if not sys.platform.startswith("linux"):
@@ -91,7 +93,8 @@ class Bulk:
         self._sock = sock
         self._call = ctypes.CDLL(None, use_errno=True).recvmmsg  # releases the interpreter while it works
         self._call.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
-        self._slots = np.zeros(MOST * LONGEST, np.uint8)
+        self._memory = mmap.mmap(-1, MOST * LONGEST, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        self._slots = np.frombuffer(self._memory, np.uint8)
         self._names = np.zeros((MOST, _ADDRESS), np.uint8)
         self._stamps = np.zeros((MOST, _STAMP), np.int64)
         self._newest = 0.0  # arrival [s since 1970]
@@ -121,6 +124,8 @@ class Bulk:
             return None
         lengths = self._lengths[:count].astype(np.int64)
         buf, stop = tight(self._slots, self._starts[:count], lengths)
+        if lengths.max() > _PAGE:
+            self._memory.madvise(mmap.MADV_DONTNEED)
         sender, first = numbered(self._names[:count], self._name_sizes[:count])
         names = [self._names[i, : self._name_sizes[i]].tobytes() for i in first.tolist()]
         return Heard(buf, stop - lengths, stop, self._arrivals(count), sender, tuple(map(self._address, names)))

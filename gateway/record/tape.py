@@ -129,7 +129,7 @@ class Tape(contextlib.AbstractContextManager):
         self._budget.grow(self._path, self._size)
 
     def _fail(self, error: OSError, now: float) -> None:
-        """Leave the file as it was before this write, and let it be for a while."""
+        """Leave the file as it was before this write, none where that is empty, and let it be for a while."""
         self.trouble = (
             f"recording of {self._slug} stopped ({error.strerror or error}), the gateway goes on; "
             f"make room in {self._budget.folder} (ours take {in_words(self._budget.used)})"
@@ -137,6 +137,8 @@ class Tape(contextlib.AbstractContextManager):
         if self._file is not None:
             with contextlib.suppress(OSError):
                 self._file.truncate(self._size)
+                if not self._size:
+                    self._path.unlink()
         self.close()
         self._again = now + AGAIN_S
 

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from fleet.cli import guarded, parser_for
 from fleet.commands.assess import EXAMPLES, arguments, check, chosen
+from fleet.logs import tell
 from twin_worker.assess.case import Case
 from twin_worker.assess.drive import Plan
 from twin_worker.assess.share import Found, assess
@@ -20,7 +21,7 @@ _WIDE = 150  # columns of the table where the output is no terminal
 
 
 def _say(line: str) -> None:
-    print(f"assess: {line}", file=sys.stderr, flush=True)
+    tell("assess", line)
 
 
 def _run(args: argparse.Namespace) -> int:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from fleet.cli import guarded, parser_for
 from fleet.commands.calibrate import EXAMPLES, arguments
+from fleet.logs import tell
 from twin_worker.diagnose.baseline import Baseline
 from twin_worker.diagnose.calibrate import calibrate
 from twin_worker.diagnose.card import UNKNOWN, Card, read
@@ -19,7 +20,7 @@ from twin_worker.diagnose.past import before, calibrate_past
 
 def say(word: str) -> None:
     """Report progress."""
-    print(f"diagnose: {word}", file=sys.stderr, flush=True)
+    tell("diagnose", word)
 
 
 def card_of(path: Path | None) -> Card:

@@ -1,9 +1,9 @@
 """Several workers of one range on one machine: they share it by their claims, as workers on several machines do."""
 
-import sys
 import threading
 
 from fleet.children import Children
+from fleet.logs import tell
 
 _LOOK_S = 0.5
 _AGAIN_S = 5.0  # before one that died is started again, so that what kills it at once does not run hot [s]
@@ -18,7 +18,7 @@ def run_many(options: list[list[str]], stop: threading.Event) -> int:
         while not stop.wait(_LOOK_S):
             failed = children.failed()
             for code, sentence in failed:
-                print(sentence, file=sys.stderr, flush=True)
+                tell("twin_worker", sentence)
                 if code == 2:
                     return 2
             if failed and not stop.wait(_AGAIN_S):

@@ -14,6 +14,9 @@ HEARD, SPOKE, RECEIVED, MISSED, MISSING, SEQ, COLUMNS = range(7)
 to the newest; its sequence number."""
 
 
+_NEW = np.array([[-np.inf, -np.inf, 0.0, 0.0, 0.0, NOBODY]])
+
+
 class Counts:
     """Counters of many aircraft.
 
@@ -31,10 +34,14 @@ class Counts:
 
     def add(self) -> None:
         """Make room for one more aircraft."""
-        new = np.array([[-np.inf, -np.inf, 0.0, 0.0, 0.0, NOBODY]])
-        self.state = np.concatenate([self.state, new])
+        self.state = np.concatenate([self.state, _NEW])
         self._kinds = np.concatenate([self._kinds, np.zeros((1, len(self._number)), np.int64)])
         self._hz = np.concatenate([self._hz, np.full((1, len(self._number)), np.nan)])
+
+    def reset(self, number: int) -> None:
+        """Begin anew for one aircraft."""
+        self.state[number] = _NEW
+        self._kinds[number], self._hz[number] = 0, np.nan
 
     def numbers(self, names: Sequence[str]) -> np.ndarray:
         """Number kinds by name, new ones too, (n,)."""

@@ -58,6 +58,13 @@ class Flock:
         self._memory = np.concatenate([self._memory, new_memory()[None]])
         return len(self.clocks) - 1
 
+    def reset(self, number: int) -> None:
+        """Begin anew for one aircraft, which has nothing to tell until it is heard."""
+        self.counts.reset(number)
+        self.clocks[number], self._memory[number] = clock.new_clocks(), new_memory()
+        self.shelves.refused[number] = 0
+        self.look[number] = np.inf
+
     def judge(self, laid: Laid) -> Judged:
         """Give rows their time, put them in order, leave out the late, the repeated and the second best."""
         n, many = len(laid.owner), len(self.clocks)
