@@ -17,7 +17,7 @@ from fleet.telemetry.onboard_log import OnboardLog
 from fleet.telemetry.onboard_news import UNDATED_S, craft_of, log_steps
 from fleet.telemetry.opening import COMPRESSED, Source
 from fleet.telemetry.scan import COUNTS, STAMP, START, STOP
-from fleet.telemetry.steps import Steps
+from fleet.telemetry.steps import STEP_S, Steps
 from fleet.telemetry.tlog import Tlog
 from fleet.telemetry.ulog import UlogLog
 
@@ -29,6 +29,7 @@ KINDS = {
     ".parauav": "fleet recording",
 }
 _HEAD = 1 << 16  # bytes looked at to tell the kind
+_MOST_AT_ONCE = 500_000  # frames taken in while recorded time stands still
 
 _log = logging.getLogger("parauav.recordings")
 
@@ -98,10 +99,21 @@ class Recording:
         self._opened = tlog = Tlog(self.source)
         intake = Intake(self.offset)
         steps = Steps(intake.take)
+        waiting = left_out = 0  # frames since time went on, and those of them that are too many
         for frames in tlog.batches():
-            intake.digest(frames)
+            waiting += len(frames.at)
+            if waiting > _MOST_AT_ONCE:
+                left_out += len(frames.at)
+            else:
+                intake.digest(frames)
             self.crafts.update((craft.uav, craft) for craft in intake.crafts.values())
-            yield from steps.upto(frames.arrival)
+            for step in steps.upto(frames.arrival):
+                waiting = 0
+                yield step
+        if left_out:
+            self._told.append(
+                f"{left_out} frames left out: over {_MOST_AT_ONCE:,} in {STEP_S} s, which no radio carries"
+            )
         yield from steps.last()
 
     def _onboard(self) -> Iterator[tuple[float, list[News]]]:

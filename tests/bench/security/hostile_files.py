@@ -127,12 +127,14 @@ def rows_unfolding() -> bytes:
 
 
 def _frames(n: int, step_us: int = 10_000, system: int = 1) -> bytes:
+    """Give frames of one aircraft: every tenth a heartbeat, the others attitude."""
     from pymavlink.dialects.v20 import ardupilotmega as mav
 
     talker = mav.MAVLink(io.BytesIO(), system, 1)
+    beat = mav.MAVLink_heartbeat_message(mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4, 3)
     out = []
     for k in range(n):
-        message = mav.MAVLink_attitude_message(k * 10, 0.1, 0.1, 0.1, 0.0, 0.0, 0.0)
+        message = mav.MAVLink_attitude_message(k * 10, 0.1, 0.1, 0.1, 0.0, 0.0, 0.0) if k % 10 else beat
         out.append(struct.pack(">Q", 1_600_000_000_000_000 + k * step_us) + message.pack(talker))
     return b"".join(out)
 
@@ -212,7 +214,7 @@ FILES: dict[str, tuple[str, Callable[[], bytes]]] = {
     "ULog and 8 GB": ("bomb.ulg.gz", lambda: _bomb(lambda: _rows(50))),
     "tlog of false starts": ("fd.tlog", fd_everywhere),
     "tlog and 8 GB": ("bomb.tlog.gz", lambda: _bomb(zeros_after_a_frame)),
-    "tlog, good for 8 GB": ("good.tlog.gz", lambda: _members(_frames(20), _frames(40_000), 5000)),
+    "tlog, good for 8 GB": ("good.tlog.gz", lambda: _members(_frames(20), _frames(10) * 20_000, 1000)),
     "tlog with gaps": ("lone.tlog", lone_frames),
     "tlog of all systems": ("many.tlog", many_senders),
     "DataFlash, formats over and over": ("over.bin", formats_over_and_over),
@@ -271,12 +273,7 @@ def rightful_files() -> str:
 
 def a_flight() -> bytes:
     """A minute of telemetry."""
-    from pymavlink.dialects.v20 import ardupilotmega as mav
-
-    talker = mav.MAVLink(io.BytesIO(), 1, 1)
-    beat = mav.MAVLink_heartbeat_message(mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4, 3)
-    stamps = (struct.pack(">Q", 1_600_000_000_000_000 + k * 1_000_000) for k in range(20))
-    return b"".join(stamp + beat.pack(talker) for stamp in stamps) + _frames(100, step_us=300_000)
+    return _frames(600, step_us=100_000)
 
 
 def main() -> int:
