@@ -391,3 +391,13 @@ def test_who_gets_ready_gives_way_to_those_that_hold_aircraft(monkeypatch: pytes
     thread.join()
     found()
     assert nice == [min(before + BEHIND, 19), before]
+
+
+def test_who_could_not_even_be_renewed_is_the_first_to_be_flown_ahead() -> None:
+    worker, now = Worker(MemoryBus(), range(4), omega=0.0), time.monotonic()
+    for uav in range(4):
+        worker._twins.adopt(uav, 1, None)
+        held = worker._held[uav]
+        held.ready, held.published = True, now - (60.0 if uav == 2 else 0.0)
+    found = [[held.twin.uav for held in worker._in_turn()] for _ in range(4)]
+    assert [order[0] for order in found] == [2] * 4 and sorted(order[1] for order in found) == [0, 1, 3, 3]

@@ -32,7 +32,7 @@ from twin_worker.engine.learner import Learner
 from twin_worker.engine.pace import Pace, Work
 from twin_worker.engine.quota import Quota
 from twin_worker.engine.rates import Rates
-from twin_worker.engine.stand_in import LOOK_S, said_already, stand_in, stand_in_for
+from twin_worker.engine.stand_in import LOOK_S, lacks_prediction, said_already, stand_in, stand_in_for
 from twin_worker.memory import AUTO
 from twin_worker.mismatch.live import Live
 from twin_worker.mismatch.told import word
@@ -195,14 +195,19 @@ class Worker:
         return taken
 
     def _in_turn(self) -> list[Held]:
-        """Give all, those without a prediction first, then each sweep another: heavy work may go to the first alone."""
+        """Give all, those without a prediction first, then those whose last is old, then each sweep another.
+
+        Heavy work may go to the first alone, and who could not be renewed has nothing but a flight ahead to wait for.
+        """
         found = self.holding()
         self._first = (self._first + 1) % max(len(found), 1)
         found = found[self._first :] + found[: self._first]
         new = [held for held in found if held.twin.prediction is None and time.monotonic() - held.since < _NEW_S]
         self._watch_time()
         self.quota.sweep(hurry=bool(new))
-        return [*new, *(held for held in found if held not in new)]
+        now = time.monotonic()
+        found.sort(key=lambda held: (held not in new, not lacks_prediction(held, now)))
+        return found
 
     def _watch_time(self) -> None:
         """Let heavy work wait where telemetry does: a sweep that was late leaves it a share of the CPU time."""

@@ -11,8 +11,9 @@ from twin_worker.engine.pace import SOON
 from twin_worker.renew import OVERDUE_S, renewed
 
 LOOK_S = 0.4  # between looks for aircraft without a prediction [s]
-OLD_S = 1.2  # since an aircraft's last prediction was published, from which on another is due: least [s]
+OLD_S = 1.0  # since an aircraft's last prediction was published, from which on another is due: least [s]
 _LATE = 1.2  # the same in the wanted periods of predictions [-]
+_LACKING = 2.0  # that in these from which on no renewal will come, either [-]
 _BACK_S = 1.0  # telemetry that lies so far before what was published: the clock was set back [s]
 _FARTHEST = 2e9  # positions beyond are noise [1e-7 deg, mm]
 
@@ -40,10 +41,19 @@ def stand_in(held: Held) -> Prediction | None:
 def stand_in_for(holding: list[Held], publish: Callable[[Message, Held], None]) -> None:
     """Renew the predictions of all whose twins were not reached in time: for want of CPU time, or locked."""
     for held in holding:
-        pace = held.twin.pace
-        late = time.monotonic() - held.published > max(OLD_S, _LATE * min(pace.predict, pace.renew))
+        late = time.monotonic() - held.published > _due_s(held)
         if late and (made := stand_in(held)) is not None:
             publish(made, held)
+
+
+def lacks_prediction(held: Held, now: float) -> bool:
+    """Tell whether an aircraft has been without a prediction, even a renewed one, up to `now`, monotonic [s]."""
+    return now - held.published > _LACKING * _due_s(held)
+
+
+def _due_s(held: Held) -> float:
+    pace = held.twin.pace
+    return max(OLD_S, _LATE * min(pace.predict, pace.renew))
 
 
 def said_already(result: Message, held: Held) -> bool:
