@@ -1,6 +1,6 @@
 """ParaUAV: a fleet of digital twins for UAV swarms (what every process shares)."""
 
-from fleet import interrupt as interrupt  # first: from here on it handles Ctrl-C
+from fleet.process import interrupt as interrupt  # first: from here on it handles Ctrl-C
 
 # isort: split
 
@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from fleet import private
+from fleet.process import private_files
 
 __version__ = "0.1.0"
 _UNUSED_S = 30 * 86_400  # a compile cache of other sources is removed after so long [s]
@@ -45,13 +45,13 @@ def _compile_cache() -> tuple[Path, str]:
         OSError: when it cannot be made.
     """
     if given := os.environ.get("NUMBA_CACHE_DIR"):
-        return private.folder(Path(given).absolute(), "NUMBA_CACHE_DIR"), ""
+        return private_files.folder(Path(given).absolute(), "NUMBA_CACHE_DIR"), ""
     if given := os.environ.get("PARAUAV_CACHE"):
-        return _within(private.folder(Path(given).absolute(), "PARAUAV_CACHE")), ""
+        return _within(private_files.folder(Path(given).absolute(), "PARAUAV_CACHE")), ""
     try:
-        usual = private.cache_folder()
-        private.folder(usual, "cache")
-        private.close(usual)
+        usual = private_files.cache_folder()
+        private_files.folder(usual, "cache")
+        private_files.close(usual)
         return _within(usual), ""
     except (ValueError, OSError, RuntimeError) as error:
         found = Path(tempfile.mkdtemp(prefix="parauav-cache-"))
@@ -66,8 +66,8 @@ def _within(base: Path) -> Path:
         for old in base.glob("numba-*"):
             if time.time() - old.lstat().st_mtime > _UNUSED_S:
                 shutil.rmtree(old, ignore_errors=True)
-    private.folder(found, "compile cache")
-    private.close(found)
+    private_files.folder(found, "compile cache")
+    private_files.close(found)
     os.utime(found)
     return found
 

@@ -11,8 +11,8 @@ import threading
 from collections.abc import Callable
 
 from fleet import __version__, commands
-from fleet.interrupt import INTERRUPTED, PARENT, interruptible
-from fleet.logs import begin, fail
+from fleet.process.interrupt import INTERRUPTED, PARENT, interruptible
+from fleet.process.logs import begin, fail
 
 GRACE_S = 30.0  # an orphan may take so long to end by its own door [s]
 

@@ -11,30 +11,30 @@ from pathlib import Path
 from rich.console import Console
 
 from fleet.access.roles import GATEWAY
-from fleet.bars import shown
-from fleet.bus import connect
+from fleet.bus.session import connect
 from fleet.cli import guarded, parser_for, stop_on_signal
 from fleet.config import entry, router_arguments
-from fleet.heap import give_back
-from fleet.logs import log_arguments, say
 from fleet.metrics import served
-from fleet.telemetry.ids import Ids
-from fleet.telemetry.intake import MOST_UAVS
-from fleet.telemetry.warm import warm_up
-from gateway.apart import divided, played_apart
-from gateway.board import posted
-from gateway.gate import gates_of
-from gateway.link import Link
+from fleet.process.logs import log_arguments, say
+from fleet.process.malloc_trim import give_back
+from fleet.report.progress import shown
+from fleet.telemetry.mavlink.intake import MOST_UAVS
+from fleet.telemetry.mavlink.warm import warm_up
+from fleet.telemetry.recording.ids import Ids
+from gateway.admission.admission import gates_of
+from gateway.links.isolated_replay import divided, played_apart
+from gateway.links.link import Link
 from gateway.links.opening import open_link
-from gateway.metrics import counters
+from gateway.links.recorded import Replay
 from gateway.onboard.cache import Cache
 from gateway.onboard.rates import BUDGET
-from gateway.pump import Pump
+from gateway.pipeline import Pump
 from gateway.record.recorder import Recorder
 from gateway.record.size import read_size
 from gateway.record.tape import Budget
-from gateway.recorded import Replay
-from gateway.spec import read_forward, read_spec
+from gateway.settings.link_spec import read_forward, read_spec
+from gateway.status.metrics import counters
+from gateway.status.status_table import posted
 
 SWITCH_S = 5e-4  # how long a receiving thread waits while messages are made [s]
 COLD_S = 2.0  # compiling that takes longer is said [s]

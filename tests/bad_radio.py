@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet.pretend.drive import EPOCH_US
+from fleet.simulator.flight.drive import EPOCH_US
 
 _STAMP = struct.Struct(">Q")
 _HEAD, _TAIL, _SIGNED, _SIGNATURE = 10, 2, 1, 13  # of a MAVLink 2 frame [bytes]

@@ -21,14 +21,14 @@ import hover
 import numpy as np
 import pytest
 
-from fleet.bus import open_router
+from fleet.bus.memory_bus import MemoryBus
+from fleet.bus.session import open_router
 from fleet.contract import Message
-from fleet.memory_bus import MemoryBus
-from twin_worker.contest import Contest
-from twin_worker.horizon import Record
-from twin_worker.offline import run
-from twin_worker.twin import Twin
-from twin_worker.worker import Held, Worker
+from twin_worker.confidence.tube_and_horizon import Record
+from twin_worker.evaluation.offline import run
+from twin_worker.prediction.method_selection import Contest
+from twin_worker.service.worker import Held, Worker
+from twin_worker.twin.step import Twin
 
 ROOT = Path(__file__).resolve().parent.parent
 LONG_FILES = pytest.StashKey[list[str]]()

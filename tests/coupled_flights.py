@@ -11,8 +11,8 @@ from fleet.physics.actuators import TAU
 from fleet.physics.dynamics import step
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
 from fleet.window import Window
-from twin_worker.airframe_prior import prior
-from twin_worker.coupled import Coupled
+from twin_worker.identification.fixed_wing.derivatives_model import Coupled
+from twin_worker.identification.fixed_wing.derivatives_prior import prior
 
 V, W0 = 20.0, 1.0  # trim, forward and down the body [m/s]
 AT = np.array([V, W0])

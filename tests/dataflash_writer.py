@@ -10,8 +10,8 @@ import numpy as np
 from pymavlink import DFReader
 
 from fleet.contract import COLUMNS
-from fleet.telemetry.dataflash import DataflashLog
-from fleet.telemetry.onboard_log import Said, Table
+from fleet.telemetry.mavlink.onboard_log import Said, Table
+from fleet.telemetry.onboard_logs.dataflash.reader import DataflashLog
 
 LETTERS = DFReader.FORMAT_TO_STRUCT
 

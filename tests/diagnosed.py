@@ -3,9 +3,9 @@
 import numpy as np
 
 from fleet.effects import Onset, catalogue
-from twin_worker.diagnose.baseline import CHANNELS
-from twin_worker.diagnose.guess import Guess, When
-from twin_worker.diagnose.report import Finding, Outcome, Report, Series, Tried
+from twin_worker.diagnosis.data.fault_hypothesis import Guess, When
+from twin_worker.diagnosis.inference.report import Finding, Outcome, Report, Series, Tried
+from twin_worker.diagnosis.model.baseline import CHANNELS
 
 ONSET = 83.0
 LENGTH = 200.0

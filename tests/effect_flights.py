@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet.effects import Body, Effect, Flow, Parameter, Stage
-from twin_worker.diagnose.baseline import Baseline, Timing
-from twin_worker.diagnose.card import Card
-from twin_worker.diagnose.flight import Flight
-from twin_worker.diagnose.guess import Guess
-from twin_worker.diagnose.residual import RHO_0
-from twin_worker.diagnose.simulate import STATE, Runs, Simulation
-from twin_worker.diagnose.smooth import DT
+from twin_worker.diagnosis.data.card import Card
+from twin_worker.diagnosis.data.fault_hypothesis import Guess
+from twin_worker.diagnosis.data.flight import Flight
+from twin_worker.diagnosis.data.smooth import DT
+from twin_worker.diagnosis.model.baseline import Baseline, Timing
+from twin_worker.diagnosis.model.residual import RHO_0
+from twin_worker.diagnosis.model.simulate import STATE, Runs, Simulation
 
 LONG_S = 80.0
 CARD = Card(

@@ -3,7 +3,7 @@
 import numpy as np
 from msgspec import Raw
 
-from fleet.codec import encode
+from fleet.bus.codec import encode
 from fleet.contract import (
     COLUMNS,
     Account,

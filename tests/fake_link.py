@@ -5,10 +5,10 @@ from collections import defaultdict
 
 from talker import Ears
 
-from fleet import logs
+from fleet.process import logs
 from gateway.__main__ import COLD
-from gateway.link import Batch
-from gateway.spec import read_spec
+from gateway.links.link import Batch
+from gateway.settings.link_spec import read_spec
 
 PATIENCE_S = 60.0  # an upper bound; every wait ends with its condition
 

@@ -7,18 +7,18 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from fleet.codec import decode, encode
+from fleet.bus.codec import decode, encode
 from fleet.contract import COLUMNS, Array, Item, Message, Prediction, Rows, Sample, Status
 from fleet.frames import Origin, to_geodetic, wrap
-from fleet.pretend.drive import to_tlog
-from fleet.pretend.uav import PretendUav
-from fleet.telemetry.recordings import replay_messages
+from fleet.simulator.flight.drive import to_tlog
+from fleet.simulator.flight.uav import PretendUav
+from fleet.telemetry.recording.recordings import replay_messages
 from fleet.window import Window
-from twin_worker.history import History
-from twin_worker.identify import AXES, Axis
-from twin_worker.offline import run
-from twin_worker.prior import INPUTS, STATES, prior
-from twin_worker.twin import Twin, advance
+from twin_worker.evaluation.offline import run
+from twin_worker.identification.linear.linear_model import AXES, Axis
+from twin_worker.identification.linear.linear_prior import INPUTS, STATES, prior
+from twin_worker.telemetry.history import History
+from twin_worker.twin.step import Twin, advance
 
 T0 = 1_700_000_000.0
 DT = 0.04

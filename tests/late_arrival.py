@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleet.codec import Wire
+from fleet.bus.codec import Wire
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, AlertKind, Message, Prediction, Sample, Status
-from fleet.memory_bus import MemoryBus
-from fleet.pretend.uav import PretendUav
-from fleet.telemetry.intake import Intake, unpacked
-from twin_worker.worker import Worker
+from fleet.simulator.flight.uav import PretendUav
+from fleet.telemetry.mavlink.intake import Intake, unpacked
+from twin_worker.service.worker import Worker
 
 T0 = 1_700_000_000.0  # arrival of the first datagram [s since 1970]
 TICK_S = 0.1  # between two publications of a gateway [s]

@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator, Sequence
 
-from twin_worker.diagnose.calibrate import calibrate
-from twin_worker.diagnose.card import Card
-from twin_worker.diagnose.diagnose import diagnose
-from twin_worker.diagnose.flight import Flight
-from twin_worker.diagnose.report import Report
+from twin_worker.diagnosis.baseline.calibrate import calibrate
+from twin_worker.diagnosis.data.card import Card
+from twin_worker.diagnosis.data.flight import Flight
+from twin_worker.diagnosis.inference.diagnose import diagnose
+from twin_worker.diagnosis.inference.report import Report
 
 
 def left_out(flights: Sequence[Flight], card: Card) -> Iterator[Report]:

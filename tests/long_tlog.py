@@ -11,9 +11,9 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Talker
 
-from fleet.telemetry import scan as s
-from fleet.telemetry.decode import IDS, frames_of, layout
-from fleet.telemetry.recast import seal
+from fleet.telemetry.mavlink.parsing import scan as s
+from fleet.telemetry.mavlink.parsing.decode import IDS, frames_of, layout
+from fleet.telemetry.replay.rewrite_frames import seal
 
 BLOCK_S = 60.0  # flown anew in bytes, then repeated with other times
 TICKS = {"ATTITUDE": ("time_boot_ms", 1), "GLOBAL_POSITION_INT": ("time_boot_ms", 1)}

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from twin_worker.calibration.miss import AHEAD, path_length
-from twin_worker.calibration.scored import Scored, revisions
-from twin_worker.calibration.table import Doubt
+from twin_worker.confidence.calibration.scored_predictions import Scored, revisions
+from twin_worker.confidence.calibration_table import Doubt
+from twin_worker.numerics.prediction_errors import AHEAD, path_length
 
 V = 20.0  # over ground [m/s]
 LINE = np.column_stack([V * AHEAD, 0 * AHEAD, 0 * AHEAD - 100.0])

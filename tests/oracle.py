@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.telemetry.decode import Dealt, Decoder, Frames
-from fleet.telemetry.heard import Heard
-from fleet.telemetry.scan import START, STOP
+from fleet.telemetry.mavlink.parsing.decode import Dealt, Decoder, Frames
+from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.mavlink.parsing.scan import START, STOP
 
 V1, V2 = mav.PROTOCOL_MARKER_V1, mav.PROTOCOL_MARKER_V2
 KINDS = tuple(mav.mavlink_map[number] for number in sorted(mav.mavlink_map))

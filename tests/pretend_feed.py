@@ -13,9 +13,11 @@ import numpy as np
 
 from fleet.access.entry import ROUTER
 from fleet.access.knock import reachable
-from fleet.bus import connect, open_router
+from fleet.bus.bus_protocol import Bus
+from fleet.bus.codec import Stamp
+from fleet.bus.memory_bus import MemoryBus
+from fleet.bus.session import connect, open_router
 from fleet.cli import stop_on_signal
-from fleet.codec import Stamp
 from fleet.contract import (
     Alert,
     AlertKind,
@@ -40,9 +42,7 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin, to_geodetic
-from fleet.memory_bus import MemoryBus
-from fleet.talk import Bus
-from viewer.feed import Feed
+from viewer.store.store import Feed
 
 HOME = Origin(473977420, 85455940, 488_000)
 AHEAD = np.arange(0.0, 40.5, 0.5)

@@ -6,9 +6,9 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.contract import COLUMNS, Item, Mission, Params, Sample
-from fleet.pretend.mavlink import Voice
-from fleet.telemetry.decode import Decoder
-from fleet.telemetry.heard import Heard
+from fleet.simulator.flight.mavlink import Voice
+from fleet.telemetry.mavlink.parsing.decode import Decoder
+from fleet.telemetry.mavlink.parsing.received import Heard
 
 T0 = 1_700_000_000.0  # fleet time at which the tests begin [s since 1970]
 PLANE, ARDU = mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA

@@ -11,33 +11,40 @@ from test_inspect import judged, known, lively, slower
 from ulog_writer import flight as flight_of
 from ulog_writer import ulog
 
-from fleet.commands import inspect
+from fleet.commands.offline import inspect
 from fleet.contract import Mission, Prediction, Status
-from fleet.plain import below
-from fleet.telemetry import abilities as needs
-from fleet.telemetry.survey import ROTORS, ROTORS_HIGH, airborne, survey
-from twin_worker import imm, kinds, learn, memory, preprocess, verify
-from twin_worker.diagnose import flight, own_past, past, smooth
-from twin_worker.diagnose.card import UNKNOWN
-from twin_worker.events import watch
-from twin_worker.history import History
-from twin_worker.offline import run
+from fleet.process.sanitise import below
+from fleet.telemetry.inspection import abilities as needs
+from fleet.telemetry.inspection.survey import ROTORS, ROTORS_HIGH, airborne, survey
+from twin_worker.diagnosis.baseline import own_past, past
+from twin_worker.diagnosis.data import flight, smooth
+from twin_worker.diagnosis.data.card import UNKNOWN
+from twin_worker.evaluation.offline import run
+from twin_worker.prediction import turn_rate
+from twin_worker.telemetry import resample
+from twin_worker.telemetry.history import History
+from twin_worker.twin.state import flight_phase, state, vehicle_class
+from twin_worker.twin.steps import identify_step
+from twin_worker.validation import verify
 
 
 def test_the_figures_are_those_the_twin_works_by():
-    assert preprocess.LONGEST_GAP == needs.LONGEST_S
-    assert (learn.LEAST_S, learn.NO_WINGS) == (needs.LEAST_S, needs.NO_WINGS)
-    least, papers, most = learn._HELD_S  # held out beside what is identified
-    assert max(learn._STRETCH_S[1] + most, learn._PAPER_S + papers) == needs.WINDOW_S and least < papers < most
-    assert memory.ROUTE_MODES == needs.ROUTE_MODES
+    assert resample.LONGEST_GAP == needs.LONGEST_S
+    assert (identify_step.LEAST_S, identify_step.NO_WINGS) == (needs.LEAST_S, needs.NO_WINGS)
+    least, papers, most = identify_step._HELD_S  # held out beside what is identified
+    assert (
+        max(identify_step._STRETCH_S[1] + most, identify_step._PAPER_S + papers) == needs.WINDOW_S
+        and least < papers < most
+    )
+    assert state.ROUTE_MODES == needs.ROUTE_MODES
     assert min(verify.HORIZONS_S) == needs.UNBROKEN_S
     assert verify._QUIET == needs.QUIET
-    assert max(4 * imm.STEP, 50 * preprocess.DT) == needs.RECENT_S
-    assert (kinds.NO_WINGS, kinds.WINGS) == (needs.NO_WINGS, needs.WINGS)
+    assert max(4 * turn_rate.STEP, 50 * resample.DT) == needs.RECENT_S
+    assert (vehicle_class.NO_WINGS, vehicle_class.WINGS) == (needs.NO_WINGS, needs.WINGS)
     assert (flight._LEAST_S, flight.VANE_HZ) == (needs.DIAGNOSE_S, needs.VANE_HZ)
     assert (needs._BEGIN_S, needs._END_S) == flight._SETTLE_S
     assert past.LEAST_S + own_past.LEAST_AFTER_S == needs.OWN_PAST_S
-    assert (watch.ROTORS, watch._LOW_M) == (ROTORS, ROTORS_HIGH)
+    assert (flight_phase.ROTORS, flight_phase._LOW_M) == (ROTORS, ROTORS_HIGH)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from fleet.access.knock import answers
 from fleet.access.papers import ending, papers_of, password_of
 from fleet.access.roles import ROLES, ROUTER_ROLE
 from fleet.access.rules import PASSWORD, access_control
-from fleet.bus import connect, open_router
+from fleet.bus.session import connect, open_router
 from fleet.config import entry, passed_on, router_arguments
 from gateway import __main__ as gateway
 from tests.bench.security.site import SCRIPT, expired, make_papers, make_passwords

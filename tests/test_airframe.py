@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fleet.airframe import servo_map
+from fleet.airframes.airframe import servo_map
 
 PLANE = {"SERVO1_FUNCTION": 4, "SERVO2_FUNCTION": 19, "SERVO3_FUNCTION": 70, "SERVO4_FUNCTION": 21}
 ELEVONS = {"SERVO1_FUNCTION": 77, "SERVO2_FUNCTION": 78, "SERVO3_FUNCTION": 70}

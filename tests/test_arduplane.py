@@ -12,7 +12,7 @@ from fleet import mission as m
 from fleet.autopilots import arduplane as ap
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.arduplane import state as S
+from fleet.autopilots.common import controller_state as S
 from fleet.frames import G
 
 

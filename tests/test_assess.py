@@ -12,20 +12,20 @@ import pytest
 from flights import T0, item, messages, turn
 
 from fleet.cli import main as fleet
-from fleet.commands.assess import METHODS
+from fleet.commands.offline.assess import METHODS
 from fleet.contract import Message, Mission, Params, Prediction, Status
-from fleet.pretend.drive import to_tlog
-from fleet.pretend.uav import PretendUav
-from fleet.telemetry.recordings import replay_messages
-from twin_worker.assess.__main__ import main
-from twin_worker.assess.case import OURS
-from twin_worker.assess.drive import Drive, Plan
-from twin_worker.assess.keep import KEYS, covariance
-from twin_worker.assess.log import Log
-from twin_worker.assess.methods import BASELINES
-from twin_worker.assess.share import assess
-from twin_worker.assess.table import notes
-from twin_worker.assess.truth import FIRST_S, WHOLE_S
+from fleet.simulator.flight.drive import to_tlog
+from fleet.simulator.flight.uav import PretendUav
+from fleet.telemetry.recording.recordings import replay_messages
+from twin_worker.evaluation.__main__ import main
+from twin_worker.evaluation.baselines.methods import BASELINES
+from twin_worker.evaluation.drive import Drive, Plan
+from twin_worker.evaluation.keep import KEYS, covariance
+from twin_worker.evaluation.scoring.case import OURS
+from twin_worker.evaluation.scoring.log import Log
+from twin_worker.evaluation.scoring.truth import FIRST_S, WHOLE_S
+from twin_worker.evaluation.share import assess
+from twin_worker.evaluation.table import notes
 
 KEYS_OF_A_METHOD = {
     "m1_t10_lq_s",
@@ -128,7 +128,7 @@ def test_nothing_later_is_known_at_a_start(one, driven):
 
 
 def test_ours_is_what_a_twin_publishes(one, cases):
-    from twin_worker.offline import run
+    from twin_worker.evaluation.offline import run
 
     by_t = {p.t: p.path.numpy() for p in run(one[: len(one) // 3], {}) if isinstance(p, Prediction)}
     for case in cases[:3]:

@@ -6,11 +6,11 @@ from flights import HERE, T0, item, messages, turn
 
 from fleet.contract import Message, Mission, Params, Status
 from fleet.mission import route
-from twin_worker.assess.methods import BASELINES, Now
-from twin_worker.assess.route_line import Ride, line
-from twin_worker.kinds import seen
-from twin_worker.memory import Twin, hear
-from twin_worker.twin import advance
+from twin_worker.evaluation.baselines.methods import BASELINES, Now
+from twin_worker.evaluation.baselines.route_line import Ride, line
+from twin_worker.twin.state.state import Twin, hear
+from twin_worker.twin.state.vehicle_class import seen
+from twin_worker.twin.step import advance
 
 AHEAD = np.arange(0.0, 61.0)
 VA = 20.0

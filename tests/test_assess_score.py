@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from flights import HERE
 
-from twin_worker.assess.case import OURS, Asked, Case, Told
-from twin_worker.assess.compare import BEATEN, MATCHED, ONE_FLIGHT, WORSE, compare
-from twin_worker.assess.score import LIMITS, quantile, score, surviving
-from twin_worker.assess.summary import figures, summary
+from twin_worker.evaluation.scoring.case import OURS, Asked, Case, Told
+from twin_worker.evaluation.scoring.compare import BEATEN, MATCHED, ONE_FLIGHT, WORSE, compare
+from twin_worker.evaluation.scoring.score import LIMITS, quantile, score, surviving
+from twin_worker.evaluation.scoring.summary import figures, summary
 
 V = 20.0
 AHEAD = np.concatenate([np.arange(0.0, 61.0), np.arange(64.0, 93.0, 4.0)])  # steps that widen

@@ -9,9 +9,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Talker, of
 
 from fleet.contract import MAX_ITEMS, Mission, Params, Sample, Status
-from fleet.telemetry.decode import MOST_SENDERS
-from fleet.telemetry.flock.pack import MOST_ROWS
-from fleet.telemetry.intake import Intake
+from fleet.telemetry.mavlink.arrays.pack import MOST_ROWS
+from fleet.telemetry.mavlink.intake import Intake
+from fleet.telemetry.mavlink.parsing.decode import MOST_SENDERS
 
 DO_JUMP, LAND = 177, 21
 NAN = math.nan

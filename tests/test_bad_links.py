@@ -8,7 +8,7 @@ import pytest
 from bad_radio import RADIOS, Radio, frames, worsen
 
 from fleet.contract import Event, Message
-from fleet.telemetry.recordings import replay_messages
+from fleet.telemetry.recording.recordings import replay_messages
 from tests.bench.bad_links import Tally, behind, fly, positions
 
 

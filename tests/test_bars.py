@@ -7,10 +7,10 @@ import threading
 import pytest
 from rich.console import Console
 
-from fleet import bars
-from fleet.bars import shown
-from fleet.telemetry import pace
-from fleet.telemetry.pace import Pace, read_speed
+from fleet.report import progress
+from fleet.report.progress import shown
+from fleet.telemetry.recording import pace
+from fleet.telemetry.recording.pace import Pace, read_speed
 
 
 class Half:
@@ -27,7 +27,7 @@ class Half:
 
 
 def test_a_terminal_sees_share_time_and_speed(monkeypatch):
-    monkeypatch.setattr(bars, "REFRESH_S", 0.01)
+    monkeypatch.setattr(progress, "REFRESH_S", 0.01)
     out, half = io.StringIO(), Half()
     with shown([half], pytest.fail, Console(file=out, force_terminal=True, width=120)):
         assert half.asked.wait(30)
@@ -36,7 +36,7 @@ def test_a_terminal_sees_share_time_and_speed(monkeypatch):
 
 
 def test_elsewhere_a_line_is_said_now_and_then(monkeypatch):
-    monkeypatch.setattr(bars, "PLAIN_S", 0.01)
+    monkeypatch.setattr(progress, "PLAIN_S", 0.01)
     said, came = [], threading.Event()
 
     def say(line):

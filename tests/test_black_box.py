@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 from test_subspace import closed_loop, miss
 
-from twin_worker.black_box import fit_inputs, normal_equations, refine_black_box, squared_errors
-from twin_worker.linear import StateSpace
-from twin_worker.order import choose
-from twin_worker.projection import projection
-from twin_worker.subspace import pbsid
+from twin_worker.identification.linear.black_box_prediction_error import (
+    fit_inputs,
+    normal_equations,
+    refine_black_box,
+    squared_errors,
+)
+from twin_worker.identification.linear.order_selection import choose
+from twin_worker.identification.linear.state_space import StateSpace
+from twin_worker.identification.linear.subspace import pbsid
+from twin_worker.identification.linear.subspace_open_loop import projection
 
 POLES = {2: (0.92 + 0.15j,), 3: (0.92 + 0.15j, 0.8), 4: (0.92 + 0.15j, 0.75 + 0.4j), 5: (0.92 + 0.15j, 0.5j, 0.85)}
 POLES[6] = (*POLES[4], 0.3 + 0.7j)

@@ -14,18 +14,18 @@ from rich.console import Console
 from talker import T0, Talker
 from test_gateway import PATIENCE_S, Ear
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Account, Status
-from fleet.memory_bus import MemoryBus
 from fleet.metrics import served
-from gateway import board
-from gateway.account import overruns
-from gateway.board import drawn, in_line, posted
 from gateway.links.udp import Udp
-from gateway.metrics import counters
-from gateway.pump import Pump
+from gateway.pipeline import Pump
 from gateway.record.recorder import Recorder
 from gateway.record.tape import Budget
-from gateway.spec import read_spec
+from gateway.settings.link_spec import read_spec
+from gateway.status import status_table
+from gateway.status.link_statistics import overruns
+from gateway.status.metrics import counters
+from gateway.status.status_table import drawn, in_line, posted
 
 ACCOUNT, STATUS = EXAMPLES[Account], EXAMPLES[Status]
 
@@ -49,8 +49,8 @@ def test_of_many_aircraft_those_in_trouble_are_shown():
 
 
 def test_plain_lines_come_at_news_and_now_and_then(monkeypatch):
-    monkeypatch.setattr(board, "REFRESH_S", 0.001)
-    monkeypatch.setattr(board, "PLAIN_S", 0.05)
+    monkeypatch.setattr(status_table, "REFRESH_S", 0.001)
+    monkeypatch.setattr(status_table, "PLAIN_S", 0.05)
     said, enough = [], threading.Event()
 
     def say(line):

@@ -20,7 +20,7 @@ from conftest import ROOT, unused_port
 from fake_link import untimed
 from pretend_feed import HOSTILE, PretendFleet
 
-from fleet.bus import connect, open_router
+from fleet.bus.session import connect, open_router
 from fleet.contract import Array, Rows, Sample
 
 pytestmark = pytest.mark.browser

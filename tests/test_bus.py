@@ -17,11 +17,11 @@ from examples import EXAMPLES
 
 from fleet.access.entry import endpoint
 from fleet.access.knock import reachable
-from fleet.bus import connect, open_router
-from fleet.codec import Stamp, encode, encoding
+from fleet.bus.bus_protocol import Bus, key, newest, uav_in
+from fleet.bus.codec import Stamp, encode, encoding
+from fleet.bus.memory_bus import MemoryBus
+from fleet.bus.session import connect, open_router
 from fleet.contract import Account, Alert, AlertKind, FleetState, Handover, Prediction, Sample, Status
-from fleet.memory_bus import MemoryBus
-from fleet.talk import Bus, key, newest, uav_in
 from tests.bench.referee.forwarder import Forwarder
 
 PATIENCE_S = 10.0

@@ -9,17 +9,23 @@ import pytest
 from made_up import GROUP, V
 from scipy.stats import norm
 
-from twin_worker.calibration.__main__ import main
-from twin_worker.calibration.check import claimed, figures, left_out
-from twin_worker.calibration.conform import factors_of
-from twin_worker.calibration.fit import fit, fit_sigma
-from twin_worker.calibration.groups import airframe_class, group_of, wider
-from twin_worker.calibration.miss import AHEAD, axes_error, first_passage, path_length, track_frame
-from twin_worker.calibration.quantile import censored_quantile, masses, median_passage, survival, weighted_quantile
-from twin_worker.calibration.revision import Earlier
-from twin_worker.calibration.scored import Scored, joined
-from twin_worker.calibration.table import INDEPENDENT, KNOTS, Doubt, doubt_of, law_of_growth, untaught
-from twin_worker.calibration.written import Source, Tables, load, read_tables, write
+from twin_worker.confidence.calibration.__main__ import main
+from twin_worker.confidence.calibration.conformal import factors_of
+from twin_worker.confidence.calibration.evaluate_table import claimed, figures, left_out
+from twin_worker.confidence.calibration.fit_table import fit, fit_sigma
+from twin_worker.confidence.calibration.scored_predictions import Scored, joined
+from twin_worker.confidence.calibration_table import INDEPENDENT, KNOTS, Doubt, doubt_of, law_of_growth, untaught
+from twin_worker.confidence.groups import airframe_class, group_of, wider
+from twin_worker.confidence.lagged_ensemble import Earlier
+from twin_worker.confidence.table_files import Source, Tables, load, read_tables, write
+from twin_worker.confidence.weighted_quantile import (
+    censored_quantile,
+    masses,
+    median_passage,
+    survival,
+    weighted_quantile,
+)
+from twin_worker.numerics.prediction_errors import AHEAD, axes_error, first_passage, path_length, track_frame
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.contract import Message, Model, Prediction, Sample
-from twin_worker.claims.carry import CARRIED, Load, packed, unpacked
-from twin_worker.claims.revive import go_on, revive
-from twin_worker.claims.tree import pack, unpack
-from twin_worker.memory import Twin, hear
-from twin_worker.twin import advance
+from twin_worker.ownership.cold_start import go_on, revive
+from twin_worker.ownership.handover import CARRIED, Load, packed, unpacked
+from twin_worker.ownership.typed_serialization import pack, unpack
+from twin_worker.twin.state.state import Twin, hear
+from twin_worker.twin.step import advance
 
 
 def later(heard: tuple[Message, ...], by: float = 20.0) -> list[Message]:

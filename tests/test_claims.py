@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from fleet.codec import Stamp
-from fleet.fence import GIVE_UP_S, Fence
+from fleet.bus.codec import Stamp
+from fleet.bus.epoch_fence import GIVE_UP_S, Fence
 from tests.bench.security import forged
-from twin_worker.claims.decide import PAUSE_S, SETTLE_S, SILENT_S, Claims, Plan, Rank
-from twin_worker.claims.owner import owner, owners
+from twin_worker.ownership.protocol_state import PAUSE_S, SETTLE_S, SILENT_S, Claims, Plan, Rank
+from twin_worker.ownership.rendezvous import owner, owners
 
 IDS = range(100)
 WALL = 1_700_000_000_000

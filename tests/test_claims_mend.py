@@ -11,14 +11,14 @@ import msgspec
 import pytest
 
 import fleet
-from fleet.codec import encode
+from fleet.bus.codec import encode
+from fleet.bus.memory_bus import MemoryBus
+from fleet.bus.presence import Present
 from fleet.contract import Claim, Handover, History, Message, Sample, Status, Wanted
-from fleet.memory_bus import MemoryBus
-from fleet.presence import Present
-from twin_worker.claims.keeper import INBOX
-from twin_worker.claims.past import recall
-from twin_worker.claims.protocol import Claiming
-from twin_worker.worker import Worker
+from twin_worker.ownership.history_query import recall
+from twin_worker.ownership.protocol import Claiming
+from twin_worker.ownership.twin_store import INBOX
+from twin_worker.service.worker import Worker
 
 OTHER = Present("00000000000000aa", range(5), 1)
 
@@ -26,7 +26,7 @@ OTHER = Present("00000000000000aa", range(5), 1)
 @pytest.fixture
 def worker(monkeypatch: pytest.MonkeyPatch) -> Worker:
     """One that holds UAV 1 and looks at every turn."""
-    monkeypatch.setattr("twin_worker.claims.protocol._MEND_S", 0.0)
+    monkeypatch.setattr("twin_worker.ownership.protocol._MEND_S", 0.0)
     made = Worker(MemoryBus(), range(5), omega=0.0)
     made.listen()
     made.bus.publish(Status(uav=1, t=f.T0))
@@ -76,7 +76,7 @@ def test_who_hands_over_many_is_waited_for_as_long_as_copies_come(
     worker: Worker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now, coming = [100.0], []
-    monkeypatch.setattr("twin_worker.claims.protocol.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("twin_worker.ownership.protocol.time.monotonic", lambda: now[0])
     monkeypatch.setattr(worker.bus, "gather", lambda *_: iter(coming))
     claiming = worker.claiming
     claiming.tick()

@@ -1,7 +1,7 @@
 """A fleet of workers that join, leave, die, freeze and are cut off, in every order: who holds what, and who is read.
 
 The world is made up: a router that knows tokens and passes messages on in order, as late as it likes; clocks that are
-wrong by minutes; readers. Every worker is `Claims`, driven as `twin_worker/claims/protocol.py` drives it.
+wrong by minutes; readers. Every worker is `Claims`, driven as `twin_worker/ownership/protocol.py` drives it.
 """
 
 from collections import deque
@@ -12,10 +12,10 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from fleet.codec import Stamp
-from fleet.fence import GIVE_UP_S, Fence
-from twin_worker.claims.decide import PAUSE_S, SETTLE_S, SILENT_S, Claims, Rank
-from twin_worker.claims.owner import owners
+from fleet.bus.codec import Stamp
+from fleet.bus.epoch_fence import GIVE_UP_S, Fence
+from twin_worker.ownership.protocol_state import PAUSE_S, SETTLE_S, SILENT_S, Claims, Rank
+from twin_worker.ownership.rendezvous import owners
 
 UAVS = range(5)
 RANGES = (range(5), range(3), range(2, 5))

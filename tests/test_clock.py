@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from talker import T0
 
-from fleet.telemetry import clock as c
-from fleet.telemetry.clock import BOOT, NONE, USEC, USEC32, WRAP_BOOT_S, WRAP_USEC_S
+from fleet.telemetry.tables import clock as c
+from fleet.telemetry.tables.clock import BOOT, NONE, USEC, USEC32, WRAP_BOOT_S, WRAP_USEC_S
 
 
 class Clock:

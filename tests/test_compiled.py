@@ -6,14 +6,14 @@ import pytest
 from fleet.autopilots import laws
 from fleet.contract import Mission
 from fleet.frames import Origin, _radii, to_ned
-from twin_worker.calibration import adapt
-from twin_worker.calibration.ledger import ROWS, Ledger
-from twin_worker.calibration.miss import AHEAD, track_frame
-from twin_worker.compiled.answer import run_on
-from twin_worker.compiled.straight import straight
-from twin_worker.events.watch import moves
-from twin_worker.rotor import item_in_force, items_in_force
-from twin_worker.speed import _middle
+from twin_worker.confidence import adaptive_conformal
+from twin_worker.confidence.prediction_log import ROWS, Ledger
+from twin_worker.confidence.prediction_log_kernel import run_on
+from twin_worker.estimation.airspeed_setpoint import _middle
+from twin_worker.numerics.interpolation import straight
+from twin_worker.numerics.prediction_errors import AHEAD, track_frame
+from twin_worker.prediction.multirotor.rollout import item_in_force, items_in_force
+from twin_worker.twin.state.flight_phase import moves
 
 
 @pytest.mark.parametrize("beyond", [None, np.nan])
@@ -81,21 +81,35 @@ def book(rng: np.random.Generator) -> Ledger:
 @pytest.mark.parametrize("seed", range(5))
 def test_levels_learn_what_numpy_would_have_learnt(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    found, tube, horizon = adapt.Levels(), np.full(len(adapt.KNOTS), adapt.QUANTILE), adapt.QUANTILE
+    found, tube, horizon = (
+        adaptive_conformal.Levels(),
+        np.full(len(adaptive_conformal.KNOTS), adaptive_conformal.QUANTILE),
+        adaptive_conformal.QUANTILE,
+    )
     ends = np.zeros(2)
     for _ in range(30):
         made, n = book(rng), int(rng.integers(0, 60))
         r, j = rng.integers(ROWS, size=n), rng.integers(len(AHEAD), size=n)
         mine, claimed = made.group == "a", made.claimed.copy()
-        knot, score = adapt._COLUMN_OF[j], made.score[r, j]
+        knot, score = adaptive_conformal._COLUMN_OF[j], made.score[r, j]
         new = mine[r] & (knot >= 0) & np.isfinite(score)
-        step = adapt._TUBE_STEP * adapt._SHARE[knot[new]] * ((score[new] > 1.0) - (1.0 - adapt.QUANTILE))
+        step = (
+            adaptive_conformal._TUBE_STEP
+            * adaptive_conformal._SHARE[knot[new]]
+            * ((score[new] > 1.0) - (1.0 - adaptive_conformal.QUANTILE))
+        )
         np.add.at(tube, knot[new], step)
-        np.clip(tube, adapt._LEAST_LEVEL, adapt._MOST_LEVEL, out=tube)
+        np.clip(tube, adaptive_conformal._LEAST_LEVEL, adaptive_conformal._MOST_LEVEL, out=tube)
         held = mine & claimed & (made.followed >= made.horizon)
         failed = mine & claimed & made.passed & ~held
-        moved = failed.sum() * adapt.QUANTILE - held.sum() * (1.0 - adapt.QUANTILE)
-        horizon = float(np.clip(horizon + adapt._HORIZON_STEP * moved, adapt.QUANTILE, adapt._MOST_LEVEL))
+        moved = failed.sum() * adaptive_conformal.QUANTILE - held.sum() * (1.0 - adaptive_conformal.QUANTILE)
+        horizon = float(
+            np.clip(
+                horizon + adaptive_conformal._HORIZON_STEP * moved,
+                adaptive_conformal.QUANTILE,
+                adaptive_conformal._MOST_LEVEL,
+            )
+        )
         found.learn(made, r, j, mine)
         assert np.array_equal(found.tube, tube) and found.horizon == horizon
         assert np.array_equal(made.claimed, claimed & ~(held | failed))

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from fleet.contract import Mission, Params, Sample
-from fleet.pretend.conceal import acts as acting
-from fleet.pretend.conceal import exam as examination
-from fleet.pretend.conceal import plan as planning
-from fleet.pretend.conceal import record as recording
-from fleet.pretend.conceal.effects import BOTH, HIDDEN, UNKNOWN
-from fleet.pretend.conceal.exam import exam, jobs_of
-from fleet.pretend.conceal.plan import Job, Planned, draw
-from fleet.pretend.conceal.record import fly, why_not_sane
-from fleet.pretend.conceal.roles import counts, go_together
-from fleet.telemetry.recordings import replay_messages
+from fleet.simulator.conceal import acts as acting
+from fleet.simulator.conceal import exam as examination
+from fleet.simulator.conceal import plan as planning
+from fleet.simulator.conceal import record as recording
+from fleet.simulator.conceal.effects import BOTH, HIDDEN, UNKNOWN
+from fleet.simulator.conceal.exam import exam, jobs_of
+from fleet.simulator.conceal.plan import Job, Planned, draw
+from fleet.simulator.conceal.record import fly, why_not_sane
+from fleet.simulator.conceal.roles import counts, go_together
+from fleet.telemetry.recording.recordings import replay_messages
 
 KINDS = HIDDEN | UNKNOWN
 SHORT_S = 7.0

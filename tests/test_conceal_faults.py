@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from fleet.cli import main
-from fleet.pretend.altered import altered
-from fleet.pretend.conceal.effects import SERVO_LAG_S, told
-from fleet.pretend.conceal.paths import FIELD
-from fleet.pretend.conceal.plan import quiet
-from fleet.pretend.faults.fault import Fault
-from fleet.pretend.faults.kinds import KINDS, read
-from fleet.pretend.faults.physics import World
-from fleet.pretend.faults.sensing import SPOILS
-from fleet.pretend.faults.servos import MOVES
-from fleet.pretend.jsbsim import DT, KG_TO_LB, Aircraft
-from fleet.pretend.sensors import Estimate, pressure_at, pressure_height
-from fleet.pretend.types import TYPES
+from fleet.simulator.conceal.effects import SERVO_LAG_S, told
+from fleet.simulator.conceal.paths import FIELD
+from fleet.simulator.conceal.plan import quiet
+from fleet.simulator.faults.fault import Fault
+from fleet.simulator.faults.kinds import KINDS, read
+from fleet.simulator.faults.physics import World
+from fleet.simulator.faults.sensing import SPOILS
+from fleet.simulator.faults.servos import MOVES
+from fleet.simulator.vehicle.altered import altered
+from fleet.simulator.vehicle.jsbsim import DT, KG_TO_LB, Aircraft
+from fleet.simulator.vehicle.sensors import Estimate, pressure_at, pressure_height
+from fleet.simulator.vehicle.types import TYPES
 
 ALOFT = np.array([0.0, 0.0, -150.0])
 INCH, FT = 0.0254, 0.3048
@@ -232,7 +232,7 @@ def test_winds_blow_from_where_they_say(text: str, height: float, wind: tuple[fl
 
 def test_a_label_tells_the_whole_servo() -> None:
     assert told("actuator_lag", "small", {"tau_s": 0.2}) == {"tau_s": 0.2 + SERVO_LAG_S["small"]}
-    small = Path("fleet/pretend/aircraft/aerosonde/aerosonde.xml").read_text()
+    small = Path("fleet/simulator/aircraft/aerosonde/aerosonde.xml").read_text()
     assert f"<lag>{1 / SERVO_LAG_S['small']:.0f}</lag>" in small
     assert told("actuator_lag", "c172p", {"tau_s": 0.2}) == {"tau_s": 0.2}
 

@@ -13,13 +13,13 @@ from scipy.stats import norm
 from fleet.contract import Alert, AlertKind, Array, Mission, Params, Prediction, Status
 from fleet.frames import Origin
 from fleet.mission import route
-from twin_worker.conflict.achievable import Ability, Now, ability, achievable
-from twin_worker.conflict.fence import Fence, fence, leaves
-from twin_worker.conflict.forecast import axis_z, forecast
-from twin_worker.conflict.ground import sinks
-from twin_worker.conflict.ledger import RULES, Finding, Ledger
-from twin_worker.conflict.watch import home, watch
-from twin_worker.twin import Twin, advance
+from twin_worker.alerts.feasibility import Ability, Now, ability, achievable
+from twin_worker.alerts.gaussian_forecast import axis_z, forecast
+from twin_worker.alerts.geofence import Fence, fence, leaves
+from twin_worker.alerts.ground_clearance import sinks
+from twin_worker.alerts.hysteresis import RULES, Finding, Ledger
+from twin_worker.twin.step import Twin, advance
+from twin_worker.twin.steps.alerts import home, watch
 
 NAN, INF = float("nan"), float("inf")
 KINDS = tuple(RULES)

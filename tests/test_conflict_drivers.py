@@ -10,16 +10,16 @@ import pytest
 from predicted import T, straight
 from rich.console import Console
 
-from fleet.codec import Stamp
-from fleet.commands.status import fleet_rows, table
+from fleet.bus.codec import Stamp
+from fleet.bus.memory_bus import MemoryBus
+from fleet.commands.live.status import fleet_rows, table
 from fleet.contract import Alert, AlertKind, FleetRow, FleetState, Message, Prediction, State
 from fleet.frames import to_geodetic
-from fleet.memory_bus import MemoryBus
-from twin_worker import offline
-from twin_worker import worker as live
 from twin_worker.__main__ import main
-from twin_worker.conflict.separation import Separation
-from twin_worker.worker import Worker
+from twin_worker.alerts.conflict_probability import Separation
+from twin_worker.evaluation import offline
+from twin_worker.service import worker as live
+from twin_worker.service.worker import Worker
 
 
 def levelled(uav: int, east: float, heading: float, seconds: float = 30.0) -> list[Message]:

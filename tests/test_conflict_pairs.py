@@ -12,10 +12,10 @@ from scipy.stats import norm
 
 from fleet.contract import Alert, AlertKind, Array, Prediction
 from fleet.frames import Origin, to_geodetic, to_ned
-from twin_worker.calibration.conform import factors_of
-from twin_worker.conflict.forecast import axis_z, forecast
-from twin_worker.conflict.separation import Separation
-from twin_worker.conflict.traffic import Traffic
+from twin_worker.alerts.conflict_probability import Separation
+from twin_worker.alerts.gaussian_forecast import axis_z, forecast
+from twin_worker.alerts.traffic import Traffic
+from twin_worker.confidence.calibration.conformal import factors_of
 
 Z = axis_z(0.9)
 

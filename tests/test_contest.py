@@ -6,8 +6,8 @@ import pytest
 from flights import T0
 
 from fleet.mission import N_COLUMNS, SEQ, VA_C
-from twin_worker.contest import AT, Contest
-from twin_worker.speed import aimed_at, as_told
+from twin_worker.estimation.airspeed_setpoint import aimed_at, as_told
+from twin_worker.prediction.method_selection import AT, Contest
 
 
 def follow(contest: Contest, off: dict[str, float], n: int, t0: float = 0.0) -> None:

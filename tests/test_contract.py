@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet import contract
-from fleet.codec import Stamp, decode, encode, encoding, pack_stamp, unpack_stamp
-from fleet.commands.schema import meaning, parts_of
+from fleet.bus.codec import Stamp, decode, encode, encoding, pack_stamp, unpack_stamp
+from fleet.commands.offline.schema import meaning, parts_of
 from fleet.contract import COLUMNS, DTYPES, TOPICS, Array, Params, Prediction, Sample
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -17,19 +17,19 @@ from examples import EXAMPLES
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Talker, of
 
-from fleet.codec import decode, encode
+from fleet.bus.codec import decode, encode
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import COLUMNS, Account, Array, Item, Mission, Params, Rows, Sample, Status
 from fleet.frames import Origin, to_geodetic, to_ned
-from fleet.memory_bus import MemoryBus
-from fleet.telemetry.airing import Airing, address
-from fleet.telemetry.aside import SPACING_M, Aside
-from fleet.telemetry.copies import GROUPS, Copies, Group, Prepared
-from fleet.telemetry.ids import Ids
-from fleet.telemetry.intake import Intake
-from fleet.telemetry.steps import STEP_S
-from gateway.pump import Pump
-from gateway.recorded import Replay
-from gateway.spec import read_spec
+from fleet.telemetry.mavlink.intake import Intake
+from fleet.telemetry.mavlink.steps import STEP_S
+from fleet.telemetry.recording.ids import Ids
+from fleet.telemetry.replay.broadcaster import Airing, address
+from fleet.telemetry.replay.offset import SPACING_M, Aside
+from fleet.telemetry.replay.offset_copies import GROUPS, Copies, Group, Prepared
+from gateway.links.recorded import Replay
+from gateway.pipeline import Pump
+from gateway.settings.link_spec import read_spec
 
 HOME = Origin(470_000_000, 80_000_000, 500_000)
 PATIENCE_S = 60.0

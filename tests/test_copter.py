@@ -8,7 +8,7 @@ from flights import HERE, item
 
 from fleet.autopilots import copter
 from fleet.autopilots.copter import corner_speed, limits
-from twin_worker.plan import home_again, lay, numbered_from_one, paced, stop_from
+from twin_worker.prediction.multirotor.route import home_again, lay, numbered_from_one, paced, stop_from
 
 PARAMS = {"WPNAV_SPEED": 800.0, "WPNAV_ACCEL": 250.0, "WPNAV_SPEED_UP": 250.0, "WPNAV_SPEED_DN": 150.0}
 LIMIT, _ = limits(PARAMS)

@@ -9,10 +9,10 @@ from flights import DT
 
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
 from fleet.window import Window
-from twin_worker import coupled
-from twin_worker.coupled import Coupled, identify
-from twin_worker.unseen import Unseen
-from twin_worker.verify import fits_at, mean
+from twin_worker.identification.fixed_wing import derivatives_model
+from twin_worker.identification.fixed_wing.derivatives_model import Coupled, identify
+from twin_worker.validation.held_out import Unseen
+from twin_worker.validation.verify import fits_at, mean
 
 KNOWN_S = 40.0
 SPLIT = round(KNOWN_S / DT)
@@ -58,7 +58,7 @@ def test_a_warm_step_from_near_goes_on_where_the_search_was():
     near = identify(window.part(0, SPLIT), ASKED, SMALL)
     moved = window.part(25, SPLIT + 25)
     warm, cold = identify(moved, ASKED, SMALL, near=near), identify(moved, ASKED, SMALL)
-    assert warm.steps <= coupled.WARM < cold.steps
+    assert warm.steps <= derivatives_model.WARM < cold.steps
     for name in ("at", "mean", "precision"):  # it is where the search begins and holds nothing
         assert np.array_equal(getattr(warm, name), getattr(cold, name))
     assert fit(warm, window, split=SPLIT + 25) > fit(cold, window, split=SPLIT + 25) - 2.0
@@ -143,7 +143,7 @@ def test_a_search_that_cannot_begin_begins_anew(value):
     lost[NAMES.index("M_q")] = value
     anew = identify(window.part(0, SPLIT), ASKED, SMALL)
     near = identify(window.part(0, SPLIT), ASKED, SMALL, near=replace(truth, par=lost))
-    assert near.steps > coupled.WARM and fit(near, window) > fit(anew, window) - 3.0
+    assert near.steps > derivatives_model.WARM and fit(near, window) > fit(anew, window) - 3.0
     last = identify(
         window.part(0, SPLIT), ASKED, SMALL, last=replace(truth, par=lost, information=1e6 * truth.precision)
     )

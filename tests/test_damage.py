@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet.codec import encode, encoding
+from fleet.bus.codec import encode, encoding
 from fleet.contract import COLUMNS, Sample
-from fleet.telemetry.fleet_log import Record
-from fleet.telemetry.opening import Source
-from fleet.telemetry.recordings import Recording
+from fleet.telemetry.recording.fleet_log import Record
+from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.recordings import Recording
 
 FILES = {
     "tlog": "sitl/s02_nominal_light_wind.tlog.xz",

@@ -11,9 +11,9 @@ from dataflash_writer import Writer, log_of, rate, read, values
 from pymavlink import DFReader
 
 from fleet.contract import COLUMNS
-from fleet.telemetry.dataflash import DataflashLog, utc
-from fleet.telemetry.dataflash_clock import counted_times
-from fleet.telemetry.dataflash_rows import rates_between
+from fleet.telemetry.onboard_logs.dataflash.clock import counted_times
+from fleet.telemetry.onboard_logs.dataflash.reader import DataflashLog, utc
+from fleet.telemetry.onboard_logs.dataflash.rows import rates_between
 
 SITL = {"s01_nominal_calm": 2, "s02_nominal_light_wind": 3, "s05_engine_75": 6, "s09_quadplane_nominal": 9}
 DEG = np.pi / 180

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from dataflash_writer import Writer, log_of, read
 
-from fleet.telemetry.dataflash import DataflashLog
-from fleet.telemetry.dataflash_records import MOST_KINDS, MOST_PLACES, Damage
+from fleet.telemetry.onboard_logs.dataflash.reader import DataflashLog
+from fleet.telemetry.onboard_logs.dataflash.records import MOST_KINDS, MOST_PLACES, Damage
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import numpy as np
 from dataflash_writer import read
 
 from fleet.contract import COLUMNS, Sample
-from fleet.telemetry.dataflash import DataflashLog
-from fleet.telemetry.recordings import replay_messages
+from fleet.telemetry.onboard_logs.dataflash.reader import DataflashLog
+from fleet.telemetry.recording.recordings import replay_messages
 
 NAME = "s01_nominal_calm"
 STEPS = ("leg", "servo")  # not to be interpolated

@@ -7,7 +7,7 @@ import pytest
 from dataflash_writer import Writer, read
 
 from fleet.contract import COLUMNS
-from fleet.telemetry.dialects.dataflash import COLUMNS_OF, PARTS, TABLE, field_of
+from fleet.telemetry.tables.dataflash import COLUMNS_OF, PARTS, TABLE, field_of
 
 DEG = np.pi / 180
 

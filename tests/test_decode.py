@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from pymavlink.dialects.v20 import common
 
-from fleet.telemetry.decode import IDS, Decoder, layout
-from fleet.telemetry.heard import Heard
-from fleet.telemetry.opening import Source
-from fleet.telemetry.scan import STOP
-from fleet.telemetry.tlog import Tlog
+from fleet.telemetry.mavlink.parsing.decode import IDS, Decoder, layout
+from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.mavlink.parsing.scan import STOP
+from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.tlog import Tlog
 from tests.bench.gateway import fuzz
 
 QUICK = 4_000  # frames; `python -m tests.bench.gateway.equal` takes a hundred thousand and more

@@ -23,14 +23,14 @@ from examples import EXAMPLES
 from test_readme import MAINS, commands, understood
 
 from fleet.access.roles import ROLES, ROUTER_ROLE
-from fleet.bus import connect
-from fleet.codec import decode, encode
+from fleet.bus.codec import decode, encode
+from fleet.bus.memory_bus import MemoryBus
+from fleet.bus.session import connect
 from fleet.contract import Account, FleetState, Prediction, Status
-from fleet.memory_bus import MemoryBus
-from gateway import metrics as gateway
+from gateway.status import metrics as gateway
 from tests.bench.security.site import REAL, Site, make_papers, routed, zenohd
 from tests.bench.security.trying import until
-from twin_worker import metrics as twin_worker
+from twin_worker.service import metrics as twin_worker
 
 DEPLOY = ROOT / "deploy"
 README = (DEPLOY / "README.md").read_text()
@@ -220,8 +220,8 @@ def test_the_image_is_made_of_what_is_there() -> None:
         assert all((ROOT / name).exists() for name in names.split())
     (code,) = re.findall(r'^RUN python -c "(.*)" \\$', text, re.M)
     assert [node.module for node in ast.parse(code).body if isinstance(node, ast.ImportFrom)] == [
-        "fleet.telemetry.warm",
-        "twin_worker.warm",
+        "fleet.telemetry.mavlink.warm",
+        "twin_worker.service.warm_up",
     ]
 
 

@@ -8,16 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet.commands import diagnose as verb
-from twin_worker.diagnose import __main__ as diagnosis
-from twin_worker.diagnose import keep, learn
-from twin_worker.diagnose.baseline import Baseline
-from twin_worker.diagnose.calibrate import calibrate
-from twin_worker.diagnose.card import UNKNOWN, Card, read
-from twin_worker.diagnose.diagnose import diagnose
-from twin_worker.diagnose.flight import Flight, lay, read_flights
-from twin_worker.diagnose.report import Outcome
-from twin_worker.history import History
+from fleet.commands.offline import diagnose as verb
+from twin_worker.diagnosis import __main__ as diagnosis
+from twin_worker.diagnosis import learn
+from twin_worker.diagnosis.baseline.calibrate import calibrate
+from twin_worker.diagnosis.data.card import UNKNOWN, Card, read
+from twin_worker.diagnosis.data.flight import Flight, lay, read_flights
+from twin_worker.diagnosis.inference.diagnose import diagnose
+from twin_worker.diagnosis.inference.report import Outcome
+from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.diagnosis.output import keep
+from twin_worker.telemetry.history import History
 
 T0 = 1.7e9
 

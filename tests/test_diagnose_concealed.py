@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from left_out import left_out
 
-from twin_worker.diagnose import __main__ as diagnose
-from twin_worker.diagnose import keep, learn
-from twin_worker.diagnose.card import read
-from twin_worker.diagnose.diagnose import diagnose as diagnose_one
-from twin_worker.diagnose.flight import read_flights
-from twin_worker.diagnose.report import Outcome
+from twin_worker.diagnosis import __main__ as diagnose
+from twin_worker.diagnosis import learn
+from twin_worker.diagnosis.data.card import read
+from twin_worker.diagnosis.data.flight import read_flights
+from twin_worker.diagnosis.inference.diagnose import diagnose as diagnose_one
+from twin_worker.diagnosis.inference.report import Outcome
+from twin_worker.diagnosis.output import keep
 
 pytestmark = pytest.mark.recordings
 

@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 from left_out import left_out
 
-from twin_worker.diagnose.baseline import Baseline
-from twin_worker.diagnose.calibrate import calibrate
-from twin_worker.diagnose.card import read
-from twin_worker.diagnose.flight import Flight, read_flights
-from twin_worker.diagnose.report import Outcome, Report
-from twin_worker.diagnose.share import shared
+from twin_worker.diagnosis.baseline.calibrate import calibrate
+from twin_worker.diagnosis.data.card import read
+from twin_worker.diagnosis.data.flight import Flight, read_flights
+from twin_worker.diagnosis.inference.report import Outcome, Report
+from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.diagnosis.share import shared
 
 pytestmark = pytest.mark.recordings
 CARD = read(Path("skywalker"))

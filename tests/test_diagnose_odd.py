@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from twin_worker.diagnose.baseline import CHANNELS, Baseline, no_noise
-from twin_worker.diagnose.card import UNKNOWN
-from twin_worker.diagnose.changed import Equation
-from twin_worker.diagnose.odd import RULES, Odd, strange
-from twin_worker.diagnose.tones import tones
+from twin_worker.diagnosis.data.card import UNKNOWN
+from twin_worker.diagnosis.inference.isolation.changed import Equation
+from twin_worker.diagnosis.inference.isolation.tones import tones
+from twin_worker.diagnosis.inference.isolation.unmodelled import RULES, Odd, strange
+from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline, no_noise
 
 STEP_S, ONSET_S = 0.2, 90.0
 T = np.arange(1000) * STEP_S

@@ -11,12 +11,12 @@ from diagnosed import LENGTH, NAN, made
 from PIL import Image
 
 from fleet.effects import catalogue
-from twin_worker.diagnose.baseline import CHANNELS
-from twin_worker.diagnose.figures import KINDS, draw, stems
-from twin_worker.diagnose.marks import MEANING, marks, runs, times
-from twin_worker.diagnose.page import amount, unit, write
-from twin_worker.diagnose.report import Outcome, Series
-from twin_worker.diagnose.traces import chosen
+from twin_worker.diagnosis.inference.report import Outcome, Series
+from twin_worker.diagnosis.model.baseline import CHANNELS
+from twin_worker.diagnosis.output.figures import KINDS, draw, stems
+from twin_worker.diagnosis.output.marks import MEANING, marks, runs, times
+from twin_worker.diagnosis.output.page import amount, unit, write
+from twin_worker.diagnosis.output.traces import chosen
 
 
 class Reader(HTMLParser):

@@ -5,14 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin_worker.diagnose import __main__ as diagnosis
-from twin_worker.diagnose import keep, learn
-from twin_worker.diagnose.card import read
-from twin_worker.diagnose.flight import Flight, read_flights
-from twin_worker.diagnose.own_past import OwnPast
-from twin_worker.diagnose.past import before, calibrate_past, since, split
-from twin_worker.diagnose.report import Outcome, Report
-from twin_worker.diagnose.share import shared
+from twin_worker.diagnosis import __main__ as diagnosis
+from twin_worker.diagnosis import learn
+from twin_worker.diagnosis.baseline.own_past import OwnPast
+from twin_worker.diagnosis.baseline.past import before, calibrate_past, since, split
+from twin_worker.diagnosis.data.card import read
+from twin_worker.diagnosis.data.flight import Flight, read_flights
+from twin_worker.diagnosis.inference.report import Outcome, Report
+from twin_worker.diagnosis.output import keep
+from twin_worker.diagnosis.share import shared
 
 pytestmark = pytest.mark.recordings
 CARD = read(Path("skywalker"))

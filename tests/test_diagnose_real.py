@@ -8,19 +8,19 @@ import pytest
 import real_flights
 
 from fleet.contract import Sample
-from fleet.telemetry.recordings import replay_messages
-from twin_worker.diagnose import __main__ as diagnosis
-from twin_worker.diagnose import hidden
-from twin_worker.diagnose.baseline import CHANNELS, Baseline
-from twin_worker.diagnose.card import UNKNOWN
-from twin_worker.diagnose.flight import Flight, read_flights
-from twin_worker.diagnose.held import ENERGY, lost
-from twin_worker.diagnose.own_past import OwnPast
-from twin_worker.diagnose.past import before, calibrate_past, since
-from twin_worker.diagnose.report import Outcome, Report
-from twin_worker.diagnose.residual import Case
-from twin_worker.diagnose.weather import fit_wind
-from twin_worker.history import History
+from fleet.telemetry.recording.recordings import replay_messages
+from twin_worker.diagnosis import __main__ as diagnosis
+from twin_worker.diagnosis.baseline import hidden
+from twin_worker.diagnosis.baseline.own_past import OwnPast
+from twin_worker.diagnosis.baseline.past import before, calibrate_past, since
+from twin_worker.diagnosis.baseline.tracking_loss import ENERGY, lost
+from twin_worker.diagnosis.data.card import UNKNOWN
+from twin_worker.diagnosis.data.flight import Flight, read_flights
+from twin_worker.diagnosis.inference.report import Outcome, Report
+from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
+from twin_worker.diagnosis.model.residual import Case
+from twin_worker.diagnosis.model.weather import fit_wind
+from twin_worker.telemetry.history import History
 
 pytestmark = pytest.mark.recordings
 ALFA = "alfa_20180718_155331_1_engine_failure"

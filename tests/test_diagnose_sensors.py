@@ -7,12 +7,12 @@ import pytest
 from effect_flights import CRAFT, Plan, flown
 
 from fleet.effects import Onset, catalogue
-from twin_worker.diagnose.baseline import CHANNELS
-from twin_worker.diagnose.flight import Flight
-from twin_worker.diagnose.guess import Guess, When
-from twin_worker.diagnose.residual import Case
-from twin_worker.diagnose.scan import scan
-from twin_worker.diagnose.sight import Sight
+from twin_worker.diagnosis.data.fault_hypothesis import Guess, When
+from twin_worker.diagnosis.data.flight import Flight
+from twin_worker.diagnosis.inference.isolation.isolate import scan
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.model.baseline import CHANNELS
+from twin_worker.diagnosis.model.residual import Case
 
 JUMP_S = 40.4
 KNOWN = catalogue()

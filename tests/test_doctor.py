@@ -17,12 +17,12 @@ from rich.console import Console
 from fleet import SOURCES, cli
 from fleet.access.entry import Entry
 from fleet.access.knock import _cure
-from fleet.bus import open_router
-from fleet.commands.status import machines, processes, spans
+from fleet.bus.memory_bus import MemoryBus
+from fleet.bus.session import open_router
+from fleet.commands.live.status import machines, processes, spans
 from fleet.contract import Account, Claim, FleetRow, FleetState, LinkAccount, State, Status
-from fleet.examine import claims, door, machine
-from fleet.examine.finding import BAD, NOTE, OK
-from fleet.memory_bus import MemoryBus
+from fleet.health import claims, door, machine
+from fleet.health.finding import BAD, NOTE, OK
 from tests.bench.security.bombs import ESCAPES
 from tests.bench.security.site import expired, make_papers, make_passwords
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fleet.window import STATES
-from twin_worker.earned import KNOTS_S, Earned
+from twin_worker.validation.forecast_shrinkage import KNOTS_S, Earned
 
 DT, N, RUNS = 0.25, 161, 60  # 40 s
 MEAN = np.linspace(-2.0, 2.0, 9)

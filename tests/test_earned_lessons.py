@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from twin_worker.earned import KNOTS_S, Earned
+from twin_worker.validation.forecast_shrinkage import KNOTS_S, Earned
 
 DT = 0.1
 N = 401  # rows of a run: 40 s and the start

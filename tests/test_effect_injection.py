@@ -9,11 +9,11 @@ import pytest
 from effect_flights import CARD, Plan, flown
 
 from fleet.effects import Effect, Onset, catalogue
-from twin_worker.diagnose.baseline import Baseline
-from twin_worker.diagnose.calibrate import calibrate
-from twin_worker.diagnose.guess import Guess, When
-from twin_worker.diagnose.report import Finding, Outcome, Report
-from twin_worker.diagnose.share import shared
+from twin_worker.diagnosis.baseline.calibrate import calibrate
+from twin_worker.diagnosis.data.fault_hypothesis import Guess, When
+from twin_worker.diagnosis.inference.report import Finding, Outcome, Report
+from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.diagnosis.share import shared
 
 ALL = catalogue("")
 SINCE_S = 35.0

@@ -18,11 +18,12 @@ from conftest import ROOT, unused_port
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import Talker
 
-from fleet import cli, logs
-from fleet.bus import connect
-from fleet.commands.status import fleet_rows
+from fleet import cli
+from fleet.bus.bus_protocol import Bus
+from fleet.bus.session import connect
+from fleet.commands.live.status import fleet_rows
 from fleet.contract import Account, FleetState, Mission, Model, Outcome, Params, Prediction, Sample, State, Status
-from fleet.talk import Bus
+from fleet.process import logs
 
 PATIENCE_S = 300.0  # an upper bound on a cold machine; every wait ends with its condition
 ROW = {"uav", "state", "verdict", "fit", "horizon_s", "worker", "sample_age_s", "prediction_age_s"}

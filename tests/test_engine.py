@@ -12,22 +12,22 @@ import msgspec
 import numpy as np
 import pytest
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Array, Prediction, Sample
 from fleet.frames import Origin, to_geodetic
-from fleet.memory_bus import MemoryBus
-from twin_worker import twin as loop
 from twin_worker.__main__ import BEHIND, _get_ready
-from twin_worker.engine import quota as clocked
-from twin_worker.engine.beside import LEAST, Beside
-from twin_worker.engine.pace import Pace, Work, read_pace
-from twin_worker.engine.quota import EARNED, LEAST_S, SWEEP_S, Quota
-from twin_worker.engine.rates import OVER_S, Rates
-from twin_worker.engine.stand_in import said_already, stand_in_for
-from twin_worker.horizon import AHEAD
-from twin_worker.predict import LEAST_AHEAD_S
-from twin_worker.renew import LATEST_S, OVERDUE_S, renew, widened
-from twin_worker.twin import Twin, advance
-from twin_worker.worker import Held, Worker, _advance_all
+from twin_worker.confidence.tube_and_horizon import AHEAD
+from twin_worker.prediction.closed_loop import LEAST_AHEAD_S
+from twin_worker.service.busy_fallback import said_already, stand_in_for
+from twin_worker.service.cpu_share import LEAST, Beside
+from twin_worker.service.work_rates import OVER_S, Rates
+from twin_worker.service.worker import Held, Worker, _advance_all
+from twin_worker.twin import step as loop
+from twin_worker.twin.state import budget as clocked
+from twin_worker.twin.state.budget import EARNED, LEAST_S, SWEEP_S, Quota
+from twin_worker.twin.state.schedule import Pace, Work, read_pace
+from twin_worker.twin.step import Twin, advance
+from twin_worker.twin.steps.extrapolate import LATEST_S, OVERDUE_S, renew, widened
 
 
 def test_a_pace_is_read_and_refused_in_a_sentence() -> None:
@@ -128,7 +128,7 @@ def test_work_beside_the_sweep_rests_until_the_others_had_their_cpu_time(monkeyp
     now = dict.fromkeys(("wall", "mine", "all"), 0.0)
     names = {"monotonic": "wall", "thread_time": "mine", "process_time": "all"}
     for name, clock in names.items():
-        monkeypatch.setattr(f"twin_worker.engine.beside.time.{name}", lambda clock=clock: now[clock])
+        monkeypatch.setattr(f"twin_worker.service.cpu_share.time.{name}", lambda clock=clock: now[clock])
     beside, granted = Beside(), 0.0
 
     class Stop:
@@ -385,7 +385,7 @@ def test_who_gets_ready_gives_way_to_those_that_hold_aircraft(monkeypatch: pytes
     def found() -> None:
         nice.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
 
-    monkeypatch.setattr("twin_worker.warm.warm_up", found)
+    monkeypatch.setattr("twin_worker.service.warm_up.warm_up", found)
     thread = threading.Thread(target=_get_ready)
     thread.start()
     thread.join()

@@ -9,8 +9,8 @@ from flights import HERE, T0, drive, item, predictions, status
 
 from fleet.contract import SENTENCES, Event, Mission, Prediction, Sample, Status
 from fleet.frames import to_geodetic
-from twin_worker.offline import run
-from twin_worker.twin import Twin, advance
+from twin_worker.evaluation.offline import run
+from twin_worker.twin.step import Twin, advance
 
 
 def told(results) -> list[Event]:

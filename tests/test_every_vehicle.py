@@ -11,12 +11,12 @@ from flights import T0, drive, predictions, published
 from fleet.autopilots import greybox
 from fleet.contract import Event, Message, Model, Outcome, Sample, State, Status
 from fleet.frames import to_ned
-from fleet.telemetry.recordings import replay_messages
-from twin_worker.greybox import air_of
-from twin_worker.lift import lift_channels, lifted
-from twin_worker.offline import run
-from twin_worker.track import track
-from twin_worker.twin import Twin
+from fleet.telemetry.recording.recordings import replay_messages
+from twin_worker.evaluation.offline import run
+from twin_worker.prediction.kinematic import air_of
+from twin_worker.telemetry.hover_detection import lift_channels, lifted
+from twin_worker.telemetry.track import track
+from twin_worker.twin.step import Twin
 
 # --- positions alone -------------------------------------------------------------------------------------------------
 

@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from talker import T0, Talker
 
-from fleet.codec import decode, encode
+from fleet.bus.codec import decode, encode
 from fleet.contract import COLUMNS, Array, Rows, Sample
-from fleet.telemetry.flock.counts import MISSED, RECEIVED, SPOKE, Counts
-from fleet.telemetry.flock.pack import FIELDS, MOST_ROWS, WHOLE, WIDTHS
-from fleet.telemetry.flock.rows import Shelves
-from fleet.telemetry.intake import Intake
+from fleet.telemetry.mavlink.arrays.counts import MISSED, RECEIVED, SPOKE, Counts
+from fleet.telemetry.mavlink.arrays.pack import FIELDS, MOST_ROWS, WHOLE, WIDTHS
+from fleet.telemetry.mavlink.arrays.rows import Shelves
+from fleet.telemetry.mavlink.intake import Intake
 
 
 def made(uav: int, laid: dict[int, tuple[np.ndarray, np.ndarray]]) -> Sample:

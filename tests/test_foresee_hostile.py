@@ -9,8 +9,8 @@ import pytest
 from odd_missions import INF, NAN, ODD
 
 from fleet.contract import Mission, Prediction
-from twin_worker.foresee import foresee
-from twin_worker.memory import Twin
+from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps.predict_step import foresee
 
 FAST_S = 0.05  # the best of three predictions takes no longer [s]
 MOST_WORDS = 1500  # letters of a sentence

@@ -9,14 +9,14 @@ from oracle import framed, ours
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import ITEMS, Aircraft, Ears, Talker
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, Mission, Params
-from fleet.memory_bus import MemoryBus
-from fleet.telemetry.decode import IDS
-from fleet.telemetry.heard import Heard
-from gateway.forward import ASTRAY, DATAGRAM, DOUBLE
-from gateway.link import Batch
-from gateway.pump import Pump
-from gateway.targets import targets
+from fleet.telemetry.mavlink.parsing.decode import IDS
+from fleet.telemetry.mavlink.parsing.received import Heard
+from gateway.forwarding.forward import ASTRAY, DATAGRAM, DOUBLE
+from gateway.forwarding.targets import targets
+from gateway.links.link import Batch
+from gateway.pipeline import Pump
 
 STATION = Talker(253, 190)
 ASK = mav.MAVLink_param_request_list_message
@@ -159,7 +159,7 @@ def test_an_upload_by_a_station_is_seen_by_us(field):
 
 def test_a_station_loads_parameters_and_mission_through_us_while_we_do(field, monkeypatch):
     plane, heard = Aircraft(0.0, system=7), []
-    monkeypatch.setattr("gateway.pump.wall", lambda: field.now)
+    monkeypatch.setattr("gateway.pipeline.wall", lambda: field.now)
     wanted = [
         mav.MAVLink_mission_request_list_message(7, 1),
         *(mav.MAVLink_mission_request_int_message(7, 1, k) for k in range(12)),

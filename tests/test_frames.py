@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fleet.frames import wrap
-from fleet.telemetry.dialects.dataflash import _angles
+from fleet.telemetry.tables.dataflash import _angles
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -13,17 +13,17 @@ from conftest import ROOT, unused_port
 from fake_link import FakeLink, beside_compiling, untimed
 from talker import ITEMS, T0, Aircraft, Talker
 
-from fleet.bus import connect
+from fleet.bus.memory_bus import MemoryBus
+from fleet.bus.session import connect
 from fleet.contract import Account, Mission, Params, Sample, Status
-from fleet.memory_bus import MemoryBus
-from fleet.telemetry.heard import Heard
-from fleet.telemetry.recordings import replay_messages
+from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.recording.recordings import replay_messages
 from gateway.__main__ import compiled
-from gateway.link import Batch
+from gateway.links.link import Batch
+from gateway.links.recorded import Replay
 from gateway.links.udp import Udp
-from gateway.pump import Pump
-from gateway.recorded import Replay
-from gateway.spec import read_spec
+from gateway.pipeline import Pump
+from gateway.settings.link_spec import read_spec
 
 PATIENCE_S = 30.0  # an upper bound; every wait ends with its condition
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from flights import HERE, T0
 
-from fleet.airframe import servo_map
+from fleet.airframes.airframe import servo_map
 from fleet.contract import Sample
 from fleet.frames import Origin
 from fleet.window import Window
-from twin_worker.history import History
-from twin_worker.preprocess import DT, Grid, preprocess
+from twin_worker.telemetry.history import History
+from twin_worker.telemetry.resample import DT, Grid, preprocess
 
 PLAIN, CALM = servo_map({}), np.zeros(3)
 LATE_S = 1.5  # rows this late are still laid

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from talker import T0
 
-from fleet.bus import connect
-from fleet.codec import Wire, encode
+from fleet.bus.bus_protocol import key
+from fleet.bus.codec import Wire, encode
+from fleet.bus.memory_bus import MemoryBus
+from fleet.bus.session import connect
 from fleet.contract import Array, History, Rows, Sample, Status
-from fleet.memory_bus import MemoryBus
-from fleet.talk import key
-from gateway.history import Keeper
-from gateway.publish import Publisher
+from gateway.publication.history import Keeper
+from gateway.publication.publish import Publisher
 
 
 def sample(uav, t, rows=3):

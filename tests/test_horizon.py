@@ -5,11 +5,20 @@ import numpy as np
 import pytest
 from made_up import GROUP, LINE, V
 
-from twin_worker.calibration import adapt
-from twin_worker.calibration.fit import fit
-from twin_worker.calibration.ledger import ROWS
-from twin_worker.calibration.written import Tables
-from twin_worker.horizon import AHEAD, LIMIT, Made, Record, axes_error, first_passage, path_length, track_frame
+from twin_worker.confidence import adaptive_conformal
+from twin_worker.confidence.calibration.fit_table import fit
+from twin_worker.confidence.prediction_log import ROWS
+from twin_worker.confidence.table_files import Tables
+from twin_worker.confidence.tube_and_horizon import (
+    AHEAD,
+    LIMIT,
+    Made,
+    Record,
+    axes_error,
+    first_passage,
+    path_length,
+    track_frame,
+)
 
 TIMES = np.arange(-10, 1850) / 10.0
 PLAIN = "paper/arduplane/fixed_wing/known"
@@ -305,8 +314,8 @@ def test_errors_that_outgrow_all_adaptation_are_held_less_often_and_the_predicti
     assert record.held[0] < 0.85
     said = record.trust(Made(400.0, "paper", PLAIN, AHEAD, moved(400.0), V)).sentence
     assert "at the bound of adaptation: the tube may hold fewer" in said
-    assert "whatever the flight does" not in (adapt.__doc__ or "") and "No coverage is guaranteed" in (
-        adapt.__doc__ or ""
+    assert "whatever the flight does" not in (adaptive_conformal.__doc__ or "") and "No coverage is guaranteed" in (
+        adaptive_conformal.__doc__ or ""
     )
 
 

@@ -9,12 +9,12 @@ from conftest import unused_port
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from test_end_to_end import process, wait
 
-from fleet.bus import connect
+from fleet.bus.session import connect
 from fleet.contract import Account, Status
-from fleet.telemetry.opening import RATIO, UNFOLDED, Source
-from fleet.telemetry.ulog_formats import Formats
-from gateway.apart import divided
-from gateway.spec import read_spec
+from fleet.telemetry.onboard_logs.ulog.formats import Formats
+from fleet.telemetry.recording.opening import RATIO, UNFOLDED, Source
+from gateway.links.isolated_replay import divided
+from gateway.settings.link_spec import read_spec
 from tests.bench.security.hostile_files import CPU_S, FILES, MEMORY_MB, a_flight, read_apart, written
 
 SHORT = ("regex", "nested formats", "records in records", "tlog with gaps", "DataFlash, formats over and over")

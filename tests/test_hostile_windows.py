@@ -10,13 +10,13 @@ from flights import DT, HERE, T0, published
 
 from fleet.contract import Outcome, Verdict
 from fleet.window import Window
-from twin_worker import learn
-from twin_worker.choose import choose
-from twin_worker.coupled import Coupled, identify
-from twin_worker.memory import Twin
-from twin_worker.plant import finite
-from twin_worker.publish import model_message
-from twin_worker.verify import verify
+from twin_worker.identification.fixed_wing.derivatives_model import Coupled, identify
+from twin_worker.identification.fixed_wing.plant import finite
+from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps import identify_step
+from twin_worker.twin.steps.model_message import model_message
+from twin_worker.twin.steps.model_selection import choose
+from twin_worker.validation.verify import verify
 
 ROWS, SPLIT = 236, 130  # a short flight: 5.2 s to learn from, 4.2 s held out
 GOOD = [fly(aircraft(seed), ROWS * DT, seed=seed).part(0, ROWS) for seed in range(6)]
@@ -180,9 +180,9 @@ def test_there_are_two_thousand():
 @pytest.mark.parametrize("spoil", [kind for kind in KINDS if kind is not same_stamps], ids=lambda kind: kind.__name__)
 def test_a_whole_hop_of_learning_meets_them(spoil, monkeypatch):
     """The same through `learn`, with a verified model in force: it is never replaced by a number that is none."""
-    monkeypatch.setattr(learn, "LEAST_S", 6.0)
-    monkeypatch.setattr(learn, "_HELD_S", (4.2, 4.2, 4.2))
-    monkeypatch.setattr(learn, "compare_with_flight", lambda twin: None)
+    monkeypatch.setattr(identify_step, "LEAST_S", 6.0)
+    monkeypatch.setattr(identify_step, "_HELD_S", (4.2, 4.2, 4.2))
+    monkeypatch.setattr(identify_step, "compare_with_flight", lambda twin: None)
     rng = np.random.default_rng(100 + KINDS.index(spoil))
     model = known(aircraft(0))
     for _ in range(3):
@@ -190,7 +190,7 @@ def test_a_whole_hop_of_learning_meets_them(spoil, monkeypatch):
         twin = twin_with(model, Verdict(outcome=Outcome.VERIFIED, sentence="verified before"))
         monkeypatch.setattr(Twin, "window", lambda self, seconds, window=window: window)
         for _ in range(3):
-            published(learn.learn(twin))
+            published(identify_step.learn(twin))
             assert isinstance(twin.plant, Coupled) and finite(twin.plant)
             assert twin.verdict.sentence
             assert twin.near is None or finite(twin.near)

@@ -36,26 +36,34 @@ ROOMS = (  # inside fleet a room imports only from rooms above it, and from itse
 RANK = {f"fleet.{name}": rank for rank, names in enumerate(ROOMS) for name in names}
 
 ALONE = {  # a foreign library, and the only places that may import it
-    "zenoh": ("fleet/bus.py",),
+    "zenoh": ("fleet/bus/session.py",),
     "viser": ("viewer/",),
-    "jsbsim": ("fleet/pretend/jsbsim.py",),
-    "pymavlink": ("fleet/telemetry/", "fleet/pretend/mavlink.py", "fleet/pretend/mavlink_said.py", "gateway/"),
+    "jsbsim": ("fleet/simulator/vehicle/jsbsim.py",),
+    "pymavlink": (
+        "fleet/telemetry/",
+        "fleet/simulator/flight/mavlink.py",
+        "fleet/simulator/flight/mavlink_messages.py",
+        "gateway/",
+    ),
 }
 
 APART = (  # who, and what it must never import
     ("fleet", ("gateway", "twin_worker", "viewer")),
     ("gateway", ("twin_worker", "viewer")),
-    ("twin_worker", ("gateway", "viewer", "fleet.pretend")),
-    ("viewer", ("gateway", "twin_worker", "fleet.pretend")),
-    ("fleet.pretend", ("fleet.physics", "fleet.effects", "fleet.simulate", "fleet.hybrid")),  # never our own physics
-    ("fleet.pretend", ("importlib", "runpy", "subprocess")),  # nor by the back door
-    ("fleet.effects", ("fleet.pretend",)),  # one code must never both conceal and find
-    ("fleet.simulate", ("fleet.pretend",)),
-    ("twin_worker.diagnose", ("fleet.pretend", "fleet.prove")),
-    ("fleet.prove", ("fleet.physics", "fleet.effects", "fleet.simulate", "fleet.hybrid")),
+    ("twin_worker", ("gateway", "viewer", "fleet.simulator")),
+    ("viewer", ("gateway", "twin_worker", "fleet.simulator")),
+    (
+        "fleet.simulator",
+        ("fleet.physics", "fleet.effects", "fleet.physics.simulate", "fleet.physics.point_mass"),
+    ),  # never our own physics
+    ("fleet.simulator", ("importlib", "runpy", "subprocess")),  # nor by the back door
+    ("fleet.effects", ("fleet.simulator",)),  # one code must never both conceal and find
+    ("fleet.physics.simulate", ("fleet.simulator",)),
+    ("twin_worker.diagnosis", ("fleet.simulator", "fleet.blind_test")),
+    ("fleet.blind_test", ("fleet.physics", "fleet.effects", "fleet.physics.simulate", "fleet.physics.point_mass")),
 )
 
-TABLES = ("fleet/contract.py", "fleet/telemetry/dialects/")  # data, so they may be long
+TABLES = ("fleet/contract.py", "fleet/telemetry/tables/")  # data, so they may be long
 BANNED_NAMES = ("utils.py", "helpers.py", "common.py", "misc.py")
 NOT_IMPERATIVE = {"a", "an", "the", "this", "it", "returns", "gets", "function", "method"}
 
@@ -212,8 +220,23 @@ def test_the_house_keeps_its_law(rule: Callable[..., Iterator[str]], pytestconfi
 
 
 SHARED = (  # what concealer and finder may both stand on: words, frames, formats; nothing that flies or decides
-    *("fleet", "fleet.contract", "fleet.cli", "fleet.children", "fleet.commands", "fleet.frames", "fleet.mission"),
-    *("fleet.codec", "fleet.config", "fleet.plain", "fleet.logs", "fleet.interrupt", "fleet.private"),
+    *(
+        "fleet",
+        "fleet.contract",
+        "fleet.cli",
+        "fleet.process.children",
+        "fleet.commands",
+        "fleet.frames",
+        "fleet.mission",
+    ),
+    *(
+        "fleet.bus.codec",
+        "fleet.config",
+        "fleet.process.sanitise",
+        "fleet.process.logs",
+        "fleet.process.interrupt",
+        "fleet.process.private_files",
+    ),
 )
 AUTOPILOT = "fleet.autopilots"  # flies the pretend aircraft; the finder has no use for it, but draws beside who has
 
@@ -233,17 +256,17 @@ def reached(*begin: str) -> set[str]:
 
 
 def test_finder_and_concealer_share_nothing_that_flies_or_decides() -> None:
-    concealer = reached("fleet.prove.concealer")
-    finder = reached("twin_worker.diagnose.__main__", "twin_worker.diagnose.learn")
-    assert any(name.startswith("fleet.pretend.conceal") for name in concealer)
-    assert {"fleet.effects.icing", "twin_worker.diagnose.simulate"} <= finder | reached("fleet.effects.icing")
+    concealer = reached("fleet.blind_test.concealer")
+    finder = reached("twin_worker.diagnosis.__main__", "twin_worker.diagnosis.learn")
+    assert any(name.startswith("fleet.simulator.conceal") for name in concealer)
+    assert {"fleet.effects.icing", "twin_worker.diagnosis.model.simulate"} <= finder | reached("fleet.effects.icing")
     assert not {name for name in concealer & finder if name not in SHARED and not inside(name, AUTOPILOT)}
 
 
 ALLOWED = (
     (direction, "gateway/a.py", "from fleet.telemetry import intake"),
     (direction, "fleet/telemetry/a.py", "from fleet.contract import Sample\nfrom . import clock"),
-    (alone, "gateway/link.py", "from pymavlink import mavutil"),
+    (alone, "gateway/links/link.py", "from pymavlink import mavutil"),
     (arguments, "fleet/a.py", "@nb.njit(cache=True)\ndef f(a, b, c, d, e, g): ..."),
     (arguments, "fleet/a.py", "@inlined\ndef f(a, b, c, d, e, g): ..."),
     (arguments, "fleet/a.py", "class A:\n    def f(self, a, b, c, d, e, *, g): ..."),
@@ -261,13 +284,13 @@ PLANTED = (
     (direction, "fleet/frames.py", "from fleet.contract import Sample"),
     (direction, "fleet/frames.py", "from fleet import bus"),
     (direction, "fleet/telemetry/a.py", "from ..pretend import b"),
-    (direction, "fleet/bus.py", "import twin_worker.twin"),
-    (direction, "fleet/pretend/conceal/exam.py", "def f():\n    from fleet.effects import icing"),
-    (direction, "fleet/pretend/conceal/plan.py", "import importlib"),
-    (direction, "fleet/pretend/faults/physics.py", "from twin_worker.diagnose.card import read"),
-    (direction, "twin_worker/diagnose/name.py", "from fleet.pretend.conceal import hide"),
+    (direction, "fleet/bus/session.py", "import twin_worker.twin.step"),
+    (direction, "fleet/simulator/conceal/exam.py", "def f():\n    from fleet.effects import icing"),
+    (direction, "fleet/simulator/conceal/plan.py", "import importlib"),
+    (direction, "fleet/simulator/faults/physics.py", "from twin_worker.diagnosis.data.card import read"),
+    (direction, "twin_worker/diagnosis/name.py", "from fleet.simulator.conceal import hide"),
     (alone, "gateway/a.py", "import zenoh"),
-    (alone, "fleet/pretend/uav.py", "from jsbsim import FGFDMExec"),
+    (alone, "fleet/simulator/flight/uav.py", "from jsbsim import FGFDMExec"),
     (every_room_has_a_place, "fleet/attic.py", ""),
     (size, "viewer/a.py", "x = 1\n" * 401),
     (name, "fleet/telemetry/utils.py", ""),

@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 from test_predict import AHEAD, NORTH, situation
 
-from fleet import hybrid as H
 from fleet.autopilots import arduplane, laws
 from fleet.contract import Item
 from fleet.frames import G, Origin
 from fleet.mission import route
-from twin_worker.hybrid import energy, ensemble, lags
-from twin_worker.hybrid.energy import Flight, Ridge
-from twin_worker.hybrid.fit import Hybrid, identify
-from twin_worker.hybrid.fly import begin, fly_hybrid, ground_velocity, rest
-from twin_worker.predict import Start, set_out
+from fleet.physics import point_mass as H
+from twin_worker.identification.fixed_wing import attitude_lag, energy_balance
+from twin_worker.identification.fixed_wing.energy_balance import Flight, Ridge
+from twin_worker.identification.fixed_wing.point_mass_model import Hybrid, identify
+from twin_worker.prediction.closed_loop import Start, set_out
+from twin_worker.prediction.fixed_wing import ensemble
+from twin_worker.prediction.fixed_wing.point_mass_rollout import begin, fly_hybrid, ground_velocity, rest
 
 SPEED = 22.0
 HOME = Origin(470_000_000, 80_000_000, 500_000)
@@ -43,22 +44,22 @@ def test_a_lag_is_found_again_from_its_own_flight(lag):
     rng = np.random.default_rng(3)
     command = np.repeat(rng.uniform(-0.6, 0.6, 40), 30)
     out = np.empty(len(command))
-    lags.follow(command, np.zeros(len(command)), np.array(lag), out)
-    found = lags.identify(command, out + 0.01 * rng.standard_normal(len(out)))
+    attitude_lag.follow(command, np.zeros(len(command)), np.array(lag), out)
+    found = attitude_lag.identify(command, out + 0.01 * rng.standard_normal(len(out)))
     assert np.allclose(found, lag, rtol=0.08, atol=0.006)
 
 
 def test_a_lag_survives_lost_commands_and_holds_to_what_is_usual_without_any():
     command = np.repeat([0.0, 0.5, np.nan, -0.5, 0.2], 60)
     out = np.empty(len(command))
-    lags.follow(command, np.zeros(len(command)), np.array([2.5, 0.8, 0.0]), out)
-    assert np.isfinite(lags.identify(command, out)).all()
-    assert np.allclose(lags.identify(np.full(100, np.nan), np.zeros(100)), [3.0, 0.9, 0.0], atol=1e-6)
+    attitude_lag.follow(command, np.zeros(len(command)), np.array([2.5, 0.8, 0.0]), out)
+    assert np.isfinite(attitude_lag.identify(command, out)).all()
+    assert np.allclose(attitude_lag.identify(np.full(100, np.nan), np.zeros(100)), [3.0, 0.9, 0.0], atol=1e-6)
 
 
 def gusty(seconds: float, gust: float, seed: int) -> Flight:
     """Energy alone, c_t = 3.4, c_v = -0.1: a throttle that answers every gust, climbs asked for now and then."""
-    rng, dt = np.random.default_rng(seed), lags.STEP
+    rng, dt = np.random.default_rng(seed), attitude_lag.STEP
     n = round(seconds / dt)
     V, h, thr, blown = np.full(n, SPEED), np.full(n, 100.0), np.full(n, 0.4), 0.0
     climb = np.repeat(rng.choice([0.0, 0.0, 1.5, -1.5], n // 200 + 1), 200)[:n]
@@ -78,11 +79,15 @@ def test_power_is_told_by_what_the_route_asks_not_by_what_gusts_do():
     plain, instrumented = [], []
     for flight in flights:
         X = np.column_stack(
-            [np.ones(len(flight) - 20), energy.mean(flight.delta_t) - 0.4, energy.mean(flight.V) - SPEED]
+            [
+                np.ones(len(flight) - 20),
+                energy_balance.mean(flight.delta_t) - 0.4,
+                energy_balance.mean(flight.V) - SPEED,
+            ]
         )
-        y = energy.slope(0.5 * flight.V**2 + G * flight.h) / energy.mean(flight.V)
+        y = energy_balance.slope(0.5 * flight.V**2 + G * flight.h) / energy_balance.mean(flight.V)
         plain.append(np.linalg.lstsq(X, y, rcond=None)[0][1])
-        instrumented.append(energy.power(flight, 0.4, SPEED).value[1])
+        instrumented.append(energy_balance.power(flight, 0.4, SPEED).value[1])
     assert np.median(plain) < 0.75 * 3.4  # what feedback makes of it
     assert np.median(instrumented) == pytest.approx(3.4, rel=0.15)
 

@@ -16,14 +16,14 @@ from oracle import framed, ours, raw
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import ARDU, PLANE, T0, Talker, of
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Account, Alert, AlertKind, Status
-from fleet.memory_bus import MemoryBus
-from fleet.telemetry.collision import QUIET_S
-from fleet.telemetry.ids import Ids
-from fleet.telemetry.intake import Intake
+from fleet.telemetry.mavlink.collision import QUIET_S
+from fleet.telemetry.mavlink.intake import Intake
+from fleet.telemetry.recording.ids import Ids
 from gateway.links.opening import open_link
-from gateway.pump import Pump
-from gateway.spec import read_spec
+from gateway.pipeline import Pump
+from gateway.settings.link_spec import read_spec
 
 
 def test_a_second_sender_raises_one_alarm_which_ends_when_it_is_silent():

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from twin_worker.imm import STEP, imm, turn_on
-from twin_worker.track import STEP as TRACK_STEP
-from twin_worker.track import Track
+from twin_worker.prediction.turn_rate import STEP, imm, turn_on
+from twin_worker.telemetry.track import STEP as TRACK_STEP
+from twin_worker.telemetry.track import Track
 
 AHEAD = np.arange(0.0, 61.0)
 N = 24

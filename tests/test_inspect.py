@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from fleet.cli import main
-from fleet.commands import inspect
+from fleet.commands.offline import inspect
 from fleet.contract import Link, Mission, Params, Status
-from fleet.page.ink import drawn, mode_colours
-from fleet.plain import plain
-from fleet.sheet import table
-from fleet.telemetry.abilities import abilities
-from fleet.telemetry.findings import Facts, File, Findings, findings, happened
-from fleet.telemetry.recordings import replay_messages
-from fleet.telemetry.survey import Survey, airborne, survey
-from fleet.telemetry.thinned import Span, Thinned, overlap
+from fleet.process.sanitise import plain
+from fleet.report.ink import drawn, mode_colours
+from fleet.report.report_text import table
+from fleet.telemetry.inspection.abilities import abilities
+from fleet.telemetry.inspection.findings import Facts, File, Findings, findings, happened
+from fleet.telemetry.inspection.survey import Survey, airborne, survey
+from fleet.telemetry.inspection.thinned import Span, Thinned, overlap
+from fleet.telemetry.recording.recordings import replay_messages
 
 T0 = flights.T0
 S02, S10 = "sitl/s02_nominal_light_wind.tlog.xz", "sitl/s10_multi3_nominal.tlog.xz"
@@ -168,7 +168,7 @@ def test_table_json_and_page_of_one_file(tlog, tmp_path, capsys):
 
 @pytest.mark.parametrize("suffix", [".svg", ".pdf"])
 def test_pages_for_printing(pretended, tmp_path, suffix):
-    from fleet.page import Sheet, write
+    from fleet.report.inspection_page import Sheet, write
 
     told = findings(pretended, Facts())
     sheets = [Sheet(pretended, told, Facts(), "a$b_{x.tlog")] * 2
@@ -178,7 +178,7 @@ def test_pages_for_printing(pretended, tmp_path, suffix):
 
 
 def test_a_page_is_drawn_of_an_aircraft_that_said_next_to_nothing(tmp_path):
-    from fleet.page import Sheet, write
+    from fleet.report.inspection_page import Sheet, write
 
     silent = survey([Status(uav=1, t=T0, mode="")])[1]
     told = findings(silent, Facts())
@@ -253,7 +253,7 @@ def test_what_an_aircraft_says_cannot_steer_the_terminal(capsys):
 
 def test_a_twin_that_answers_and_one_that_does_not(tlog, monkeypatch, capsys):
     def answers(module, *options):
-        assert module == "twin_worker.replay"
+        assert module == "twin_worker.evaluation.replay"
         told = {"1": {"methods": {"paper": 7}, "first_verified_s": 34.0, "within": {"10": 0.9}, "sentence": "well"}}
         with open(options[-1], "w") as file:
             json.dump(told, file)

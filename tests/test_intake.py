@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import ARDU, PLANE, T0, Talker, of
 
 from fleet.contract import Link, Mission, Params, Sample, Status
-from fleet.telemetry.intake import Intake
+from fleet.telemetry.mavlink.intake import Intake
 
 
 @pytest.mark.parametrize(

@@ -9,17 +9,17 @@ import pytest
 from fake_link import FakeLink
 from talker import ITEMS, T0, Talker, of
 
-from fleet.codec import Wire
+from fleet.bus.codec import Wire
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Link, Params, Sample, Status
-from fleet.memory_bus import MemoryBus
-from fleet.telemetry import intake as module
-from fleet.telemetry.heard import Heard
-from fleet.telemetry.intake import EARLY_S, FORGET_S, KNOWN_S, LOST_S, MOST_EARLY_ALL, NOT_YET, Intake
-from gateway import pump as pump_module
-from gateway.link import Batch, wall
+from fleet.telemetry.mavlink import intake as module
+from fleet.telemetry.mavlink.intake import EARLY_S, FORGET_S, KNOWN_S, LOST_S, MOST_EARLY_ALL, NOT_YET, Intake
+from fleet.telemetry.mavlink.parsing.received import Heard
+from gateway import pipeline as pump_module
+from gateway.links.link import Batch, wall
 from gateway.links.receive import MOST, Bulk
-from gateway.publish import Publisher
-from gateway.pump import AT_ONCE, Pump
+from gateway.pipeline import AT_ONCE, Pump
+from gateway.publication.publish import Publisher
 
 
 def fly(intake: Intake, talker: Talker, begin: float, seconds: float, source: str = "air") -> list:

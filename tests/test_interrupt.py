@@ -11,11 +11,17 @@ import long_tlog
 import pytest
 from conftest import ROOT
 
-from fleet import interrupt
-from fleet.interrupt import INTERRUPTED, interruptible
+from fleet.process import interrupt
+from fleet.process.interrupt import INTERRUPTED, interruptible
 
 PATIENCE_S = 120.0
-PHASES = {"fleet/commands": 3, "fleet/cli.py": 2, "fleet/telemetry": 3, "fleet/sheet.py": 1, "fleet/bars.py": 2}
+PHASES = {
+    "fleet/commands": 3,
+    "fleet/cli.py": 2,
+    "fleet/telemetry": 3,
+    "fleet/report/report_text.py": 1,
+    "fleet/report/progress.py": 2,
+}
 """Files of ours, and at how many of their lines Ctrl-C comes."""
 STRIKER = """
 import os, signal, sys
@@ -103,7 +109,9 @@ def test_ctrl_c_at_any_line_of_inspect_gives_130_and_one_line(tlog, hook, lines,
         assert said[0] in ("fleet: interrupted", "fleet inspect: interrupted")
 
 
-@pytest.mark.parametrize("module", ["gateway", "twin_worker", "viewer", "twin_worker.assess", "twin_worker.replay"])
+@pytest.mark.parametrize(
+    "module", ["gateway", "twin_worker", "viewer", "twin_worker.evaluation", "twin_worker.evaluation.replay"]
+)
 def test_every_command_ends_so_while_it_is_being_loaded(hook, module):
     found = struck(hook, ["fleet/cli.py"], 5, module, "--help")
     assert (found.returncode, found.stderr) == (INTERRUPTED, f"{module}: interrupted\n")

@@ -8,9 +8,9 @@ import pytest
 from flights import T0
 
 from fleet.contract import COLUMNS, UNTOLD, Array, Rows, Sample
-from twin_worker.claims.carry import CARRIED
-from twin_worker.claims.tree import pack, unpack
-from twin_worker.history import History
+from twin_worker.ownership.handover import CARRIED
+from twin_worker.ownership.typed_serialization import pack, unpack
+from twin_worker.telemetry.history import History
 
 MOST = {"position": 2e9, "leg": 1e5, "command": 1e5}
 KINDS = tuple(MOST)

@@ -7,15 +7,15 @@ import pytest
 from flights import predictions, published
 from talker import T0, Talker
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, AlertKind, Event, Link, Sample, State, Status
-from fleet.memory_bus import MemoryBus
-from fleet.pretend import drive as simulator
-from fleet.telemetry.intake import Intake
+from fleet.simulator.flight import drive as simulator
+from fleet.telemetry.mavlink.intake import Intake
 from tests.late_arrival import ARRIVALS, Datagram, flight, lived, relayed
-from twin_worker import worker as live
-from twin_worker.offline import run
-from twin_worker.twin import advance
-from twin_worker.worker import Worker
+from twin_worker.evaluation.offline import run
+from twin_worker.service import worker as live
+from twin_worker.service.worker import Worker
+from twin_worker.twin.step import advance
 
 SECONDS = 75.0
 

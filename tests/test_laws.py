@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from point_mass import HERE, PLANE, TRIM_ALPHA, Plane, begin, fly, leg, route
 
 from fleet import mission as m
-from fleet.autopilots import arduplane, laws, slots
-from fleet.autopilots.arduplane import state as S
+from fleet.autopilots import arduplane, laws
+from fleet.autopilots.common import controller_state as S
+from fleet.autopilots.common import parameter_vector
 from fleet.autopilots.px4_fixedwing import npfg
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.shadow import shadow
@@ -255,11 +256,11 @@ def test_the_door_leads_arduplane_to_its_own_law_bit_for_bit():
 @pytest.mark.parametrize("law", tuple(laws.LAWS))
 def test_every_law_knows_its_mark_and_fits_the_vector(law):
     par, absent = laws.parameters(law, {})
-    assert par.shape == (slots.N_PAR,) and par[slots.LAW] == laws.LAWS[law].mark
+    assert par.shape == (parameter_vector.N_PAR,) and par[parameter_vector.LAW] == laws.LAWS[law].mark
     assert absent == laws.LAWS[law].names
-    assert len(laws.LAWS[law].names) + 1 <= slots.N_PAR + slots.W_N
-    assert tuple(laws.blown(par, 1.0, 2.0)[[slots.W_N, slots.W_E]]) == (1.0, 2.0)
-    assert par[slots.W_N] == 0.0  # the original is as it was
+    assert len(laws.LAWS[law].names) + 1 <= parameter_vector.N_PAR + parameter_vector.W_N
+    assert tuple(laws.blown(par, 1.0, 2.0)[[parameter_vector.W_N, parameter_vector.W_E]]) == (1.0, 2.0)
+    assert par[parameter_vector.W_N] == 0.0  # the original is as it was
     assert len({known.sentence for known in laws.LAWS.values()}) == len(laws.LAWS)
 
 

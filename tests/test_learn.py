@@ -9,10 +9,10 @@ from flights import T0, linear_flight, truth
 
 from fleet.contract import Outcome, Verdict
 from fleet.window import STATES
-from twin_worker import choose as choosing
-from twin_worker import learn as learning
-from twin_worker.memory import Believed, Twin
-from twin_worker.unseen import Unseen
+from twin_worker.twin.state.state import Believed, Twin
+from twin_worker.twin.steps import identify_step as learning
+from twin_worker.twin.steps import model_selection as choosing
+from twin_worker.validation.held_out import Unseen
 
 VERDICT = Verdict(outcome=Outcome.VERIFIED, sentence="mean fit 30 %")
 WINDOW = linear_flight(20.0)

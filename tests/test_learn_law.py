@@ -9,10 +9,10 @@ from point_mass import PLANE, Plane, begin, fly, leg, route
 
 from fleet.autopilots import laws
 from fleet.window import Window
-from twin_worker import learn_law as learning
-from twin_worker.learn_law import Learnt, learn_law
-from twin_worker.predict import Heard, Onboard, Situation
-from twin_worker.wind import WindFilter
+from twin_worker.estimation.wind_filter import WindFilter
+from twin_worker.prediction import autopilot_identification as learning
+from twin_worker.prediction.autopilot_identification import Learnt, learn_law
+from twin_worker.prediction.closed_loop import Heard, Onboard, Situation
 
 OURS = {
     "arduplane": PLANE | {"NAVL1_PERIOD": 15},

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from gateway.sieve import read_sieve
-from gateway.spec import read_forward, read_spec
+from gateway.settings.link_spec import read_forward, read_spec
+from gateway.settings.message_filter import read_sieve
 
 
 def test_links_are_read():

@@ -15,17 +15,17 @@ from conftest import unused_port
 from fake_link import PATIENCE_S, pieces, until
 from talker import Talker
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Account
-from fleet.memory_bus import MemoryBus
-from fleet.telemetry.heard import Heard
-from fleet.telemetry.ids import Ids
-from gateway.link import Batch, wall
+from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.recording.ids import Ids
 from gateway.links import receive, tcp_listener
+from gateway.links.link import Batch, wall
 from gateway.links.opening import open_link
-from gateway.links.outbox import MOST, Outbox
+from gateway.links.send_queue import MOST, Outbox
 from gateway.onboard import Onboard
-from gateway.pump import Pump
-from gateway.spec import read_spec
+from gateway.pipeline import Pump
+from gateway.settings.link_spec import read_spec
 
 DROPPED = "dropped: decoding fell behind"
 HELLO, ANSWER = Talker().heartbeat(), Talker(255, 190).heartbeat(6, 8)
@@ -293,7 +293,7 @@ def test_what_a_full_queue_cannot_take_is_counted():
 
 
 def test_what_was_sent_is_what_was_counted_however_far_decoding_falls_behind(monkeypatch):
-    monkeypatch.setattr("gateway.pump.QUEUE", 2)
+    monkeypatch.setattr("gateway.pipeline.QUEUE", 2)
     link, bus = open_link(read_spec(f"udpin:127.0.0.1:{udp_port()}"), Ids()), MemoryBus()
     stop, done = threading.Event(), threading.Event()
     talker, sent, accounts = Talker(), 3000, []

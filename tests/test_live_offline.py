@@ -7,12 +7,12 @@ import hover
 import numpy as np
 import pytest
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, Event, Message, Model, Prediction, Sample
-from fleet.memory_bus import MemoryBus
-from fleet.telemetry.recordings import replay_messages
-from twin_worker import worker as live
-from twin_worker.offline import run
-from twin_worker.worker import Worker
+from fleet.telemetry.recording.recordings import replay_messages
+from twin_worker.evaluation.offline import run
+from twin_worker.service import worker as live
+from twin_worker.service.worker import Worker
 
 KINDS = (Model, Prediction, Alert)
 

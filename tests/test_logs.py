@@ -13,13 +13,13 @@ import pytest
 from conftest import ROOT, unused_port
 from prometheus_client.parser import text_string_to_metric_families
 
-from fleet.children import Children
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import FleetRow, FleetState, State
-from fleet.logs import Lines, Words, fail, say, tell, timed, untimed
-from fleet.memory_bus import MemoryBus
 from fleet.metrics import served
+from fleet.process.children import Children
+from fleet.process.logs import Lines, Words, fail, say, tell, timed, untimed
 from tests.bench.security.bombs import ESCAPES
-from twin_worker.metrics import counters
+from twin_worker.service.metrics import counters
 
 PATIENCE_S = 10.0
 
@@ -31,7 +31,7 @@ def record(message: str, *, defect: bool = False) -> logging.LogRecord:
             raise ZeroDivisionError("by a stranger")
         except ZeroDivisionError:
             info = sys.exc_info()
-    return logging.LogRecord("gateway.router", logging.WARNING, __file__, 1, "%s", (message,), info)
+    return logging.LogRecord("gateway.publication.router_session", logging.WARNING, __file__, 1, "%s", (message,), info)
 
 
 def test_people_read_a_sentence_that_steers_no_terminal() -> None:
@@ -80,7 +80,11 @@ def test_machines_read_one_line_of_json() -> None:
     assert line.isprintable()
     told = json.loads(line)
     assert told["message"] == f"uav-7 says {ESCAPES}" and "by a stranger" in told["defect"]
-    assert (told["level"], told["process"], told["from"]) == ("warning", "gateway", "gateway.router")
+    assert (told["level"], told["process"], told["from"]) == (
+        "warning",
+        "gateway",
+        "gateway.publication.router_session",
+    )
     assert told["t"].endswith("+00:00")
 
 

@@ -13,10 +13,10 @@ import pytest
 from conftest import ROOT
 from talker import T0, of
 
-from fleet.commands import inspect
+from fleet.commands.offline import inspect
 from fleet.contract import Sample
-from fleet.telemetry.recordings import Recording
-from fleet.telemetry.thinned import Thinned
+from fleet.telemetry.inspection.thinned import Thinned
+from fleet.telemetry.recording.recordings import Recording
 
 PATIENCE_S = 60.0
 FILES = 12  # so many that a terminal that is read late on a busy machine is still read before the last

@@ -7,22 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet import hybrid as H
 from fleet.contract import Message, Model, Prediction, Sample
 from fleet.effects import catalogue
 from fleet.frames import to_ned
+from fleet.physics import point_mass as H
 from fleet.physics.wrench import NAMES, WIND
-from fleet.pretend.drive import to_tlog
-from fleet.pretend.faults.kinds import read
-from fleet.pretend.uav import PretendUav
-from fleet.telemetry.recordings import replay_messages
-from twin_worker.diagnose.guess import Guess
-from twin_worker.hybrid.extend import Added, extended
-from twin_worker.memory import Twin
-from twin_worker.mismatch.extend import extend, extended_plant, wind_since
-from twin_worker.mismatch.marks import MOST, before
-from twin_worker.mismatch.push import Push, moved
-from twin_worker.twin import advance
+from fleet.simulator.faults.kinds import read
+from fleet.simulator.flight.drive import to_tlog
+from fleet.simulator.flight.uav import PretendUav
+from fleet.telemetry.recording.recordings import replay_messages
+from twin_worker.diagnosis.data.fault_hypothesis import Guess
+from twin_worker.identification.fixed_wing.point_mass_with_effects import Added, extended
+from twin_worker.mismatch.adapt_models import extend, extended_plant, wind_since
+from twin_worker.mismatch.effect_increments import Push, moved
+from twin_worker.twin.state.checkpoint import MOST, before
+from twin_worker.twin.state.state import Twin
+from twin_worker.twin.step import advance
 
 FAULT_S, NAMED_S, END_S = 70.0, 100.0, 150.0
 

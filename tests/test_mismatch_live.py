@@ -14,16 +14,16 @@ import odd_jobs
 import pytest
 from diagnosed import made
 
-from fleet.codec import Stamp
+from fleet.bus.codec import Stamp
 from fleet.contract import Found, Mismatch, Prediction
-from twin_worker.diagnose.baseline import Baseline
-from twin_worker.diagnose.card import UNKNOWN
-from twin_worker.diagnose.report import Outcome, Report
-from twin_worker.mismatch.background import Background
+from twin_worker.diagnosis.data.card import UNKNOWN
+from twin_worker.diagnosis.inference.report import Outcome, Report
+from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.mismatch.coordinator import ALL, Live
 from twin_worker.mismatch.job import Answer, Job, rows_of, work
-from twin_worker.mismatch.live import ALL, Live
-from twin_worker.mismatch.told import message, since, word
-from twin_worker.mismatch.watch import LOOK_S, Watch
+from twin_worker.mismatch.messages import message, since, word
+from twin_worker.mismatch.process import Background
+from twin_worker.mismatch.scheduler import LOOK_S, Watch
 
 BASE = Baseline(UNKNOWN, {}, 20.0)
 
@@ -257,7 +257,7 @@ def test_a_defect_in_taking_an_answer_is_that_aircrafts_alone_and_passes(looking
     live, hand, twin = looking
     turned(live, twin)
     hand.say(made())
-    monkeypatch.setattr("twin_worker.mismatch.watch.message", None)
+    monkeypatch.setattr("twin_worker.mismatch.scheduler.message", None)
     assert turned(live, twin) == [] and "TypeError" in live.failed([1])[0]
     monkeypatch.undo()
     watch = live.watch(1)

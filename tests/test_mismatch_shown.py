@@ -5,15 +5,15 @@ import copy
 import numpy as np
 import pytest
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Found, Message, Mismatch, Prediction, Sample
-from fleet.memory_bus import MemoryBus
 from tests.bench.mismatch.flown import Inline, errors
 from tests.bench.mismatch.world import FAULT, ONSET_S, baseline, messages
-from twin_worker.mismatch.live import ALL, Live
-from twin_worker.worker import Held, Worker
-from viewer.detail import about
-from viewer.feed import Feed
-from viewer.palette import DARK
+from twin_worker.mismatch.coordinator import ALL, Live
+from twin_worker.service.worker import Held, Worker
+from viewer.panels.detail import about
+from viewer.store.store import Feed
+from viewer.theme.palette import DARK
 
 UAV, SEED, END_S = 1, 6, 215
 WITHIN_S = 60.0  # of the fault, named and shown

@@ -8,10 +8,10 @@ from effect_flights import CARD, Plan, flown
 
 from fleet import cli
 from fleet.effects import FOLDERS, Onset, catalogue
-from twin_worker.diagnose.calibrate import calibrate
-from twin_worker.diagnose.diagnose import HELD, diagnose
-from twin_worker.diagnose.guess import Guess, When
-from twin_worker.diagnose.report import Outcome
+from twin_worker.diagnosis.baseline.calibrate import calibrate
+from twin_worker.diagnosis.data.fault_hypothesis import Guess, When
+from twin_worker.diagnosis.inference.diagnose import HELD, diagnose
+from twin_worker.diagnosis.inference.report import Outcome
 
 DOOR = '''
 """A door that jammed open on the right: it pushes to the left, turns the nose to the right, and drags."""

@@ -11,7 +11,7 @@ from fleet.physics.actuators import TAU as LAGS
 from fleet.physics.actuators import lagged
 from fleet.physics.wrench import OFFSETS
 from fleet.window import Window
-from twin_worker.observer import _ALPHA, _BETA, TAU, Observer
+from twin_worker.validation.gust_observer import _ALPHA, _BETA, TAU, Observer
 
 DT = 0.02
 IDLE = np.zeros((225, 4))  # inputs

@@ -3,7 +3,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import ITEMS, T0, Aircraft, Ears, Talker, of
 
 from fleet.contract import Mission, Params
-from fleet.telemetry.intake import Intake
+from fleet.telemetry.mavlink.intake import Intake
 from gateway.onboard import Onboard
 
 

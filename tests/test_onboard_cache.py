@@ -7,13 +7,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import ITEMS, T0, Aircraft, of
 
 from fleet.contract import Item, Mission, Params
-from fleet.pretend.mavlink import Voice
-from fleet.pretend.mavlink_said import DIALECTS
-from fleet.telemetry.intake import Intake
+from fleet.simulator.flight.mavlink import Voice
+from fleet.simulator.flight.mavlink_messages import DIALECTS
+from fleet.telemetry.mavlink.intake import Intake
 from gateway.onboard import Onboard
 from gateway.onboard.cache import Cache
 from gateway.onboard.rates import LEAST, WANTED_BYTES_S, WANTED_HZ, budget_of
-from gateway.spec import read_spec
+from gateway.settings.link_spec import read_spec
 
 VALUES = {"NAVL1_PERIOD": 17.0, "STAT_RUNTIME": 1.0, **{f"P{k:03d}": k / 7 for k in range(300)}}
 LONG = tuple(ITEMS) + tuple(Item(seq=k, command=16, lat_e7=470_100_000 + k) for k in range(len(ITEMS), 60))

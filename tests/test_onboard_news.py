@@ -6,8 +6,8 @@ from flights import item
 from talker import of
 
 from fleet.contract import Mission, Params, Sample, Status
-from fleet.telemetry.onboard_log import Chunk, Said
-from fleet.telemetry.onboard_news import UNDATED_S, craft_of, log_steps
+from fleet.telemetry.mavlink.onboard_log import Chunk, Said
+from fleet.telemetry.onboard_logs.onboard_news import UNDATED_S, craft_of, log_steps
 
 ITEMS = (item(0), item(1, north=500.0), item(2, north=500.0, east=500.0))
 

@@ -7,10 +7,10 @@ from flights import DT
 
 from fleet.physics.actuators import TAU, lagged
 from fleet.physics.wrench import N_PAR, WIND
-from twin_worker import output_error as oe
-from twin_worker.airframe_prior import prior
-from twin_worker.output_error import Problem, line_start, search, segments_of
-from twin_worker.sweep import GROUP, N_COLUMN, sweep
+from twin_worker.identification.fixed_wing import output_error as oe
+from twin_worker.identification.fixed_wing.derivatives_prior import prior
+from twin_worker.identification.fixed_wing.output_error import Problem, line_start, search, segments_of
+from twin_worker.identification.fixed_wing.output_error_kernel import GROUP, N_COLUMN, sweep
 
 HELD = prior(SMALL, AT, TRIM, np.array([2.0, -3.0]))
 LAMBDA = np.diag(HELD[1] ** -2.0)

@@ -12,12 +12,12 @@ from flights import linear_flight, truth
 
 from fleet.cli import main as fleet
 from fleet.contract import Outcome
-from fleet.pretend.drive import to_tlog
-from fleet.pretend.uav import PretendUav
-from twin_worker import experiment, paper
-from twin_worker.experiment import NAMES, Experiment, Plan, both_steps
-from twin_worker.flown import MODES, Flown, flown, mode_of
-from twin_worker.identify import AXES
+from fleet.simulator.flight.drive import to_tlog
+from fleet.simulator.flight.uav import PretendUav
+from twin_worker.identification.linear.linear_model import AXES
+from twin_worker.paper_experiments import __main__, experiment
+from twin_worker.paper_experiments.experiment import NAMES, Experiment, Plan, both_steps
+from twin_worker.paper_experiments.recorded_flights import MODES, Flown, flown, mode_of
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_the_paired_gain_is_of_pairs():
         runs = np.zeros((3, 9))
         return Experiment(1, 0.0, "turn", "turn", np.zeros(3), runs, runs, runs, fit, fit, Outcome.VERIFIED, "good")
 
-    rows = paper.summary([one(-80, -70), one(80, 90), one(-60, 70)])
+    rows = __main__.summary([one(-80, -70), one(80, 90), one(-60, 70)])
     assert rows["turn"]["paired_gain"] == 10.0 and rows["turn"]["share_better"] == 1.0
     assert rows["turn"]["fit"] == {"first": -60.0, "refined": 70.0}
     assert list(rows) == ["turn"] and rows["turn"]["sentence"] == "good"
@@ -115,7 +115,7 @@ def test_wrong_use_is_one_sentence(words, sentence, capfd):
 def test_too_short_a_recording_is_said(tmp_path, capfd):
     path = tmp_path / "short.tlog"
     to_tlog(path, [PretendUav(0, 5)], seconds=30, loss=0.0, seed=5)
-    assert paper.main(["identify", str(path)]) == 2
+    assert __main__.main(["identify", str(path)]) == 2
     assert "no 48 s of whole data; fly longer" in capfd.readouterr().err
 
 

@@ -11,9 +11,9 @@ from test_predict import AHEAD, PARAMS, level, situation
 from fleet.physics.dynamics import rates_of_change
 from fleet.physics.wrench import NAMES, OFFSETS, WIND
 from fleet.window import INPUTS
-from twin_worker.coupled import Coupled
-from twin_worker.plant import acting, finite, method, settled
-from twin_worker.predict import fly_ahead
+from twin_worker.identification.fixed_wing.derivatives_model import Coupled
+from twin_worker.identification.fixed_wing.plant import acting, finite, method, settled
+from twin_worker.prediction.closed_loop import fly_ahead
 
 CALM = aircraft(0, wind=(0.0, 0.0))
 SLOWER = PARAMS | {"AIRSPEED_CRUISE": V, "TRIM_ARSPD_CM": 100 * V}

@@ -9,9 +9,9 @@ from flights import DT, HERE, SPEED, T0, item, truth
 
 from fleet.autopilots import arduplane
 from fleet.window import Window
-from twin_worker import predict
-from twin_worker.predict import Onboard, Situation, fly_ahead, held
-from twin_worker.wind import WindFilter
+from twin_worker.estimation.wind_filter import WindFilter
+from twin_worker.prediction import closed_loop
+from twin_worker.prediction.closed_loop import Onboard, Situation, fly_ahead, held
 
 AHEAD = np.arange(0.0, 31.0)
 FLOWN_S = 30.0
@@ -78,8 +78,8 @@ def test_beyond_a_minute_a_path_ends_where_its_envelope_does(monkeypatch):
     far = np.concatenate([np.arange(0.0, 61.0), np.arange(64.0, 181.0, 4.0)])
 
     def left_after(seconds: float):
-        whole = predict.simulate
-        monkeypatch.setattr(predict, "simulate", lambda *flight: min(whole(*flight), int(seconds / flight[-2])))
+        whole = closed_loop.simulate
+        monkeypatch.setattr(closed_loop, "simulate", lambda *flight: min(whole(*flight), int(seconds / flight[-2])))
         got = fly_ahead(situation(), truth(), far)
         monkeypatch.undo()
         return got

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from flights import T0
 
-from fleet.airframe import servo_map
+from fleet.airframes.airframe import servo_map
 from fleet.contract import Array, Rows, Sample
-from fleet.telemetry.dialects.row import HIGHEST
-from twin_worker.history import History
-from twin_worker.preprocess import fill, lagrange, preprocess
+from fleet.telemetry.tables.row import HIGHEST
+from twin_worker.telemetry.history import History
+from twin_worker.telemetry.resample import fill, lagrange, preprocess
 
 PLAIN = servo_map({})
 CALM = np.zeros(3)

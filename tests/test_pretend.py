@@ -9,11 +9,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from fleet.cli import main
 from fleet.contract import Item
 from fleet.frames import to_geodetic, to_ned
-from fleet.pretend.jsbsim import CRUISE, DT, Aircraft
-from fleet.pretend.missions import DO_CHANGE_SPEED, DO_JUMP, HOME, LOITER_TURNS, WAYPOINT, mission
-from fleet.pretend.sensors import Sensors
-from fleet.pretend.uav import PretendUav
-from fleet.pretend.weather import GaussMarkov, Wind, turbulence_level
+from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.vehicle.jsbsim import CRUISE, DT, Aircraft
+from fleet.simulator.vehicle.missions import DO_CHANGE_SPEED, DO_JUMP, HOME, LOITER_TURNS, WAYPOINT, mission
+from fleet.simulator.vehicle.sensors import Sensors
+from fleet.simulator.vehicle.weather import GaussMarkov, Wind, turbulence_level
 
 ALOFT = np.array([100.0, -200.0, -120.0])
 
@@ -192,7 +192,7 @@ def test_sensor_errors_are_small_but_there() -> None:
 
 
 def test_an_endless_mission_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fleet.pretend.uav._LEGS_AHEAD", 4)
+    monkeypatch.setattr("fleet.simulator.flight.uav._LEGS_AHEAD", 4)
     uav = PretendUav(2, seed=9, wind=2.0, turbulence=0)
     seen = []
     for k in range(1, 90):

@@ -9,17 +9,17 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.cli import main
-from fleet.commands.fly import AIRCRAFT, AUTOPILOTS
+from fleet.commands.live.fly import AIRCRAFT, AUTOPILOTS
 from fleet.contract import Mission, Params, Sample, Status
 from fleet.frames import to_ned
 from fleet.mission import KIND, WAYPOINT
-from fleet.pretend import drive
-from fleet.pretend.jsbsim import Aircraft
-from fleet.pretend.missions import DO_JUMP, HOME, LOITER_TIME, mission
-from fleet.pretend.tuning import TUNINGS, tuned
-from fleet.pretend.types import TYPES
-from fleet.pretend.uav import PretendUav
-from fleet.telemetry.recordings import replay_messages
+from fleet.simulator.flight import drive
+from fleet.simulator.flight.tuning import TUNINGS, tuned
+from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.vehicle.jsbsim import Aircraft
+from fleet.simulator.vehicle.missions import DO_JUMP, HOME, LOITER_TIME, mission
+from fleet.simulator.vehicle.types import TYPES
+from fleet.telemetry.recording.recordings import replay_messages
 
 KINDS = sorted(TUNINGS)
 

@@ -12,14 +12,14 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from fleet.frames import to_ned
-from fleet.pretend import drive
-from fleet.pretend.jsbsim import DT
-from fleet.pretend.link import Link
-from fleet.pretend.mavlink import Voice
-from fleet.pretend.mavlink_said import AUTO, TELEMETRY
-from fleet.pretend.sensors import Servos
-from fleet.pretend.tuning import tuned
-from fleet.pretend.uav import PretendUav
+from fleet.simulator.flight import drive
+from fleet.simulator.flight.link import Link
+from fleet.simulator.flight.mavlink import Voice
+from fleet.simulator.flight.mavlink_messages import AUTO, TELEMETRY
+from fleet.simulator.flight.tuning import tuned
+from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.vehicle.jsbsim import DT
+from fleet.simulator.vehicle.sensors import Servos
 
 
 def heard(frames: list[bytes]) -> list:

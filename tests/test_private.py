@@ -9,10 +9,10 @@ import pytest
 from conftest import ROOT
 
 import fleet
-from fleet import private
 from fleet.access.papers import private as secret
-from fleet.examine import machine
-from fleet.prove.seal import seal, taken
+from fleet.blind_test.seal import seal, taken
+from fleet.health import machine
+from fleet.process import private_files
 from gateway.onboard.cache import Cache, Card
 from tests.bench.security import planted
 
@@ -67,13 +67,13 @@ def test_a_folder_the_user_names_is_honoured_and_checked(name: str, tmp_path: Pa
 
 def test_a_folder_below_one_that_others_may_change_is_refused_where_it_is_not_sticky(tmp_path: Path) -> None:
     above = tmp_path / "above"
-    below = private.folder(above / "below", "cache")
+    below = private_files.folder(above / "below", "cache")
     assert below.stat().st_mode & 0o777 == 0o700
     above.chmod(0o777)
     with pytest.raises(ValueError, match="above above it with mode 0777"):
-        private.folder(below, "cache")
+        private_files.folder(below, "cache")
     above.chmod(0o1777)
-    assert private.folder(below, "cache") == below
+    assert private_files.folder(below, "cache") == below
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
@@ -81,7 +81,7 @@ def test_what_belongs_to_another_is_refused(tmp_path: Path, monkeypatch: pytest.
     other = tmp_path / "other"
     other.mkdir(mode=0o700)
     os.chown(other, 12345, 12345)
-    assert "owner 12345, expected 0" in private.trouble(other)
+    assert "owner 12345, expected 0" in private_files.trouble(other)
     key = tmp_path / "key"
     seal(b"words", tmp_path / "sealed", key)
     os.chown(key, 12345, 12345)

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
+from fleet.blind_test.mark import Mark, Size, mark
+from fleet.blind_test.score import ASKED, met, score
+from fleet.blind_test.seal import digest, seal, taken, unseal
+from fleet.blind_test.shown import confusion, ordered
 from fleet.cli import main as fleet
-from fleet.prove.mark import Mark, Size, mark
-from fleet.prove.score import ASKED, met, score
-from fleet.prove.seal import digest, seal, taken, unseal
-from fleet.prove.shown import confusion, ordered
 
 
 def effect(name: str, **params: float) -> dict[str, Any]:

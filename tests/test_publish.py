@@ -7,13 +7,13 @@ import pytest
 from coupled_flights import SMALL, aircraft, fly, known
 from flights import published, truth
 
-from fleet.codec import decode, encode
+from fleet.bus.codec import decode, encode
 from fleet.contract import Model, Outcome, Verdict
 from fleet.physics.actuators import TAU
 from fleet.physics.wrench import NAMES
-from twin_worker.coupled import identify
-from twin_worker.memory import Twin
-from twin_worker.publish import derivatives_of, model_message
+from twin_worker.identification.fixed_wing.derivatives_model import identify
+from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps.model_message import derivatives_of, model_message
 
 WINDOW = fly(aircraft(0), 40.0)
 GOOD, BAD = (

@@ -15,15 +15,15 @@ from conftest import ROOT, unused_port
 
 from fleet import cli
 from fleet.access.entry import ROUTER
-from fleet.bus import connect, open_router
-from fleet.codec import Stamp
+from fleet.bus.bus_protocol import Answer
+from fleet.bus.codec import Stamp
+from fleet.bus.memory_bus import MemoryBus
+from fleet.bus.session import connect, open_router
 from fleet.contract import Array, Prediction, State
-from fleet.memory_bus import MemoryBus
-from fleet.talk import Answer
 from gateway import __main__ as gateway
 from twin_worker import __main__ as twin_worker
-from twin_worker.answers import Answers
-from twin_worker.worker import Worker
+from twin_worker.service.queries import Answers
+from twin_worker.service.worker import Worker
 from viewer import __main__ as viewer
 
 README = (ROOT / "README.md").read_text()

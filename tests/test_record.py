@@ -15,20 +15,20 @@ from examples import EXAMPLES, MESSAGES
 from fake_link import untimed
 from pretend_feed import STAMP, PretendFleet, T
 
-from fleet.bus import connect
-from fleet.codec import Stamp, encode, encoding
-from fleet.commands import record
-from fleet.commands.record import Recorder
+from fleet.bus.codec import Stamp, encode, encoding
+from fleet.bus.memory_bus import MemoryBus
+from fleet.bus.session import connect
+from fleet.commands.live import record
+from fleet.commands.live.record import Recorder
 from fleet.contract import TOPICS, Alert, FleetState, Message, Mission, Model, Prediction, Sample, Status
-from fleet.memory_bus import MemoryBus
-from fleet.telemetry.fleet_log import HOPELESS, Record
-from fleet.telemetry.fleet_news import NEWS, RESULTS
-from fleet.telemetry.recordings import Recording, replay_messages
-from gateway.publish import Publisher
-from gateway.pump import Pump
-from gateway.recorded import Replay
-from gateway.spec import read_spec
-from viewer.feed import Feed
+from fleet.telemetry.recording.fleet_log import HOPELESS, Record
+from fleet.telemetry.recording.fleet_news import NEWS, RESULTS
+from fleet.telemetry.recording.recordings import Recording, replay_messages
+from gateway.links.recorded import Replay
+from gateway.pipeline import Pump
+from gateway.publication.publish import Publisher
+from gateway.settings.link_spec import read_spec
+from viewer.store.store import Feed
 
 PATIENCE_S = 60.0
 

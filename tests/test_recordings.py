@@ -6,11 +6,11 @@ import pytest
 from talker import T0, Talker, assert_finite, of
 
 from fleet.contract import COLUMNS, Mission, Params, Sample, Status
-from fleet.telemetry.decode import Decoder
-from fleet.telemetry.heard import Heard
-from fleet.telemetry.opening import Source
-from fleet.telemetry.recordings import Recording, replay_messages
-from fleet.telemetry.tlog import Line, Tlog, backlog_offset, boot_s, restamped
+from fleet.telemetry.mavlink.parsing.decode import Decoder
+from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.recordings import Recording, replay_messages
+from fleet.telemetry.recording.tlog import Line, Tlog, backlog_offset, boot_s, restamped
 
 S02 = "sitl/s02_nominal_light_wind.tlog.xz"
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_subspace import closed_loop, system
 
-from twin_worker.refine import free_run, normal_equations, refine
+from twin_worker.identification.linear.prediction_error_method import free_run, normal_equations, refine
 
 
 def truth() -> np.ndarray:
@@ -94,7 +94,7 @@ def test_a_biased_start_gets_better_on_data_it_has_not_seen(seed):
 
 
 def test_subspace_then_prediction_error():
-    from twin_worker.subspace import subspace
+    from twin_worker.identification.linear.subspace import subspace
 
     y, u = closed_loop(3000, 0.3)
     A, B = subspace(y, u, np.ones(len(y), bool))

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from fleet.pretend.drive import to_tlog
-from fleet.pretend.uav import PretendUav
-from twin_worker.replay import WITHIN_S, main, replay, text
+from fleet.simulator.flight.drive import to_tlog
+from fleet.simulator.flight.uav import PretendUav
+from twin_worker.evaluation.replay import WITHIN_S, main, replay, text
 
 ROW = {"vehicle", "seconds", "methods", "first_verified_s", "scored", "within_10_percent", "verdict", "prediction"}
 

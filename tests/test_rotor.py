@@ -9,10 +9,10 @@ from flights import predictions, published
 from fleet.autopilots import copter
 from fleet.contract import Mission, Params, Prediction, Sample, State, Status
 from fleet.frames import to_ned
-from twin_worker.horizon import AHEAD
-from twin_worker.imm import imm
-from twin_worker.offline import run
-from twin_worker.twin import Twin
+from twin_worker.confidence.tube_and_horizon import AHEAD
+from twin_worker.evaluation.offline import run
+from twin_worker.prediction.turn_rate import imm
+from twin_worker.twin.step import Twin
 
 SEED = 106
 

@@ -9,8 +9,8 @@ import pytest
 from flights import item, predictions, published, rows
 
 from fleet.contract import Mission, Params, Sample, Status
-from twin_worker.offline import run
-from twin_worker.twin import Twin, advance
+from twin_worker.evaluation.offline import run
+from twin_worker.twin.step import Twin, advance
 
 NAN, INF = float("nan"), float("inf")
 ABSURD = (NAN, INF, -1e300, 1e300, 0.0, -1.0)

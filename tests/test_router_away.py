@@ -14,12 +14,12 @@ from pymavlink import mavutil
 from talker import T0, Talker
 from test_gateway import PATIENCE_S, Ear, udp_port
 
-from fleet.bus import connect, open_router
-from fleet.codec import Wire, encode
+from fleet.bus.codec import Wire, encode
+from fleet.bus.memory_bus import MemoryBus
+from fleet.bus.session import connect, open_router
 from fleet.contract import Account, Mission, Status
-from fleet.memory_bus import MemoryBus
-from gateway.publish import Publisher
-from gateway.router import LEASE_S, Way
+from gateway.publication.publish import Publisher
+from gateway.publication.router_session import LEASE_S, Way
 
 STATUS = Wire(Status, 7, encode(Status(uav=7, t=T0)))
 

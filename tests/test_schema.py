@@ -7,8 +7,8 @@ import pytest
 
 from fleet import cli
 from fleet.contract import COLUMNS, TOPICS, Prediction, WhatIf
-from fleet.examine import machine
-from fleet.examine.finding import Finding
+from fleet.health import machine
+from fleet.health.finding import Finding
 
 
 def shown(capsys: pytest.CaptureFixture[str], *argv: str) -> str:

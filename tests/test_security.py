@@ -15,9 +15,9 @@ from examples import EXAMPLES
 from fleet.access.entry import Entry
 from fleet.access.roles import LIVE, SAID
 from fleet.access.roles import ROOT as WIRE
-from fleet.bus import connect
-from fleet.codec import decode, encode, encoding
-from fleet.commands.router import text
+from fleet.bus.codec import decode, encode, encoding
+from fleet.bus.session import connect
+from fleet.commands.live.router import text
 from fleet.contract import TOPICS
 from tests.bench.security.attack import attack
 from tests.bench.security.bombs import bombs

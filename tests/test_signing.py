@@ -12,10 +12,10 @@ from oracle import ours
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Ears, Talker
 
-from fleet.telemetry.intake import Intake
-from gateway.gate import Gate, gates_of
-from gateway.signing import FORGED, REPLAYED, STALE, UNSIGNED, Signing, pick, read_keys, stamp_now
-from gateway.spec import read_spec
+from fleet.telemetry.mavlink.intake import Intake
+from gateway.admission.admission import Gate, gates_of
+from gateway.admission.signing import FORGED, REPLAYED, STALE, UNSIGNED, Signing, pick, read_keys, stamp_now
+from gateway.settings.link_spec import read_spec
 
 KEY, OTHER = bytes(range(32)), bytes(32)
 NOW = 37_000_000_000_000  # [10 us since 2015]

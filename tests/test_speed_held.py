@@ -5,8 +5,8 @@ import pytest
 from flights import T0
 
 from fleet.contract import Array, Rows, Sample
-from twin_worker.history import History
-from twin_worker.speed import held_to
+from twin_worker.estimation.airspeed_setpoint import held_to
+from twin_worker.telemetry.history import History
 
 SPEEDS = np.array([20.0, 22.5, 25.0])
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin_worker.subspace import FUTURE, PAST, subspace
+from twin_worker.identification.linear.subspace import FUTURE, PAST, subspace
 
 POLES = np.array([0.97, 0.85, 0.9 + 0.12j, 0.9 - 0.12j])
 FEEDBACK = np.array([[0.15, 0.0, 0.1, 0.0], [0.0, 0.2, 0.0, 0.1]])

@@ -17,18 +17,18 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from fleet.bus import connect
-from fleet.codec import Stamp, encode
+from fleet.bus.bus_protocol import Bus
+from fleet.bus.codec import Stamp, encode
+from fleet.bus.memory_bus import MemoryBus
+from fleet.bus.session import connect
 from fleet.contract import Claim, Handover, History, Message, Mission, Model, Prediction, Sample, Status, Wanted
-from fleet.memory_bus import MemoryBus
-from fleet.talk import Bus
-from gateway.publish import Publisher
+from gateway.publication.publish import Publisher
 from tests.bench.asking.answerer import prediction
-from twin_worker.claims.protocol import Claiming
-from twin_worker.claims.tape import read
-from twin_worker.claims.tree import pack
-from twin_worker.engine.pace import Pace
-from twin_worker.worker import Worker
+from twin_worker.ownership.history_decoder import read
+from twin_worker.ownership.protocol import Claiming
+from twin_worker.ownership.typed_serialization import pack
+from twin_worker.service.worker import Worker
+from twin_worker.twin.state.schedule import Pace
 
 PATIENCE_S = 120.0  # an upper bound on a busy machine
 OTHER = "00000000000000aa"

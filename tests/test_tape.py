@@ -12,9 +12,9 @@ import pytest
 from pymavlink import mavutil
 from talker import T0, Talker
 
-from fleet.telemetry.heard import Heard
-from fleet.telemetry.recordings import replay_messages
-from gateway.link import Batch
+from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.recording.recordings import replay_messages
+from gateway.links.link import Batch
 from gateway.record import recorder as module
 from gateway.record.recorder import Recorder, Tapped
 from gateway.record.size import in_words, read_size

@@ -6,12 +6,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Ears, Talker, assert_finite, of
 
 from fleet.contract import COLUMNS, Sample, Status
-from fleet.telemetry.decode import IDS, Decoder
-from fleet.telemetry.dialects.mavlink import TABLE, own_seconds
-from fleet.telemetry.dialects.row import HIGHEST, believable
-from fleet.telemetry.heard import Heard
-from fleet.telemetry.intake import Intake
-from fleet.telemetry.settle import RANKS, YIELD_S
+from fleet.telemetry.mavlink.arrays.row_arbiter import RANKS, YIELD_S
+from fleet.telemetry.mavlink.intake import Intake
+from fleet.telemetry.mavlink.parsing.decode import IDS, Decoder
+from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.tables.mavlink import TABLE, own_seconds
+from fleet.telemetry.tables.row import HIGHEST, believable
 
 
 def columns(message: str, field: str, sent, autopilot: str = "ardupilot") -> dict[str, float]:

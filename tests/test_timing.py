@@ -6,9 +6,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from talker import T0, Talker, of
 
 from fleet.contract import Status
-from fleet.telemetry import clock as c
-from fleet.telemetry.intake import Intake
-from fleet.telemetry.timing import Timing
+from fleet.telemetry.mavlink.intake import Intake
+from fleet.telemetry.mavlink.timing import Timing
+from fleet.telemetry.tables import clock as c
 
 
 def flight(seconds, drift=0.0, jitter_s=0.05, boot=100.0, seed=1):

@@ -9,7 +9,7 @@ import pytest
 from flights import drive, predictions, published, shifted, status
 
 from fleet.autopilots import laws
-from fleet.codec import encode
+from fleet.bus.codec import encode
 from fleet.contract import (
     Mission,
     Model,
@@ -18,9 +18,9 @@ from fleet.contract import (
     Status,
 )
 from tests.flights import ROUTE
-from twin_worker import memory
-from twin_worker.offline import run
-from twin_worker.twin import Twin, advance, fleet_row
+from twin_worker.evaluation.offline import run
+from twin_worker.twin.state import state
+from twin_worker.twin.step import Twin, advance, fleet_row
 
 FLOWN_S = 100.0
 
@@ -76,8 +76,8 @@ def test_the_prediction_comes_true_for_a_few_seconds(flown):
 def test_an_offline_run_makes_one_twin_for_each_aircraft(monkeypatch):
     """Once one was made, and its airframe's TOML parsed, for every message."""
     loads = []
-    load = memory.load
-    monkeypatch.setattr(memory, "load", lambda which: loads.append(which) or load(which))
+    load = state.load
+    monkeypatch.setattr(state, "load", lambda which: loads.append(which) or load(which))
     said = [Status(uav=uav, t=f.T0 + k, mode="AUTO") for k in range(50) for uav in (1, 2)]
     assert list(run(said, twins := {})) == []
     assert sorted(twins) == [1, 2] and len(loads) == 2

@@ -8,7 +8,7 @@ from flights import HERE, drive, item, predictions, published, shifted, status
 
 from fleet.contract import SENTENCES, Alert, AlertKind, Event, Link, Mission, Sample, State
 from tests.flights import ROUTE
-from twin_worker.twin import Twin, advance, fleet_row
+from twin_worker.twin.step import Twin, advance, fleet_row
 
 # --- the link --------------------------------------------------------------------------------------------------------
 

@@ -11,10 +11,10 @@ from pyulog import ULog
 from ulog_writer import START_US, TRUTH, UTC_US, flight, read, release, rows, said, ulog
 
 from fleet.contract import COLUMNS
-from fleet.telemetry import ulog_sieve
-from fleet.telemetry.dialects.ulog import ROWS, TABLE, TOPICS, mode
-from fleet.telemetry.ulog import UlogLog, _lay
-from fleet.telemetry.ulog_topic import Topic, in_order
+from fleet.telemetry.onboard_logs.ulog import sieve
+from fleet.telemetry.onboard_logs.ulog.reader import UlogLog, _lay
+from fleet.telemetry.onboard_logs.ulog.topic import Topic, in_order
+from fleet.telemetry.tables.ulog import ROWS, TABLE, TOPICS, mode
 
 VERSIONS = ((1, 6), (1, 8), (1, 11), (1, 13), (1, 14), (1, 16))
 SAMPLE = "real/px4_vtol_cubeorange_6s_reader_test.ulg"
@@ -84,7 +84,7 @@ def test_stamps_before_the_start_and_the_bogus_last_one_do_not_stretch_the_sampl
 
 def test_the_sample_reads_equal_to_plain_pyulog(sample_bytes):
     plain = ULog(io.BytesIO(sample_bytes), sorted(TOPICS - {"mission"}))
-    sieved = ULog(ulog_sieve.Sieve(lambda: io.BytesIO(sample_bytes), TOPICS, []), sorted(TOPICS))
+    sieved = ULog(sieve.Sieve(lambda: io.BytesIO(sample_bytes), TOPICS, []), sorted(TOPICS))
     assert plain.data_list == sieved.data_list
     assert plain.initial_parameters == sieved.initial_parameters
     assert plain.logged_messages == sieved.logged_messages

@@ -10,10 +10,10 @@ from flights import truth
 
 from fleet.contract import Outcome
 from fleet.physics.wrench import NAMES, WIND
-from twin_worker.coupled import Coupled
-from twin_worker.unseen import Unseen
-from twin_worker.verify import AXES, fits_at, mean, told, verify
-from twin_worker.white import LAGS, whiteness
+from twin_worker.identification.fixed_wing.derivatives_model import Coupled
+from twin_worker.validation.held_out import Unseen
+from twin_worker.validation.verify import AXES, fits_at, mean, told, verify
+from twin_worker.validation.whiteness import LAGS, whiteness
 
 START = 500
 

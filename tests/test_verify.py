@@ -9,9 +9,9 @@ from flights import linear_flight, standstill, truth
 
 from fleet.contract import Outcome
 from fleet.window import STATES
-from twin_worker.identify import Axis
-from twin_worker.unseen import Unseen
-from twin_worker.verify import _QUIET, fit_percent, fits_at, hold, mean, verify
+from twin_worker.identification.linear.linear_model import Axis
+from twin_worker.validation.held_out import Unseen
+from twin_worker.validation.verify import _QUIET, fit_percent, fits_at, hold, mean, verify
 
 
 def blurred(share: float, seed: int = 0):

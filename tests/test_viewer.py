@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from pretend_feed import HOME, HOSTILE, STAMP, Clock, PretendUav, T, feed_of, fields
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import (
     Alert,
     AlertKind,
@@ -22,20 +23,19 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin, body_to_ned, to_geodetic
-from fleet.memory_bus import MemoryBus
-from viewer.camera import FOV, frame, near
-from viewer.charts import band, scale
-from viewer.chronicle import listing
-from viewer.detail import about, facts, law, why
-from viewer.feed import Feed
-from viewer.palette import DARK, LIGHT, line_colour, rgb, shown_line
-from viewer.place import UNIT_M, Place, scene_quat
-from viewer.routes import route
-from viewer.scene import DASHES, cut_at_horizon
-from viewer.shapes import aircraft, diamond, rotorcraft
-from viewer.tube import curtain, marks, rings, skin
-from viewer.view import ROOM, outgrown
-from viewer.words import empty, summary, table
+from viewer.panels.charts import band, scale
+from viewer.panels.detail import about, facts, law, why
+from viewer.panels.event_list import listing
+from viewer.scene.camera import FOV, frame, near
+from viewer.scene.routes import route
+from viewer.scene.scene import DASHES, cut_at_horizon
+from viewer.scene.selection.tube import curtain, marks, rings, skin
+from viewer.server.view import ROOM, outgrown
+from viewer.store.place import UNIT_M, Place, scene_quat
+from viewer.store.store import Feed
+from viewer.text.words import empty, summary, table
+from viewer.theme.palette import DARK, LIGHT, line_colour, rgb, shown_line
+from viewer.theme.shapes import aircraft, diamond, rotorcraft
 
 
 @pytest.fixture

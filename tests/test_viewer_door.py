@@ -21,9 +21,9 @@ from websockets.http11 import Request
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-from fleet.memory_bus import MemoryBus
-from viewer.app import App
-from viewer.door import POLICY, REFUSED, VIOLATION, doorman, quiet, serve
+from fleet.bus.memory_bus import MemoryBus
+from viewer.browser.http_server import POLICY, REFUSED, VIOLATION, doorman, quiet, serve
+from viewer.server.app import App
 
 PASSED = "the library's own answer"
 
@@ -177,7 +177,7 @@ def test_a_malformed_or_refused_message_closes_its_page_with_one_line(server, ba
         assert close_code(one) == VIOLATION
         other.send(packed(_messages.GuiUpdateMessage, uuid="gone", updates={}))  # the others go on
         other.ping().wait(PATIENCE_S)
-    (line,) = [record for record in caplog.records if record.name == "viewer.door"]
+    (line,) = [record for record in caplog.records if record.name == "viewer.browser.http_server"]
     assert line.getMessage().startswith("page: found ") and line.exc_info is None
     assert "Traceback" not in caplog.text + "".join(capfd.readouterr())
 

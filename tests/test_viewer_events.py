@@ -20,11 +20,11 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.contract import Event as Happened
-from viewer.chronicle import ROWS, listing
-from viewer.events import MAX_EVENTS, MAX_RAISED, Event, Kind, closed, merged
-from viewer.inbox import Head
-from viewer.palette import DARK, LIGHT, MARK
-from viewer.tell import MAX_STEPS, MAX_WORDS, Known, hear
+from viewer.panels.event_list import ROWS, listing
+from viewer.store.event_detection import MAX_STEPS, MAX_WORDS, Known, hear
+from viewer.store.received.inbox import Head
+from viewer.theme.events import MAX_EVENTS, MAX_RAISED, Event, Kind, closed, merged
+from viewer.theme.palette import DARK, LIGHT, MARK
 
 
 def told(*messages) -> list[tuple[float, Kind, str]]:

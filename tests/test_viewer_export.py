@@ -18,7 +18,7 @@ from viewer.export.film import Film
 from viewer.export.panel import Export
 from viewer.export.picture import picture, png
 from viewer.export.table import COLUMNS, plain, table
-from viewer.palette import DARK, rgb
+from viewer.theme.palette import DARK, rgb
 
 
 @pytest.fixture

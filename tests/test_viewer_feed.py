@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from pretend_feed import HOME, STAMP, Clock, PretendFleet, PretendUav, T, feed_of, fields
 
-from fleet.codec import Stamp
+from fleet.bus.codec import Stamp
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Alert, AlertKind, Array, FleetRow, FleetState, Mission, Prediction, Rows, Sample, State
 from fleet.frames import Origin
-from fleet.memory_bus import MemoryBus
-from viewer.detail import why
-from viewer.events import MAX_RAISED
-from viewer.feed import GIVE_UP_S, Feed
-from viewer.place import UNIT_M
-from viewer.vehicle import ABANDONED_S, SILENT_S
+from viewer.panels.detail import why
+from viewer.store.place import UNIT_M
+from viewer.store.store import GIVE_UP_S, Feed
+from viewer.store.vehicle import ABANDONED_S, SILENT_S
+from viewer.theme.events import MAX_RAISED
 
 
 @pytest.fixture

@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 from pretend_feed import STAMP, Clock, PretendUav, T, feed_of
 
-from fleet.codec import encode, encoding
+from fleet.bus.codec import encode, encoding
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Array, Mission, Rows, Sample, Status
 from fleet.frames import Origin
-from fleet.memory_bus import MemoryBus
-from viewer.bygone import Bygone
-from viewer.errors import AHEADS_S, by_ahead, errors
-from viewer.events import Kind
-from viewer.feed import WAIT_S, Feed
-from viewer.flock import CROWD, LOST, MINUTE, MISMATCH, TURNS, Flock, look
-from viewer.inbox import Inbox
-from viewer.labels import MOST, Sight, Tag, fitting
-from viewer.numerals import written
-from viewer.palette import DARK
-from viewer.plan import seq_in_force
-from viewer.since import Away, missed, since
-from viewer.tube import BAND_SIGMA, samples
+from viewer.scene.fleet_arrays import CROWD, LOST, MINUTE, MISMATCH, TURNS, Flock, look
+from viewer.scene.labels import MOST, Sight, Tag, fitting
+from viewer.scene.selection.plan import seq_in_force
+from viewer.scene.selection.tube import BAND_SIGMA, samples
+from viewer.store.backfill import Bygone
+from viewer.store.errors import AHEADS_S, by_ahead, errors
+from viewer.store.received.inbox import Inbox
+from viewer.store.store import WAIT_S, Feed
+from viewer.text.missed_events import Away, missed, since
+from viewer.theme.events import Kind
+from viewer.theme.numerals import written
+from viewer.theme.palette import DARK
 
 SIGHT = Sight(np.array([0.0, -100.0, 50.0]), np.zeros(3), np.radians(50), 1.6)
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from pretend_feed import Clock, PretendUav, T
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import History, Sample
-from fleet.memory_bus import MemoryBus
-from viewer.bygone import FEW, Bygone
-from viewer.feed import Feed
-from viewer.labels import Sight, Tag, fitting
-from viewer.strokes import rounded
-from viewer.track import TRAIL_ROWS
+from viewer.scene.labels import Sight, Tag, fitting
+from viewer.scene.strokes import rounded
+from viewer.store.backfill import FEW, Bygone
+from viewer.store.store import Feed
+from viewer.store.track import TRAIL_ROWS
 
 BEFORE_S, HZ = 120.0, 10.0
 

@@ -6,11 +6,11 @@ import pytest
 from pretend_feed import HOSTILE, STAMP, Clock, T, feed_of
 
 from fleet.contract import Cause, Found, Mismatch
-from viewer import mismatch
-from viewer.detail import about
-from viewer.events import Kind
-from viewer.palette import DARK
-from viewer.words import alerts, severity, table
+from viewer.panels.detail import about
+from viewer.text import mismatch_text
+from viewer.text.words import alerts, severity, table
+from viewer.theme.events import Kind
+from viewer.theme.palette import DARK
 
 TRACK = np.column_stack([T + np.arange(100.0), np.arange(100.0), np.zeros(100), np.full(100, 9.0)])
 
@@ -54,7 +54,7 @@ def test_table_and_alerts_mark_the_aircraft(scene):
     bus.publish(told(outcome=Found.SUSPECTED, t=T + 1.0), STAMP)
     assert "control effectiveness" not in page(feed, clock)
     assert "mismatch suspected" in about(feed.one(2), DARK, clock())
-    assert not mismatch.in_force(feed.one(2).mismatch)
+    assert not mismatch_text.in_force(feed.one(2).mismatch)
 
 
 def test_hostile_words_stay_words(scene):
@@ -74,24 +74,24 @@ def test_a_mismatch_is_an_event_once(scene):
 
 
 def test_segments_lie_on_the_flown_path():
-    drawn = mismatch.lines(told((T + 20.0, T + 30.0)), TRACK)
+    drawn = mismatch_text.lines(told((T + 20.0, T + 30.0)), TRACK)
     assert drawn[0, 0, 0] == pytest.approx(20.0) and drawn[-1, 1, 0] == pytest.approx(30.0)
-    assert mismatch.place(told((T + 20.0, T + 30.0)), TRACK) == pytest.approx([20.0, 0.0, 9.0])
-    goes_on = mismatch.lines(told((T + 50.0, T + 98.0)), TRACK)
+    assert mismatch_text.place(told((T + 20.0, T + 30.0)), TRACK) == pytest.approx([20.0, 0.0, 9.0])
+    goes_on = mismatch_text.lines(told((T + 50.0, T + 98.0)), TRACK)
     assert goes_on[-1, 1, 0] == pytest.approx(99.0)  # up to the aircraft
-    assert len(mismatch.lines(told((T - 500.0, T - 400.0)), TRACK)) == 0
-    assert len(mismatch.lines(None, TRACK)) == len(mismatch.lines(told((T, T + 9.0)), TRACK[:1])) == 0
+    assert len(mismatch_text.lines(told((T - 500.0, T - 400.0)), TRACK)) == 0
+    assert len(mismatch_text.lines(None, TRACK)) == len(mismatch_text.lines(told((T, T + 9.0)), TRACK[:1])) == 0
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e300])
 def test_absurd_times_draw_nothing_absurd(bad):
     for segment in ((bad, T + 9.0), (T, bad), (bad, bad)):
         found = told(*(segment,) * 50)
-        assert np.isfinite(mismatch.lines(found, TRACK)).all()
-        assert len(mismatch.lines(found, TRACK)) <= mismatch.MOST * mismatch.MOST_POINTS
-    assert mismatch.place(told((bad, T)), TRACK) is None
+        assert np.isfinite(mismatch_text.lines(found, TRACK)).all()
+        assert len(mismatch_text.lines(found, TRACK)) <= mismatch_text.MOST * mismatch_text.MOST_POINTS
+    assert mismatch_text.place(told((bad, T)), TRACK) is None
 
 
 def test_a_long_sentence_is_cut():
     found = msgspec.structs.replace(told(), sentence="x" * 100_000)
-    assert len(mismatch.card(found, DARK)) < 2_000
+    assert len(mismatch_text.card(found, DARK)) < 2_000

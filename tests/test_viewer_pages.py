@@ -13,16 +13,16 @@ import pytest
 from conftest import unused_port
 from pretend_feed import PretendFleet
 
-from fleet.memory_bus import MemoryBus
+from fleet.bus.memory_bus import MemoryBus
 from tests.bench.viewing.watcher import Watcher
-from viewer.app import App
-from viewer.clicks import click, clicked
-from viewer.door import quiet, serve
-from viewer.palette import DARK, LIGHT
-from viewer.panels import NOBODY
-from viewer.remembered import Remembered
-from viewer.view import View
-from viewer.words import table
+from viewer.browser.http_server import quiet, serve
+from viewer.browser.remembered import Remembered
+from viewer.panels.panels import NOBODY
+from viewer.server.app import App
+from viewer.server.view import View
+from viewer.text.clicks import click, clicked
+from viewer.text.words import table
+from viewer.theme.palette import DARK, LIGHT
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_a_defect_of_one_page_is_said_there_and_in_the_log_and_the_others_go_on(
     site.run()
     assert "KeyError: &#x27;&lt;b&gt;seven" in broken(first) and "Reload" in broken(first)
     assert broken(second) == "" and drawn.call_count > 5
-    said = [record for record in caplog.records if record.name == "viewer.app"]
+    said = [record for record in caplog.records if record.name == "viewer.server.app"]
     assert len(said) == 1 and said[0].exc_info and f"page {first.client.client_id}" in said[0].message
     del first.scene.draw_heads
     site.run()
@@ -73,7 +73,7 @@ def test_a_page_that_cannot_be_opened_is_left_alone(site, caplog, monkeypatch) -
     number, other = sorted(site.app.views)
     del site.app.views[number]
     tried = MagicMock(side_effect=RuntimeError("no room"))
-    monkeypatch.setattr("viewer.app.View", tried)
+    monkeypatch.setattr("viewer.server.app.View", tried)
     site.run()
     assert tried.call_count == 1 and list(site.app.views) == [other]
     assert f"page {number} could not be opened" in caplog.text
@@ -125,7 +125,7 @@ def test_nothing_is_held_back_while_lists_are_made(site, monkeypatch) -> None:
         held.append(buffer.atomic_counter)
         return table(*given, **named)
 
-    monkeypatch.setattr("viewer.panels.table", made)
+    monkeypatch.setattr("viewer.panels.panels.table", made)
     site.run()
     assert held and not any(held)
 

@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from pretend_feed import STAMP, Clock, PretendUav, T, feed_of
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Account, Alert, AlertKind, State, Status
-from fleet.memory_bus import MemoryBus
-from fleet.telemetry.onboard_news import UNDATED_S
-from fleet.telemetry.recordings import Recording
-from viewer import datatime
-from viewer.datatime import DataTime, day, is_dated, moment, stamp, times
-from viewer.detail import about, facts
-from viewer.events import Event, Kind
-from viewer.feed import Feed
-from viewer.palette import DARK
-from viewer.pins import LABELS, MINOR, apart, caption
-from viewer.track import POINTS, Track, placed
-from viewer.vehicle import ENDED_S, SILENT_S
-from viewer.words import severity, standing, summary
+from fleet.telemetry.onboard_logs.onboard_news import UNDATED_S
+from fleet.telemetry.recording.recordings import Recording
+from viewer.panels.detail import about, facts
+from viewer.scene.selection.pins import LABELS, MINOR, apart, caption
+from viewer.store.received import datatime
+from viewer.store.received.datatime import DataTime, day, is_dated, moment, stamp, times
+from viewer.store.store import Feed
+from viewer.store.track import POINTS, Track, placed
+from viewer.store.vehicle import ENDED_S, SILENT_S
+from viewer.text.words import severity, standing, summary
+from viewer.theme.events import Event, Kind
+from viewer.theme.palette import DARK
 
 REPLAY = "replay:flight.tlog?speed=4"
 NAN = float("nan")

@@ -9,21 +9,21 @@ import pytest
 from pretend_feed import HOSTILE, STAMP, Clock, PretendUav, T, feed_of
 from test_gateway import flight
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Account, LinkAccount, Status
-from fleet.memory_bus import MemoryBus
-from gateway.pump import Pump
-from gateway.recorded import Replay
-from gateway.spec import read_spec
-from viewer import feed as feeds
-from viewer.camera import start_at
-from viewer.detail import about
-from viewer.feed import Feed
-from viewer.ground import RINGS_M
-from viewer.labels import Sight
-from viewer.palette import DARK
-from viewer.place import UNIT_M
-from viewer.states import LETTERS, Router, notices
-from viewer.words import empty, summary
+from gateway.links.recorded import Replay
+from gateway.pipeline import Pump
+from gateway.settings.link_spec import read_spec
+from viewer.panels.detail import about
+from viewer.scene.camera import start_at
+from viewer.scene.ground import RINGS_M
+from viewer.scene.labels import Sight
+from viewer.store import store as feeds
+from viewer.store.place import UNIT_M
+from viewer.store.states import LETTERS, Router, notices
+from viewer.store.store import Feed
+from viewer.text.words import empty, summary
+from viewer.theme.palette import DARK
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ import pytest
 from pretend_feed import Clock, T, feed_of
 
 from fleet.contract import Array, Prediction, State, Status
-from viewer.datatime import DataTime
-from viewer.forecast import Forecast
-from viewer.timeline.tape import BARE_BYTES, KEPT_S, MAX_TOLD, ROOM, TOLD_S, Tape
+from viewer.store.forecast import Forecast
+from viewer.store.received.datatime import DataTime
+from viewer.timeline.recording import BARE_BYTES, KEPT_S, MAX_TOLD, ROOM, TOLD_S, Tape
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ import pytest
 from PIL import Image, TiffImagePlugin
 from pretend_feed import HOME
 
-from viewer.palette import DARK
-from viewer.place import UNIT_M, Place
-from viewer.terrain.land import MOST_CONTOURS, Land, Shape, contours
-from viewer.terrain.raster import KEYS, NO_DATA, SCALE, TIEPOINT, read
-from viewer.terrain.utm import to_utm
+from viewer.scene.terrain.land import MOST_CONTOURS, Land, Shape, contours
+from viewer.scene.terrain.raster import KEYS, NO_DATA, SCALE, TIEPOINT, read
+from viewer.scene.terrain.utm import to_utm
+from viewer.store.place import UNIT_M, Place
+from viewer.theme.palette import DARK
 
 LAT, LON = HOME.lat_e7 * 1e-7, HOME.lon_e7 * 1e-7
 

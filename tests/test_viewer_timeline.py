@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 from pretend_feed import HOSTILE, Clock, PretendFleet, PretendUav, T, feed_of
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Account, Alert, AlertKind, State, Status
-from fleet.memory_bus import MemoryBus
-from viewer.detail import about, facts
-from viewer.events import Event, Kind
-from viewer.feed import Feed
-from viewer.flock import Flock
-from viewer.forecast import Forecast
-from viewer.palette import DARK
+from viewer.panels.detail import about, facts
+from viewer.scene.fleet_arrays import Flock
+from viewer.store.forecast import Forecast
+from viewer.store.store import Feed
+from viewer.store.vehicle import Vehicle
+from viewer.text.words import summary, table
+from viewer.theme.events import Event, Kind
+from viewer.theme.palette import DARK
 from viewer.timeline import compare, strip
 from viewer.timeline.deck import Timeline
 from viewer.timeline.panel import STEPS, TRANSPORT
 from viewer.timeline.past import Past
 from viewer.timeline.player import Player, Span
-from viewer.timeline.tape import KEPT_S, MAX_ROWS, TOLD_S, Tape
-from viewer.timeline.tapes import Tapes
-from viewer.vehicle import Vehicle
-from viewer.words import summary, table
+from viewer.timeline.recording import KEPT_S, MAX_ROWS, TOLD_S, Tape
+from viewer.timeline.recordings import Tapes
 
 
 @pytest.fixture

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from flights import item
 
-from fleet.codec import encode
+from fleet.bus.codec import encode
 from fleet.contract import MAX_ITEMS, Prediction, WhatIf, WhatIfStart
 from fleet.frames import to_geodetic
-from twin_worker.foresee import foresee
-from twin_worker.memory import Twin
+from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps.predict_step import foresee
 from twin_worker.whatif.answer import answer
 
 NAN, INF = float("nan"), float("inf")
@@ -194,6 +194,6 @@ def test_a_defect_is_one_sentence_and_the_next_question_is_answered(holder, monk
         raise ZeroDivisionError("a defect")
 
     with monkeypatch.context() as m, pytest.raises(ValueError, match=r"uav-1 met a defect \(a defect\).*report it"):
-        m.setattr("twin_worker.answers.answer", broken)
+        m.setattr("twin_worker.service.queries.answer", broken)
         holder.bus.inquire(Prediction, 1, msgspec.msgpack.encode(WhatIf()))
     assert holder.bus.inquire(Prediction, 1, msgspec.msgpack.encode(WhatIf())) is not None

@@ -8,9 +8,9 @@ import pytest
 from odd_missions import ODD
 
 from fleet.contract import MAX_ITEMS, Prediction, WhatIf
-from twin_worker.memory import Twin
+from twin_worker.twin.state.state import Twin
 from twin_worker.whatif.answer import answer
-from twin_worker.whatif.question import MOST_BYTES
+from twin_worker.whatif.query import MOST_BYTES
 
 NAN, INF = float("nan"), float("inf")
 PLACE = {"lat_e7": 470_000_000, "lon_e7": 80_000_000, "alt_mm": 500_000}

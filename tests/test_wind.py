@@ -5,7 +5,7 @@ from math import cos, sin
 import numpy as np
 import pytest
 
-from twin_worker.wind import WindFilter
+from twin_worker.estimation.wind_filter import WindFilter
 
 WIND = np.array([5.0, -3.0])
 VA, RATE = 20.0, 0.2

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from flights import item
 
-from fleet.codec import Stamp, decode, encode
+from fleet.bus.codec import Stamp, decode, encode
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import (
     Array,
     FleetState,
@@ -20,12 +21,11 @@ from fleet.contract import (
     State,
     Status,
 )
-from fleet.memory_bus import MemoryBus
-from twin_worker import worker as live
-from twin_worker.answers import told as told_of
-from twin_worker.claims.keeper import INBOX
-from twin_worker.whatif.grid import resample, wanted
-from twin_worker.worker import Worker
+from twin_worker.ownership.twin_store import INBOX
+from twin_worker.service import worker as live
+from twin_worker.service.queries import told as told_of
+from twin_worker.service.worker import Worker
+from twin_worker.whatif.resample import resample, wanted
 
 NAN = float("nan")
 

@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 
-from fleet.telemetry.ulog import UlogLog
+from fleet.telemetry.onboard_logs.ulog.reader import UlogLog
 
 MAGIC = b"ULog\x01\x12\x35\x01"
 START_US = 10_000_000

@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING
 
 from fleet.access.roles import WORKER
 from fleet.airframes import GENERIC, load
-from fleet.bus import connect
+from fleet.bus.session import connect
 from fleet.cli import guarded, id_range, parser_for, stop_on_signal
 from fleet.config import entry, router_arguments
 from fleet.contract import FleetState
-from fleet.heap import give_back
-from fleet.logs import log_arguments, say
 from fleet.metrics import address, served
-from twin_worker.engine.many import run_many
-from twin_worker.engine.pace import read_pace
+from fleet.process.logs import log_arguments, say
+from fleet.process.malloc_trim import give_back
+from twin_worker.service.processes import run_many
+from twin_worker.twin.state.schedule import read_pace
 
 if TYPE_CHECKING:
-    from twin_worker.diagnose.baseline import Baseline
+    from twin_worker.diagnosis.model.baseline import Baseline
 
 SWITCH_S = 5e-4  # how long a thread of the bus waits for the interpreter while another holds it [s]
 END_S = 10.0  # after which a worker that was told to end does so in any case [s]
@@ -61,8 +61,8 @@ def _bases(given: list[str]) -> "dict[int, Baseline]":
     """
     if not given:
         return {}
-    from twin_worker.diagnose.keep import load as load_baseline
-    from twin_worker.mismatch.live import ALL
+    from twin_worker.diagnosis.output.keep import load as load_baseline
+    from twin_worker.mismatch.coordinator import ALL
 
     pairs = [text.partition("=") if text.partition("=")[0].isdecimal() else ("", "", text) for text in given]
     return {int(uav) if uav else ALL: load_baseline(Path(path))[0] for uav, _, path in pairs}
@@ -89,7 +89,7 @@ def _get_ready() -> None:
     if sys.platform == "linux":
         me = threading.get_native_id()
         os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) + BEHIND)
-    from twin_worker.warm import warm_up  # numba is slow to import: say what happens first
+    from twin_worker.service.warm_up import warm_up  # numba is slow to import: say what happens first
 
     warm_up()  # before anything is claimed: who compiles cannot take over
 
@@ -102,11 +102,11 @@ def _run(args: argparse.Namespace) -> int:
         bus.publish(FleetState(t=0.0, sentence="compiling the twin's physics, once"))
         with ThreadPoolExecutor(1) as hand:  # a thread may give its priority away, and never has it back
             hand.submit(_get_ready).result()
-        from twin_worker.conflict.separation import Separation
-        from twin_worker.metrics import counters
-        from twin_worker.mismatch.background import Background
-        from twin_worker.mismatch.live import Live
-        from twin_worker.worker import Worker
+        from twin_worker.alerts.conflict_probability import Separation
+        from twin_worker.mismatch.coordinator import Live
+        from twin_worker.mismatch.process import Background
+        from twin_worker.service.metrics import counters
+        from twin_worker.service.worker import Worker
 
         aside = Background()
         worker = Worker(

@@ -5,15 +5,15 @@ import gc
 import sys
 
 from fleet.access.roles import VIEWER
-from fleet.bus import connect
+from fleet.bus.session import connect
 from fleet.cli import guarded, parser_for, stop_on_signal
 from fleet.config import entry, router_arguments
-from fleet.heap import give_back
-from fleet.logs import log_arguments, say
-from viewer.app import App
-from viewer.door import quiet, serve
-from viewer.terrain.land import Land
-from viewer.terrain.raster import read
+from fleet.process.logs import log_arguments, say
+from fleet.process.malloc_trim import give_back
+from viewer.browser.http_server import quiet, serve
+from viewer.scene.terrain.land import Land
+from viewer.scene.terrain.raster import read
+from viewer.server.app import App
 
 RARELY = 50_000, 10, 10  # of a crowd some ten thousand objects come and go every second, and next to none in circles
 LARGE = 48 * 1024  # less than the bus receives into: one message that waits keeps all of such a block [bytes]

@@ -1,12 +1,12 @@
 """A link as it was asked for -> the link."""
 
-from fleet.telemetry.ids import Ids
-from gateway.link import Link
-from gateway.links.dialled import Dialled
+from fleet.telemetry.recording.ids import Ids
+from gateway.links.link import Link
+from gateway.links.recorded import Replay
+from gateway.links.stream_client import Dialled
 from gateway.links.tcp_listener import TcpListener
 from gateway.links.udp import Udp
-from gateway.recorded import Replay
-from gateway.spec import Spec
+from gateway.settings.link_spec import Spec
 
 
 def open_link(spec: Spec, ids: Ids) -> Link:

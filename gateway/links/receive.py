@@ -14,8 +14,8 @@ from typing import Protocol
 import numba as nb
 import numpy as np
 
-from fleet.telemetry.heard import Heard, tight
-from gateway.link import wall
+from fleet.telemetry.mavlink.parsing.received import Heard, tight
+from gateway.links.link import wall
 
 MOST = 256  # datagrams taken at once; of the longest ones they are 16 MB
 LONGEST = 65_536  # no datagram is longer [bytes]

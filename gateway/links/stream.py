@@ -7,7 +7,7 @@ from typing import Any
 
 import serial
 
-from gateway.links.outbox import Outbox
+from gateway.links.send_queue import Outbox
 
 CHUNK = 65_536  # bytes read at once
 CONNECT_S = 3.0  # patience of one try [s]

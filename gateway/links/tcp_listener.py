@@ -8,9 +8,9 @@ import threading
 import time
 from collections.abc import Hashable, Sequence
 
-from gateway.link import POLL_S, Batch, Outlet
+from gateway.links.link import POLL_S, Batch, Outlet
 from gateway.links.stream import Tcp, offer
-from gateway.spec import Spec
+from gateway.settings.link_spec import Spec
 
 MOST = 64  # callers at a time
 SPEAKING_S = 3.0  # a caller that sent something so lately keeps its place [s]

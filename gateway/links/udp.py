@@ -8,10 +8,10 @@ import threading
 from collections.abc import Hashable, Sequence
 from typing import Any, cast
 
-from gateway.link import POLL_S, Batch, Outlet
 from gateway.links.backoff import BackOff
+from gateway.links.link import POLL_S, Batch, Outlet
 from gateway.links.receive import MOST, receiver
-from gateway.spec import Spec
+from gateway.settings.link_spec import Spec
 
 BUFFER = 1 << 26  # asked of the system: two seconds of 250 aircraft; taken only while it is full [bytes]
 _FORCE = 33  # SO_RCVBUFFORCE: beyond the system's limit, where that is allowed

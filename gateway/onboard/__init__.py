@@ -6,7 +6,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from fleet.contract import Link
-from fleet.telemetry.craft import Craft
+from fleet.telemetry.mavlink.aircraft_link import Craft
 from gateway.onboard.cache import Cache
 from gateway.onboard.questions import Questions
 from gateway.onboard.rates import Share

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import msgspec
 
-from fleet import private
 from fleet.contract import Item
+from fleet.process import private_files
 
 _log = logging.getLogger(__name__)
 _MOST = 1 << 24  # bytes read of one card; 5,000 parameters and 1,000 items have 0.5 MB
@@ -32,7 +32,7 @@ class Cache:
         self._refused = ""  # why nothing is read or kept
         self._said = False
         try:
-            self._where = private.onboard_folder() if where is None else where
+            self._where = private_files.onboard_folder() if where is None else where
         except RuntimeError as error:
             self._refused, self._where = str(error), Path()
         if not self._refused and self._where.is_dir():
@@ -60,14 +60,14 @@ class Cache:
             self._said = True
             return
         try:
-            private.write(self._where / f"{key}.json", msgspec.json.encode(card))
+            private_files.write(self._where / f"{key}.json", msgspec.json.encode(card))
         except OSError as error:
             _log.warning("what aircraft told cannot be kept in %s (%s)", self._where, error.strerror)
 
     def _check(self) -> None:
         """Make the folder, or see that nobody else can have written there."""
         try:
-            private.folder(self._where, "PARAUAV_ONBOARD")
+            private_files.folder(self._where, "PARAUAV_ONBOARD")
             self._refused = ""
         except ValueError as error:
             self._refused = str(error)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from fleet.telemetry.params import HASH
+from fleet.telemetry.mavlink.microservices.params import HASH
 
 
 class Dialect(NamedTuple):

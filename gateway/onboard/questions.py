@@ -7,12 +7,12 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from fleet.telemetry.craft import Craft
+from fleet.telemetry.mavlink.aircraft_link import Craft
 from gateway.onboard.cache import Cache
 from gateway.onboard.dialects import ANY, DIALECTS, STREAMS, Dialect
-from gateway.onboard.patience import Patience
+from gateway.onboard.parameter_cache_check import Recall
 from gateway.onboard.rates import WANTED_HZ
-from gateway.onboard.recall import Recall
+from gateway.onboard.retry_timer import Patience
 
 RETRY_S = 0.5  # for one item or a handful of parameters [s]
 ITEM_TRIES = 20  # in vain, then the list is asked for again: it may have become shorter

@@ -4,10 +4,10 @@ from collections.abc import Collection
 
 import numpy as np
 
-from fleet.telemetry.craft import Craft
-from fleet.telemetry.decode import layout
+from fleet.telemetry.mavlink.aircraft_link import Craft
+from fleet.telemetry.mavlink.parsing.decode import layout
 from gateway.record.size import in_words, read_size
-from gateway.spec import Spec
+from gateway.settings.link_spec import Spec
 
 WANTED_HZ: dict[str, float] = {  # [Hz]
     "ATTITUDE": 25,

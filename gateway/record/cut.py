@@ -3,8 +3,8 @@
 import numba as nb
 import numpy as np
 
-from fleet.telemetry.heard import Heard
-from fleet.telemetry.scan import CRC, EXTRA, STAMP, V1, V2, frame_length, message_id, sound
+from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.mavlink.parsing.scan import CRC, EXTRA, STAMP, V1, V2, frame_length, message_id, sound
 
 CARRY = 300  # the longest frame is 293 [bytes]
 FRAMES, NOISE = range(2)  # what `cut` counts: frames found, bytes that belong to none

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
-from fleet.telemetry.heard import Heard
-from fleet.telemetry.scan import STAMP
-from gateway.link import QUEUE_BYTES, Batch
+from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.mavlink.parsing.scan import STAMP
+from gateway.links.link import QUEUE_BYTES, Batch
 from gateway.record.cut import FRAMES, Cutter
 from gateway.record.tape import Budget, Tape
 

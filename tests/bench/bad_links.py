@@ -19,13 +19,13 @@ import numpy as np
 
 from fleet.contract import Message, Prediction, Sample
 from fleet.frames import to_ned
-from fleet.pretend.drive import to_tlog
-from fleet.pretend.uav import PretendUav
-from fleet.telemetry.recordings import replay_messages
+from fleet.simulator.flight.drive import to_tlog
+from fleet.simulator.flight.uav import PretendUav
+from fleet.telemetry.recording.recordings import replay_messages
 from tests.bad_radio import RADIOS, Radio, worsen
-from twin_worker.horizon import axes_error, first_passage, path_length
-from twin_worker.offline import run
-from twin_worker.twin import Twin
+from twin_worker.confidence.tube_and_horizon import axes_error, first_passage, path_length
+from twin_worker.evaluation.offline import run
+from twin_worker.twin.step import Twin
 
 FROM_S = 60.0  # predictions count from here on: before, there is little to learn from [s]
 LEAST_S = 20.0  # of flight that must follow a prediction [s]

@@ -1,6 +1,6 @@
 """`python -m tests.bench.ensemble`: 100 aircraft, 50 members each, 60 s ahead on one core; beside all control loops.
 
-The peer flies as many members through `fleet.simulate`: the same guidance, with attitude loops and coupled dynamics.
+The peer flies as many members through `fleet.physics.simulate`: the same guidance, with attitude loops and coupled dynamics.
 """
 
 import argparse
@@ -13,15 +13,15 @@ from statistics import median
 
 import numpy as np
 
-from fleet import hybrid as H
 from fleet.airframes import GENERIC, load
 from fleet.autopilots import arduplane, laws
 from fleet.cli import guarded, parser_for
 from fleet.contract import Item
 from fleet.frames import Origin
 from fleet.mission import route
-from fleet.simulate import N_STATE, coupled_plant, simulate
-from twin_worker.airframe_prior import prior
+from fleet.physics import point_mass as H
+from fleet.physics.simulate import N_STATE, coupled_plant, simulate
+from twin_worker.identification.fixed_wing.derivatives_prior import prior
 
 EXAMPLES = """
   python -m tests.bench.ensemble --json ensemble.json
@@ -92,7 +92,7 @@ def _run(args: argparse.Namespace) -> int:
     ours, peer = seconds(bundles(control)), 10.0 * seconds(loops(control), 3)
     print(f"{UAVS} aircraft x {MEMBERS} members x {SECONDS} s: {ours:.2f} s of one core")
     print(
-        f"the same through attitude loops and coupled dynamics (fleet.simulate): {peer:.2f} s, {peer / ours:.1f} times"
+        f"the same through attitude loops and coupled dynamics (fleet.physics.simulate): {peer:.2f} s, {peer / ours:.1f} times"
     )
     if args.json:
         args.json.write_text(json.dumps({"bundles_s": ours, "simulate_s": peer, "ratio": peer / ours}, indent=2) + "\n")

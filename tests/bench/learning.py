@@ -19,15 +19,15 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Message
-from fleet.memory_bus import MemoryBus
-from fleet.telemetry.recordings import replay_messages
-from twin_worker import twin as loop
-from twin_worker.learn import learn
-from twin_worker.memory import Twin
-from twin_worker.offline import run
-from twin_worker.warm import warm_up
-from twin_worker.worker import Held, Worker
+from fleet.telemetry.recording.recordings import replay_messages
+from twin_worker.evaluation.offline import run
+from twin_worker.service.warm_up import warm_up
+from twin_worker.service.worker import Held, Worker
+from twin_worker.twin import step as loop
+from twin_worker.twin.state.state import Twin
+from twin_worker.twin.steps.identify_step import learn
 
 
 def begun(messages: list[Message]) -> Twin:

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from pymavlink import mavutil
 
-from fleet.telemetry.opening import Source
-from fleet.telemetry.recordings import Recording
+from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.recordings import Recording
 
 SHIFT_US = 86_400 * 1_000_000 - 3_600_000_000  # between two copies in a grown file; less than a day [us]
 
@@ -60,7 +60,7 @@ def grown(path: Path, megabytes: int, folder: Path) -> Path:
 
 
 def _stamps(path: Path) -> list[list[tuple[int, int]]]:
-    from fleet.telemetry.decode import frames_of
+    from fleet.telemetry.mavlink.parsing.decode import frames_of
 
     data = Source(path).open().read(1 << 30) or b""
     buf = np.frombuffer(data, np.uint8)

@@ -18,10 +18,10 @@ import threading
 import time
 from pathlib import Path
 
-from fleet.bus import connect, open_router
-from fleet.children import Children
+from fleet.bus.bus_protocol import Bus
+from fleet.bus.session import connect, open_router
 from fleet.contract import Account, Item, Mission, Params
-from fleet.talk import Bus
+from fleet.process.children import Children
 
 PATIENCE_S = 600.0  # for each step [s]
 

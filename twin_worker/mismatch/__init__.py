@@ -1,1 +1,1 @@
-"""Mismatch live: diagnose what an aircraft did lately, in the background, and predict with what was found."""
+"""Live diagnosis: run in a process of its own, its result used in prediction."""

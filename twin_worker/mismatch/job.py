@@ -6,19 +6,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleet.contract import COLUMNS
-from twin_worker.diagnose.baseline import Baseline
-from twin_worker.diagnose.calibrate import own_weather
-from twin_worker.diagnose.card import Card
-from twin_worker.diagnose.diagnose import diagnose
-from twin_worker.diagnose.flight import Flight, lay
-from twin_worker.diagnose.own_past import later
-from twin_worker.diagnose.past import BEFORE_S, calibrate_past, since
-from twin_worker.diagnose.report import Report
-from twin_worker.diagnose.residual import Case
-from twin_worker.diagnose.sight import Sight
-from twin_worker.diagnose.smooth import STEP_S
-from twin_worker.history import History
-from twin_worker.mismatch.push import Push, pushes
+from twin_worker.diagnosis.baseline.calibrate import own_weather
+from twin_worker.diagnosis.baseline.own_past import later
+from twin_worker.diagnosis.baseline.past import BEFORE_S, calibrate_past, since
+from twin_worker.diagnosis.data.card import Card
+from twin_worker.diagnosis.data.flight import Flight, lay
+from twin_worker.diagnosis.data.smooth import STEP_S
+from twin_worker.diagnosis.inference.diagnose import diagnose
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.inference.report import Report
+from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.diagnosis.model.residual import Case
+from twin_worker.mismatch.effect_increments import Push, pushes
+from twin_worker.telemetry.history import History
 
 NEWEST_S = 20.0  # newest flight whose residuals are watched [s]
 GREW = 1.5  # their mean square over that of the flight before, from which a diagnosis is worth its time [-]

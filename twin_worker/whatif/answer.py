@@ -10,13 +10,13 @@ import numpy as np
 from fleet.contract import Item, Mission, Prediction, Status, WhatIf
 from fleet.frames import Origin, to_ned
 from fleet.mission import FIRST
-from twin_worker.control import CRUISES
-from twin_worker.foresee import foresee
-from twin_worker.greybox import air_of
-from twin_worker.kinds import NO_WINGS, seen
-from twin_worker.memory import ROUTE_MODES, Twin
-from twin_worker.whatif.elsewhere import Motion, moved
-from twin_worker.whatif.instead import Instead
+from twin_worker.prediction.autopilot_parameters import CRUISES
+from twin_worker.prediction.kinematic import air_of
+from twin_worker.prediction.route_override import Instead
+from twin_worker.twin.state.state import ROUTE_MODES, Twin
+from twin_worker.twin.state.vehicle_class import NO_WINGS, seen
+from twin_worker.twin.steps.predict_step import foresee
+from twin_worker.whatif.move_history import Motion, moved
 
 _FAR_M = 50_000.0  # a start farther than this gets its own local frame [m]
 _BACK_S = 6.0  # flight the controller is synchronised on where it flew none of this route [s]

@@ -5,19 +5,19 @@ from typing import Any
 
 import numpy as np
 
-from viewer.camera import FOV, IN_VIEW_M, frame, near, start_at
-from viewer.datatime import stamp
-from viewer.door import quiet, serve
-from viewer.feed import Feed
-from viewer.flock import Flock
-from viewer.labels import Labels, Sight
-from viewer.palette import Palette
-from viewer.place import UNIT_M
-from viewer.routes import route
-from viewer.scene import Scene
-from viewer.selected import Selection
+from viewer.browser.http_server import quiet, serve
+from viewer.scene.camera import FOV, IN_VIEW_M, frame, near, start_at
+from viewer.scene.fleet_arrays import Flock
+from viewer.scene.labels import Labels, Sight
+from viewer.scene.routes import route
+from viewer.scene.scene import Scene
+from viewer.scene.selection.selected import Selection
+from viewer.store.place import UNIT_M
+from viewer.store.received.datatime import stamp
+from viewer.store.store import Feed
+from viewer.theme.palette import Palette
 from viewer.timeline.past import Past, as_it_was, remember
-from viewer.timeline.tapes import Tapes
+from viewer.timeline.recordings import Tapes
 
 FRAMES, FRAME_S = 400, 0.1  # of a film at most, and how long each is shown [s]
 ASPECT = 1.6  # the shape of window its camera is set for [-]

@@ -6,13 +6,13 @@ from typing import Any
 
 import viser
 
-from viewer.datatime import stamp
 from viewer.export.film import Film
 from viewer.export.picture import picture
 from viewer.export.table import table
-from viewer.feed import Feed
-from viewer.palette import Palette
-from viewer.timeline.tapes import Tapes
+from viewer.store.received.datatime import stamp
+from viewer.store.store import Feed
+from viewer.theme.palette import Palette
+from viewer.timeline.recordings import Tapes
 
 
 class Export:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from viewer.palette import Palette, rgb
+from viewer.theme.palette import Palette, rgb
 
 WIDEST = 2_560  # of a picture: a browser gives up on more [pixels]
 PATIENCE_S = 20.0  # a browser that draws in software takes its time [s]

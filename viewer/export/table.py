@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 import numpy as np
 
 from fleet.frames import to_geodetic
-from viewer.datatime import is_dated
-from viewer.place import UNIT_M, Place
-from viewer.timeline.tape import Tape
+from viewer.store.place import UNIT_M, Place
+from viewer.store.received.datatime import is_dated
+from viewer.timeline.recording import Tape
 
 COLUMNS = (
     *("t_s", "utc", "lat_deg", "lon_deg", "alt_m", "phi_deg", "theta_deg", "psi_deg", "Va_m_s"),

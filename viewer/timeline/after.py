@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from viewer.palette import Palette, mix, rgb
-from viewer.strokes import Strokes, chain
+from viewer.scene.strokes import Strokes, chain
+from viewer.theme.palette import Palette, mix, rgb
 from viewer.timeline import compare
 from viewer.timeline.past import Past
 

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viewer.forecast import Forecast
-from viewer.place import UNIT_M
-from viewer.tube import frame_of
+from viewer.scene.selection.tube import frame_of
+from viewer.store.forecast import Forecast
+from viewer.store.place import UNIT_M
 
 STEPS_S = (5.0, 10.0, 20.0, 30.0, 60.0, 120.0)  # look-aheads compared in words [s]
 WHISKER_S = 5.0  # between whiskers [s]

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from viewer.datatime import stamp
-from viewer.events import Event
-from viewer.feed import Feed
-from viewer.flock import Flock
-from viewer.palette import Palette
+from viewer.scene.fleet_arrays import Flock
+from viewer.store.received.datatime import stamp
+from viewer.store.store import Feed
+from viewer.store.vehicle import Vehicle
+from viewer.theme.events import Event
+from viewer.theme.palette import Palette
 from viewer.timeline import strip
 from viewer.timeline.after import After
 from viewer.timeline.panel import Panel
 from viewer.timeline.past import Past, as_it_was, remember
 from viewer.timeline.player import Player, Span, last_before, next_after
-from viewer.timeline.tapes import Tapes
-from viewer.vehicle import Vehicle
+from viewer.timeline.recordings import Tapes
 
 SNAP = 0.008  # of the bar: a press this near to an event means the event
 OTHERS = 40  # events of each other UAV looked at: the newest

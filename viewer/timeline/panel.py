@@ -5,7 +5,7 @@ from typing import Any
 
 import viser
 
-from viewer.palette import Palette
+from viewer.theme.palette import Palette
 from viewer.timeline.strip import touched
 
 TRANSPORT = ("Pause", "1×", "4×", "● Live")

@@ -6,15 +6,15 @@ import msgspec
 import numpy as np
 
 from fleet.contract import FleetRow, State
-from viewer.datatime import DataTime
-from viewer.events import Event
-from viewer.flock import MINUTE, Flock
-from viewer.forecast import Forecast
-from viewer.place import UNIT_M, scene_quat
-from viewer.timeline.stood import Stood
-from viewer.timeline.tape import Tape
-from viewer.track import placed
-from viewer.vehicle import Vehicle
+from viewer.scene.fleet_arrays import MINUTE, Flock
+from viewer.store.forecast import Forecast
+from viewer.store.place import UNIT_M, scene_quat
+from viewer.store.received.datatime import DataTime
+from viewer.store.track import placed
+from viewer.store.vehicle import Vehicle
+from viewer.theme.events import Event
+from viewer.timeline.recording import Tape
+from viewer.timeline.state_at import Stood
 
 TRAIL_S = 90.0  # of the fine trail [s]
 PAST_S = 60.0  # of the predictions before [s]

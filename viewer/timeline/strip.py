@@ -4,9 +4,9 @@ from collections.abc import Iterable
 from html import escape
 from math import inf
 
-from viewer.datatime import moment
-from viewer.events import Event, Kind
-from viewer.palette import MARK, Palette
+from viewer.store.received.datatime import moment
+from viewer.theme.events import Event, Kind
+from viewer.theme.palette import MARK, Palette
 from viewer.timeline.compare import STEPS_S, Miss
 from viewer.timeline.player import Span
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from fleet.autopilots.arduplane import l1
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.arduplane import state as S
-from fleet.autopilots.arduplane.state import hypot, kernel
+from fleet.autopilots.common import controller_state as S
+from fleet.autopilots.common.controller_state import hypot, kernel
 from fleet.frames import wrap
 from fleet.mission import (
     ACCEPT,

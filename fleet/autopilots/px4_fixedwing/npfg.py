@@ -13,9 +13,9 @@ from math import atan, cos, hypot, pi, sin, sqrt
 import numpy as np
 
 from fleet.autopilots.arduplane.l1 import angle_to, clip
-from fleet.autopilots.arduplane.state import kernel
+from fleet.autopilots.common.controller_state import kernel
+from fleet.autopilots.common.parameter_vector import W_E, W_N
 from fleet.autopilots.px4_fixedwing import params as P
-from fleet.autopilots.slots import W_E, W_N
 from fleet.frames import G
 
 _TIGHTEST = 0.1  # of a circle's radius: the feed-forward knows no smaller one [-]

@@ -9,7 +9,7 @@ from math import pi
 import numpy as np
 
 from fleet.autopilots.arduplane.params import Row, eas2tas, find
-from fleet.autopilots.slots import TEXTBOOK, padded
+from fleet.autopilots.common.parameter_vector import TEXTBOOK, padded
 
 TABLE = (
     Row("chi_inf", pi / 3, 1, 0.1, pi / 2),

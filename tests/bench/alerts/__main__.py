@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from fleet.contract import Alert, AlertKind, Prediction
-from fleet.pretend.drive import EPOCH_US, to_tlog
-from fleet.telemetry.recordings import replay_messages
-from twin_worker.offline import run
-from twin_worker.warm import warm_up
+from fleet.simulator.flight.drive import EPOCH_US, to_tlog
+from fleet.telemetry.recording.recordings import replay_messages
+from twin_worker.evaluation.offline import run
+from twin_worker.service.warm_up import warm_up
 
 from .world import END_S, HIGH_M, SAFE_M, STEP_S, WIDE_M, Flight, apart, chain, is_clear, lost_at, make
 

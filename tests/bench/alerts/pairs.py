@@ -7,8 +7,8 @@ import numpy as np
 
 from fleet.contract import Array, Prediction, State
 from fleet.frames import to_geodetic
-from fleet.pretend.missions import HOME
-from twin_worker.conflict.traffic import Traffic
+from fleet.simulator.vehicle.missions import HOME
+from twin_worker.alerts.traffic import Traffic
 
 T = 1_700_000_000.0
 AHEAD = np.concatenate([np.arange(0.0, 61.0), np.arange(63.0, 181.0, 3.0)])

@@ -14,9 +14,9 @@ import numpy as np
 from fleet.contract import Item
 from fleet.frames import Origin, to_geodetic, to_ned
 from fleet.mission import SEQ
-from fleet.pretend.jsbsim import CRUISE
-from fleet.pretend.missions import HOME, Start, mission
-from fleet.pretend.uav import PretendUav
+from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.vehicle.jsbsim import CRUISE
+from fleet.simulator.vehicle.missions import HOME, Start, mission
 
 END_S = 152.0  # the twins hear so much of each flight [s]
 LOOK_S = 120.0  # what is never to happen does not happen for so long after it either [s]

@@ -26,10 +26,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from fleet.bus import ZenohBus, connect
+from fleet.bus.bus_protocol import Bus
+from fleet.bus.session import ZenohBus, connect
 from fleet.cli import guarded, parser_for
 from fleet.contract import Prediction, Predictions
-from fleet.talk import Bus
 from tests.bench.referee.site import Site
 
 from . import plain

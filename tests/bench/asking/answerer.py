@@ -6,13 +6,13 @@ import time
 import msgspec
 import numpy as np
 
-from fleet.bus import connect
+from fleet.bus.session import connect
 from fleet.cli import stop_on_signal
 from fleet.contract import Array, Controller, Prediction, State
-from twin_worker.claims.keeper import Held
-from twin_worker.horizon import AHEAD
-from twin_worker.twin import Twin
-from twin_worker.worker import Worker
+from twin_worker.confidence.tube_and_horizon import AHEAD
+from twin_worker.ownership.twin_store import Held
+from twin_worker.service.worker import Worker
+from twin_worker.twin.step import Twin
 
 _EVERY_S = 1.0  # between predictions of an aircraft [s]
 _SAID = "hybrid/arduplane/fixed_wing/known, adapted by 24 of its own"

@@ -19,7 +19,7 @@ from typing import Any
 
 import msgpack
 
-from fleet.bus import connect
+from fleet.bus.session import connect
 from fleet.cli import guarded, parser_for
 from tests.bench.referee.site import Site, until
 

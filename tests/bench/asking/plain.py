@@ -5,7 +5,7 @@ import time
 
 import zenoh
 
-from fleet.bus import ZenohBus, connect
+from fleet.bus.session import ZenohBus, connect
 from fleet.cli import stop_on_signal
 
 KEYS = {"wildcard": "plain/one/*", "batch": "plain/all/*"}

@@ -16,7 +16,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from fleet.telemetry.opening import Source
+from fleet.telemetry.recording.opening import Source
 
 from . import decoding, load
 

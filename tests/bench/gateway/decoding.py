@@ -8,11 +8,11 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.telemetry.decode import Dealt, Decoder
-from fleet.telemetry.heard import Heard
-from fleet.telemetry.opening import Source
-from fleet.telemetry.scan import START, STOP
-from fleet.telemetry.tlog import Tlog
+from fleet.telemetry.mavlink.parsing.decode import Dealt, Decoder
+from fleet.telemetry.mavlink.parsing.received import Heard
+from fleet.telemetry.mavlink.parsing.scan import START, STOP
+from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.tlog import Tlog
 
 BATCH = 1_024  # datagrams
 

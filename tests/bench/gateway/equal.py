@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet.telemetry.opening import Source
-from fleet.telemetry.tlog import Tlog
+from fleet.telemetry.recording.opening import Source
+from fleet.telemetry.recording.tlog import Tlog
 from tests import oracle
 
 AT_ONCE = 10_000  # frames

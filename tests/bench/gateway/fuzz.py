@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from fleet.codec import Wire
-from fleet.telemetry.heard import Heard
-from fleet.telemetry.intake import Intake
+from fleet.bus.codec import Wire
+from fleet.telemetry.mavlink.intake import Intake
+from fleet.telemetry.mavlink.parsing.received import Heard
 from tests import oracle
 from tests.talker import Talker
 

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from fleet.bus import connect, open_router
+from fleet.bus.session import connect, open_router
 from fleet.contract import Account, Sample
 
 A_LINK = 250  # aircraft

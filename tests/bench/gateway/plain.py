@@ -12,10 +12,10 @@ from typing import Any
 import msgpack
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from fleet.bus import connect
-from fleet.codec import Wire
+from fleet.bus.codec import Wire
+from fleet.bus.session import connect
 from fleet.contract import Sample
-from fleet.telemetry.dialects.mavlink import TABLE
+from fleet.telemetry.tables.mavlink import TABLE
 
 FIELDS = {row.message: mav.mavlink_map[number].fieldnames for row in TABLE for number in mav.mavlink_map
           if mav.mavlink_map[number].msgname == row.message}  # fmt: skip

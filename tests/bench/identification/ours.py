@@ -12,10 +12,10 @@ from fleet.airframes import Airframe, load
 from fleet.frames import body_to_ned, ned_to_body
 from fleet.physics.actuators import TAU, lagged
 from fleet.window import Window
-from twin_worker.coupled import identify
-from twin_worker.earned import Earned, runs_and_flown
-from twin_worker.observer import Observer
-from twin_worker.wind import WindFilter
+from twin_worker.estimation.wind_filter import WindFilter
+from twin_worker.identification.fixed_wing.derivatives_model import identify
+from twin_worker.validation.forecast_shrinkage import Earned, runs_and_flown
+from twin_worker.validation.gust_observer import Observer
 
 from .flight import Flight
 from .gusty import WEATHER

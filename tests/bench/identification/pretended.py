@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet import private
 from fleet.frames import ned_to_body
-from fleet.pretend.jsbsim import Aircraft, Truth
-from fleet.pretend.missions import HOME
-from fleet.pretend.sensors import Servos
-from fleet.pretend.uav import DT as TICK_S
-from fleet.pretend.uav import PretendUav
-from fleet.pretend.weather import FT
+from fleet.process import private_files
+from fleet.simulator.flight.uav import DT as TICK_S
+from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.vehicle.jsbsim import Aircraft, Truth
+from fleet.simulator.vehicle.missions import HOME
+from fleet.simulator.vehicle.sensors import Servos
+from fleet.simulator.vehicle.weather import FT
 from fleet.window import STATES
 
 from .flight import Case, Flight, true_airspeed, unwrapped
@@ -86,7 +86,9 @@ def _fly(seed: int, k: int) -> dict[str, np.ndarray]:
 
 def _folder() -> Path:
     given = os.environ.get("PARAUAV_BENCH_CACHE")
-    return private.folder(Path(given).absolute() if given else private.cache_folder() / "bench", "PARAUAV_BENCH_CACHE")
+    return private_files.folder(
+        Path(given).absolute() if given else private_files.cache_folder() / "bench", "PARAUAV_BENCH_CACHE"
+    )
 
 
 def _sources() -> str:

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import scipy.io
 
-from fleet.airframe import servo_map
+from fleet.airframes.airframe import servo_map
 from fleet.contract import Params, Sample
 from fleet.frames import Origin, ned_to_body
-from fleet.telemetry.recordings import replay_messages
-from twin_worker.history import History
-from twin_worker.preprocess import DT, preprocess
+from fleet.telemetry.recording.recordings import replay_messages
+from twin_worker.telemetry.history import History
+from twin_worker.telemetry.resample import DT, preprocess
 
 from .flight import Case, Flight, true_airspeed, unwrapped
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from fleet.contract import Found, Message, Prediction, Sample
 from fleet.frames import to_ned
-from twin_worker.diagnose.baseline import Baseline
+from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.mismatch.coordinator import ALL, Live
 from twin_worker.mismatch.job import Answer, Job, work
-from twin_worker.mismatch.live import ALL, Live
-from twin_worker.twin import Twin, advance
+from twin_worker.twin.step import Twin, advance
 
 ANSWER_S, REST_S = 3.0, 12.0  # after a diagnosis began: its answer, and the next one [s of data time]
 AHEAD_S = (10, 30, 60)

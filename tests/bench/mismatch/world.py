@@ -4,19 +4,19 @@ import json
 from pathlib import Path
 
 from fleet.contract import Message
-from fleet.pretend.conceal.cards import card
-from fleet.pretend.conceal.plan import EXCITED, Job, draw
-from fleet.pretend.conceal.record import fly
-from fleet.pretend.drive import to_tlog
-from fleet.pretend.faults.kinds import read
-from fleet.pretend.uav import PretendUav
-from fleet.pretend.weather import FT, wind_at_20ft
-from fleet.telemetry.recordings import replay_messages
-from twin_worker.diagnose import card as cards
-from twin_worker.diagnose.baseline import Baseline
-from twin_worker.diagnose.calibrate import calibrate
-from twin_worker.diagnose.flight import read_flights
-from twin_worker.diagnose.keep import load, save
+from fleet.simulator.conceal.cards import card
+from fleet.simulator.conceal.plan import EXCITED, Job, draw
+from fleet.simulator.conceal.record import fly
+from fleet.simulator.faults.kinds import read
+from fleet.simulator.flight.drive import to_tlog
+from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.vehicle.weather import FT, wind_at_20ft
+from fleet.telemetry.recording.recordings import replay_messages
+from twin_worker.diagnosis.baseline.calibrate import calibrate
+from twin_worker.diagnosis.data import card as cards
+from twin_worker.diagnosis.data.flight import read_flights
+from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.diagnosis.output.keep import load, save
 
 ONSET_S = 120.0
 USUAL_W20_MPS = wind_at_20ft(2) * FT  # of ordinary flights, so that the model knows what is usual of them

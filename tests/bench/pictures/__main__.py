@@ -18,7 +18,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from fleet.bus import connect
+from fleet.bus.session import connect
 from fleet.contract import Alert, AlertKind, Cause, Found, Mismatch
 from tests.bench.viewing.page import ARGS
 from tests.bench.viewing.process import free_port, start, tell

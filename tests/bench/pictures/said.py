@@ -12,17 +12,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from fleet import private
-from fleet.bus import connect, open_router
-from fleet.codec import Stamp
+from fleet.bus.codec import Stamp
+from fleet.bus.session import connect, open_router
 from fleet.contract import Account, Found, Mismatch, Prediction, Sample, Status
-from fleet.telemetry.recordings import Recording
+from fleet.process import private_files
+from fleet.telemetry.recording.recordings import Recording
 from tests.bench.mismatch.flown import Inline
 from tests.bench.mismatch.world import baseline
 from tests.bench.viewing.process import free_port
-from twin_worker.conflict.traffic import Traffic
-from twin_worker.mismatch.live import ALL, Live
-from twin_worker.twin import Twin, advance
+from twin_worker.alerts.traffic import Traffic
+from twin_worker.mismatch.coordinator import ALL, Live
+from twin_worker.twin.step import Twin, advance
 
 ROOT = Path(__file__).resolve().parents[3]
 STAMP = Stamp(1, 0xABCD)
@@ -36,7 +36,7 @@ Said = list[tuple[float, Any, Stamp | None]]
 
 def flown(name: str, *options: str) -> Path:
     """Fly simulated aircraft into a recording, kept for the next time."""
-    path = private.folder(private.cache_folder() / "pictures", "pictures") / f"{name}.tlog"
+    path = private_files.folder(private_files.cache_folder() / "pictures", "pictures") / f"{name}.tlog"
     if not path.is_file():
         command = [sys.executable, "-m", "fleet.cli", "fly", *options, "--seed", "1", "--tlog", str(path)]
         subprocess.run(command, cwd=ROOT, check=True)

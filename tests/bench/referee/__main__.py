@@ -21,7 +21,7 @@ import numpy as np
 
 from fleet.cli import guarded, parser_for
 from fleet.contract import Claim
-from twin_worker.claims.owner import owners
+from twin_worker.ownership.rendezvous import owners
 
 from . import faults
 from .site import PACE, Site, Worker, until

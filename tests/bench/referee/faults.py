@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from twin_worker.claims.owner import owners
+from twin_worker.ownership.rendezvous import owners
 
 from .site import Site, Worker, until
 from .starve import limited

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleet.codec import Stamp
+from fleet.bus.bus_protocol import Bus
+from fleet.bus.codec import Stamp
+from fleet.bus.epoch_fence import Fence
 from fleet.contract import Claim, FleetState, Model, Prediction
-from fleet.fence import Fence
-from fleet.talk import Bus
 
 
 class Came(NamedTuple):

@@ -14,16 +14,16 @@ from pathlib import Path
 
 from fleet.access.entry import ROUTER, endpoint
 from fleet.access.knock import reachable
-from fleet.bus import connect
-from fleet.pretend.drive import to_tlog
-from fleet.pretend.uav import PretendUav
+from fleet.bus.session import connect
+from fleet.simulator.flight.drive import to_tlog
+from fleet.simulator.flight.uav import PretendUav
 
 from .forwarder import Forwarder
 from .reader import Reader
 
 ROOT = Path(__file__).resolve().parents[3]
 PACE = "predict=5,identify=5,ensemble=5,renew=0.1"
-_OPEN = "from fleet.bus import open_router; from fleet.cli import stop_on_signal; import sys; "
+_OPEN = "from fleet.bus.session import open_router; from fleet.cli import stop_on_signal; import sys; "
 _ROUTER = _OPEN + "session = open_router(sys.argv[1]); stop_on_signal().wait(); session.close()"
 
 

@@ -13,8 +13,8 @@ import zenoh
 
 from fleet.access.entry import Entry
 from fleet.access.roles import LIVE, MOST, ROOT, keys
-from fleet.bus import _config
-from fleet.codec import Stamp, encode, encoding, pack_stamp
+from fleet.bus.codec import Stamp, encode, encoding, pack_stamp
+from fleet.bus.session import _config
 from fleet.contract import TOPICS
 from tests.examples import EXAMPLES
 

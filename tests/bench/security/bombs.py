@@ -8,7 +8,7 @@ import msgpack
 import msgspec
 
 from fleet.access.roles import MOST, SAID
-from fleet.codec import encode
+from fleet.bus.codec import encode
 
 DEPTH = 200_000
 HUGE = 0xFFFFFFFF

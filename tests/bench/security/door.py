@@ -10,7 +10,7 @@ from typing import Any
 import zenoh
 
 from fleet.access.knock import answers
-from fleet.bus import _config
+from fleet.bus.session import _config
 
 from .site import PATIENCE_S, Site, expired, make_papers
 from .trying import IDS, UNTRIED, Admitted, Attempt, until

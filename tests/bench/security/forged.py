@@ -2,12 +2,12 @@
 
 import time
 
-from fleet.codec import Stamp, timely
+from fleet.bus.bus_protocol import newest
+from fleet.bus.codec import Stamp, timely
+from fleet.bus.epoch_fence import Fence
+from fleet.bus.memory_bus import MemoryBus
 from fleet.contract import Claim, Handover, Status
-from fleet.fence import Fence
-from fleet.memory_bus import MemoryBus
-from fleet.talk import newest
-from twin_worker.claims.protocol import Claiming
+from twin_worker.ownership.protocol import Claiming
 
 FORGED = (2**62 - 1, 2**63 - 1, 2**64 - 1)
 LATER_MS = 600_000  # 10 minutes

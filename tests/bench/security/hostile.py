@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from fleet.bus import connect, open_router
+from fleet.bus.session import connect, open_router
 from fleet.contract import Account, Sample
 from gateway.links.tcp_listener import MOST
 from tests.bench.gateway.fuzz import blocks

@@ -185,9 +185,9 @@ def records_in_records() -> bytes:
 
 def many_ids() -> bytes:
     """A fleet recording of a hundred thousand aircraft."""
-    from fleet.codec import encode, encoding
+    from fleet.bus.codec import encode, encoding
     from fleet.contract import Status
-    from fleet.telemetry.fleet_log import Record
+    from fleet.telemetry.recording.fleet_log import Record
 
     made = (Record(1.6e9 + k * 1e-3, encoding(Status), encode(Status(uav=k, t=1.6e9))).pack() for k in range(100_000))
     return b"".join(made)

@@ -22,8 +22,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from fleet.access.entry import Entry, endpoint
 from fleet.access.knock import reachable
 from fleet.access.roles import ROLES, ROUTER_ROLE
-from fleet.bus import _config
-from fleet.commands.router import text
+from fleet.bus.session import _config
+from fleet.commands.live.router import text
 
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPT = ROOT / "deploy" / "certificates.sh"

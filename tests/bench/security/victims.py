@@ -9,17 +9,17 @@ from typing import Any
 import msgspec
 from rich.console import Console
 
-from fleet.bus import connect
-from fleet.codec import encode
-from fleet.commands.record import Recorder
-from fleet.commands.status import as_objects, fleet_rows, table
-from fleet.commands.whatif import as_object, ask, text
+from fleet.bus.bus_protocol import Bus
+from fleet.bus.codec import encode
+from fleet.bus.session import connect
+from fleet.commands.live.record import Recorder
+from fleet.commands.live.status import as_objects, fleet_rows, table
+from fleet.commands.live.whatif import as_object, ask, text
 from fleet.contract import Account, FleetState, Mission, Prediction, Sample, Status, WhatIf
-from fleet.talk import Bus
-from gateway.publish import Publisher
+from gateway.publication.publish import Publisher
 from tests.examples import EXAMPLES
-from twin_worker.worker import Worker
-from viewer.feed import Feed
+from twin_worker.service.worker import Worker
+from viewer.store.store import Feed
 
 from .attack import BOMBARD, UAV, Attack, from_outside, lying
 from .trying import until

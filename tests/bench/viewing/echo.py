@@ -6,9 +6,9 @@ python -m tests.bench.viewing.echo --port 8090 --router tcp/127.0.0.1:17447
 import sys
 from typing import Any
 
-from viewer import app
 from viewer.__main__ import main
-from viewer.view import View
+from viewer.server import app
+from viewer.server.view import View
 
 SEND = "window.__viserMutable.sendMessage({{type:'GuiUpdateMessage',uuid:'{}',updates:{{value:''+Math.random()}}}})"
 

@@ -14,8 +14,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from fleet.bus import connect, open_router
-from fleet.codec import Stamp
+from fleet.bus.bus_protocol import Bus
+from fleet.bus.codec import Stamp
+from fleet.bus.session import connect, open_router
 from fleet.contract import (
     Alert,
     AlertKind,
@@ -35,7 +36,6 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.frames import Origin, to_geodetic
-from fleet.talk import Bus
 
 HOME = Origin(473977420, 85455940, 488_000)
 PROBE_M_S = 20.0

@@ -7,9 +7,9 @@ import argparse
 import sys
 import threading
 
-from fleet.bus import connect
+from fleet.bus.bus_protocol import key
+from fleet.bus.session import connect
 from fleet.contract import Account, Alert, FleetState, Mismatch, Mission, Model, Prediction, Sample, Status
-from fleet.talk import key
 
 HEARD = (Sample, Status, Mission, Account, Model, Prediction, Alert, Mismatch, FleetState)  # as the viewer's feed
 TICK_S = 0.1

@@ -11,13 +11,13 @@ import time
 import numpy as np
 import viser
 
-from fleet.bus import connect
-from viewer.door import quiet
-from viewer.feed import Feed
-from viewer.place import scene_quat
-from viewer.shapes import aircraft
-from viewer.strokes import chain
-from viewer.vehicle import Vehicle
+from fleet.bus.session import connect
+from viewer.browser.http_server import quiet
+from viewer.scene.strokes import chain
+from viewer.store.place import scene_quat
+from viewer.store.store import Feed
+from viewer.store.vehicle import Vehicle
+from viewer.theme.shapes import aircraft
 
 TICK_S = 0.1
 

@@ -1,0 +1,1 @@
+"""What all control laws share: controller state, parameter vector, small compiled functions."""

@@ -1,0 +1,1 @@
+"""Blind test of the diagnosis: conceal, seal, diagnose, commit, open, score, report."""

@@ -1,0 +1,40 @@
+"""`python -m fleet.blind_test.concealer`: flies the examination, seals its labels, and ends; the only process that knows."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from fleet.blind_test.seal import seal
+from fleet.cli import guarded
+from fleet.process.logs import tell
+from fleet.simulator.conceal.exam import exam
+
+_EVERY = 10
+
+
+def _progress(name: str, done: int, of: int) -> None:
+    """Say how far it is; the order of flights says nothing."""
+    if done % _EVERY == 0 or done == of:
+        tell("prove", f"{done} of {of} flights flown")
+
+
+def _run(args: argparse.Namespace) -> int:
+    labels = exam(args.seed, args.flights, args.out, _progress, args.jobs)
+    seal(json.dumps(labels, sort_keys=True).encode(), args.sealed, args.key)
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Conceal and seal."""
+    parser = argparse.ArgumentParser(prog="python -m fleet.blind_test.concealer", description=__doc__)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--flights", type=int, required=True)
+    parser.add_argument("--jobs", type=int, required=True)
+    for name in ("out", "sealed", "key"):
+        parser.add_argument(f"--{name}", type=Path, required=True)
+    return guarded("prove", _run, parser.parse_args(argv))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Verbs of `fleet` that start, connect to or query running processes."""

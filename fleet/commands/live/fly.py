@@ -1,0 +1,152 @@
+"""Fly pretend aircraft: fixed-wing UAVs on JSBSim that speak MAVLink 2 over UDP, or into a recording."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING
+
+from fleet.cli import id_range, stop_on_signal
+from fleet.process.logs import say
+
+if TYPE_CHECKING:
+    from fleet.simulator.faults.fault import Fault
+    from fleet.simulator.flight.uav import PretendUav
+
+EXAMPLES = """
+  fleet fly --uavs 0-7
+  fleet fly --uavs 0-49 --to 127.0.0.1:14550 --wind 6 --turbulence 4 --loss 0.05
+  fleet fly --uavs 0-1 --autopilot px4 --aircraft c172p
+  fleet fly --uavs 0-3 --fault drag_increase,dCD=0.03,at=120 --fault actuator_lag:elevator,tau_s=0.3 --fault-uav 2
+  fleet fly --uavs 0 --seed 3 --for 300 --tlog flight.tlog     as fast as possible, no network
+"""
+AUTOPILOTS, AIRCRAFT = (
+    ("ardupilot", "px4"),
+    ("small", "c172p"),
+)  # as in `fleet.simulator.flight.tuning`, which loads slowly
+_RECORDED_S = 300.0  # length of a recording when --for is not given [s]
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Describe the options."""
+    parser.add_argument("--uavs", type=id_range, default=range(8), metavar="A-B", help="aircraft ids (0-7)")
+    parser.add_argument("--to", default="127.0.0.1:14550", metavar="HOST:PORT", help="where the frames go")
+    parser.add_argument(
+        "--autopilot", choices=AUTOPILOTS, default="ardupilot", help="whose law and MAVLink (ardupilot)"
+    )
+    parser.add_argument("--aircraft", choices=AIRCRAFT, default="small", help="11 kg electric or a Cessna 172 (small)")
+    parser.add_argument("--seed", type=int, default=1, help="draws aircraft, missions, weather and noise (1)")
+    parser.add_argument("--wind", type=float, default=4.0, metavar="M/S", help="mean wind at 100 m (4)")
+    parser.add_argument(
+        "--turbulence",
+        default="2",
+        metavar="LEVEL",
+        help="MIL-F-8785C: none, light (3), moderate (4), severe (6) or 0..7 (2: what goes with a wind of 4 m/s)",
+    )
+    parser.add_argument("--loss", type=float, default=0.02, metavar="SHARE", help="share of frames lost (0.02)")
+    parser.add_argument("--for", dest="seconds", type=float, metavar="S", help="how long (for ever; 300 with --tlog)")
+    fault_arguments(parser)
+    parser.add_argument("--tlog", type=Path, metavar="FILE", help="fly as fast as possible into this .tlog instead")
+
+
+def fault_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what may be wrong with one of the aircraft."""
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="NAME[:OF],KEY=VALUE,...[,at=S]",
+        help="what is wrong with one aircraft, from S seconds on; may be given again",
+    )
+    parser.add_argument("--fault-uav", type=int, metavar="ID", help="which one (the first)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly until told to stop, or for the given time.
+
+    Raises:
+        ValueError: when an option makes no sense; the sentence says which.
+    """
+    from fleet.simulator.flight import drive  # loads JSBSim and the compiler: not for --help
+    from fleet.simulator.flight.uav import PretendUav
+    from fleet.simulator.vehicle.weather import turbulence_level
+
+    _check(args)
+    stop = stop_on_signal()
+    level = turbulence_level(args.turbulence)
+    host, port = _address(args.to)
+    kind = {"autopilot": args.autopilot, "aircraft": args.aircraft}
+    faulty = faults_of(args, args.uavs)
+    uavs = [
+        PretendUav(i, args.seed, wind=args.wind, turbulence=level, **kind, faults=faulty.get(i, ())) for i in args.uavs
+    ]
+    say("fly", "compiling the autopilot, once")
+    PretendUav(args.uavs[0], args.seed).step(0.2)
+    if args.tlog is not None:
+        _record(uavs, args, stop)
+        return 0
+    say("fly", f"{len(uavs)} aircraft in the air, talking to {host}:{port}")
+    worst = drive.to_udp(uavs, (host, port), seconds=args.seconds, loss=args.loss, seed=args.seed, stop=stop)
+    say("fly", f"stopped; at worst {worst * 1e3:.0f} ms behind real time")
+    return 0
+
+
+def faults_of(args: argparse.Namespace, uavs: range) -> "dict[int, tuple[Fault, ...]]":
+    """Give the faults of the one aircraft that has any.
+
+    Raises:
+        ValueError: when a fault is none that such an aircraft can carry, or the aircraft is none of them.
+    """
+    from fleet.simulator.faults.kinds import read
+
+    which = uavs[0] if args.fault_uav is None else args.fault_uav
+    if args.fault_uav is not None and not args.fault:
+        raise ValueError(f"fault-uav: found {which} but no fault, expected one; add --fault")
+    if which not in uavs:
+        raise ValueError(f"fault-uav: found {which}, expected one of {uavs[0]}-{uavs[-1]}; change --fault-uav")
+    faults = tuple(read(text, args.aircraft) for text in args.fault)
+    return {which: faults} if faults else {}
+
+
+def _check(args: argparse.Namespace) -> None:
+    if not 0 <= args.wind <= 15:
+        raise ValueError(f"wind: found {args.wind} m/s, expected 0..15 (cruise is 23 m/s); lower --wind")
+    if not 0 <= args.loss < 1:
+        raise ValueError(f"loss: found {args.loss}, expected a share from 0 to below 1; write e.g. 0.02")
+    if args.seed < 0:
+        raise ValueError(f"seed: found {args.seed}, expected a whole number from 0; change --seed")
+    if args.seconds is not None and not args.seconds > 0:
+        raise ValueError(f"for: found {args.seconds} s, expected more than 0; change --for")
+
+
+def _address(text: str) -> tuple[str, int]:
+    """Read HOST:PORT.
+
+    Raises:
+        ValueError: when it is not one.
+    """
+    host, colon, port = text.rpartition(":")
+    if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65_536:
+        raise ValueError(f"to: found {text!r}, expected HOST:PORT such as 127.0.0.1:14550; correct --to")
+    return host, int(port)
+
+
+def _record(uavs: "Sequence[PretendUav]", args: argparse.Namespace, stop: Event) -> None:
+    """Write the recording under a progress bar."""
+    from rich.progress import Progress
+
+    from fleet.simulator.flight import drive
+
+    seconds = args.seconds or _RECORDED_S
+    with Progress(transient=True) as bar:
+        task = bar.add_task(f"flying into {args.tlog.name}", total=seconds)
+        frames = drive.to_tlog(
+            args.tlog,
+            uavs,
+            seconds=seconds,
+            loss=args.loss,
+            seed=args.seed,
+            progress=lambda t: bar.update(task, completed=t),
+            stop=stop,
+        )
+    say("fly", f"{frames} frames of {len(uavs)} aircraft in {args.tlog}")

@@ -1,0 +1,160 @@
+"""Record everything a running fleet says into a file that `fleet replay` takes back."""
+
+import argparse
+import math
+import threading
+import time
+from collections import Counter
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from fleet.bus.bus_protocol import Bus
+from fleet.bus.codec import Stamp, encode, encoding
+from fleet.bus.session import connect
+from fleet.cli import stop_on_signal
+from fleet.config import entry, router_arguments
+from fleet.contract import TOPICS, Sample
+from fleet.process.logs import tell
+from fleet.telemetry.recording.fleet_log import Record
+
+EXAMPLES = """
+  fleet record monday.parauav                  until Ctrl-C
+  fleet record monday.parauav --for 600
+  fleet record monday.parauav --overwrite --router tcp/192.168.1.10:7447
+"""
+SUFFIX = ".parauav"
+MOST = 64 << 20  # bytes waiting for the disk; beyond, messages are dropped and counted
+WRITE_S = 0.25  # between two writes: what a crash may cost [s]
+_PLAIN_S = 10.0  # between progress lines where the output is no terminal [s]
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("file", type=Path, metavar="FILE", help=f"recording to write, {SUFFIX}")
+    parser.add_argument("--for", dest="seconds", type=float, default=0.0, metavar="S", help="how long (until Ctrl-C)")
+    parser.add_argument("--overwrite", action="store_true", help="replace FILE where it exists")
+    router_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Record until told to stop; exit code 1 where messages had to be dropped."""
+    _check(args)
+    stop = stop_on_signal()
+    with connect(entry(args)) as bus, _opened(args.file, args.overwrite) as file:
+        recorder = Recorder(bus, file)
+        recorder.listen()
+        _record(recorder, args, stop)
+    tell("fleet record", f"{recorder.words()}; {args.file} is complete")
+    if recorder.dropped:
+        tell("fleet record", f"{recorder.dropped} messages dropped, the disk could not follow")
+    return 1 if recorder.dropped else 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse wrong use before anything is opened.
+
+    Raises:
+        ValueError: when an option makes no sense; the sentence says which.
+    """
+    if not 0 <= args.seconds < math.inf:
+        raise ValueError(f"--for: found {args.seconds} s, expected 0 (until Ctrl-C) or more; change it")
+    if args.file.suffix != SUFFIX:
+        raise ValueError(f"FILE: found {args.file.name!r}, expected a name that ends in {SUFFIX}; rename it")
+
+
+def _opened(path: Path, overwrite: bool) -> IO[bytes]:
+    try:
+        return path.open("wb" if overwrite else "xb", buffering=0)
+    except FileExistsError:
+        raise ValueError(
+            f"FILE: found {str(path)!r} there already, expected a new name; choose one, or say --overwrite"
+        ) from None
+    except OSError as error:
+        raise OSError(f"FILE: {str(path)!r} cannot be written ({error.strerror}); choose another place") from None
+
+
+class Recorder:
+    """Pack what is heard on the bus's threads, write it on the caller's.
+
+    Args:
+        bus: what is listened to
+        file: unbuffered
+    """
+
+    def __init__(self, bus: Bus, file: IO[bytes]) -> None:
+        self.dropped = 0
+        self.counts: Counter[str] = Counter()  # messages written, by topic
+        self.size = 0  # bytes written
+        self._begun = time.monotonic()
+        self._zero = time.time() - self._begun  # a system clock that is set later does not show
+        self._bus, self._file = bus, file
+        self._lock = threading.Lock()
+        self._waiting = bytearray()
+        self._waiting_counts: Counter[str] = Counter()
+
+    def listen(self) -> None:
+        """Ask for what is said seldom, so that a recording begun in flight knows the missions; then listen."""
+        for kind in TOPICS.values():
+            if kind is not Sample:
+                found: list[tuple[Any, Stamp | None]] = self._bus.ask(kind)
+                for message, stamp in found:
+                    self._hear(kind, encode(message), encoding(kind), stamp)
+        for kind in TOPICS.values():
+            self._bus.overhear(kind, partial(self._hear, kind))
+
+    def _hear(self, kind: type, payload: bytes, named: str, stamp: Stamp | None) -> None:
+        packed = Record(self._zero + time.monotonic(), named, payload, stamp).pack()
+        with self._lock:
+            if len(self._waiting) + len(packed) > MOST:
+                self.dropped += 1
+            else:
+                self._waiting += packed
+                self._waiting_counts[kind.topic] += 1  # type: ignore[attr-defined]
+
+    def write(self) -> None:
+        """Write what waits.
+
+        Raises:
+            OSError: when the disk is full or gone; the file is good up to its last whole record.
+        """
+        with self._lock:
+            data, self._waiting = self._waiting, bytearray()
+            counts, self._waiting_counts = self._waiting_counts, Counter()
+        left = memoryview(data)
+        while left:
+            left = left[self._file.write(left) :]
+        self.size += len(data)
+        self.counts += counts
+
+    @property
+    def seconds(self) -> float:
+        """Tell for how long it has recorded [s]."""
+        return time.monotonic() - self._begun
+
+    def words(self) -> str:
+        """Say how much has been written."""
+        kinds = ", ".join(f"{n:,} {topic.lstrip('@')}" for topic, n in self.counts.most_common())
+        said = f"{self.seconds:.0f} s, {self.counts.total():,} messages, {self.size / 1e6:.1f} MB"
+        return f"{said} ({kinds or 'nothing heard yet: is a gateway running?'})"
+
+
+def _record(recorder: Recorder, args: argparse.Namespace, stop: threading.Event) -> None:
+    """Write and show it until told to stop or the time is over."""
+    console = Console(stderr=True)
+    due = _PLAIN_S
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        over = False
+        while not over:
+            left = args.seconds - recorder.seconds if args.seconds else WRITE_S
+            over = stop.wait(max(0.0, min(left, WRITE_S))) or (args.seconds and recorder.seconds >= args.seconds)
+            recorder.write()
+            if console.is_terminal:
+                live.update(Text(f"recording {args.file.name}: {recorder.words()}"), refresh=True)
+            elif recorder.seconds >= due and not over:
+                due += _PLAIN_S
+                tell("fleet record", recorder.words())

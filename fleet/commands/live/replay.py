@@ -1,0 +1,93 @@
+"""Play recordings into a running fleet, as if they were flown now."""
+
+import argparse
+import threading
+from functools import partial
+from pathlib import Path
+from urllib.parse import quote
+
+from fleet.cli import stop_on_signal
+from fleet.config import passed_on, router_arguments
+from fleet.process.children import run_until
+from fleet.process.logs import tell
+from fleet.report.progress import shown
+from fleet.telemetry.recording.ids import Ids
+from fleet.telemetry.recording.pace import read_speed
+from fleet.telemetry.replay.broadcaster import MOST_ON_A_LINK, Airing, address, shared
+
+EXAMPLES = """
+  fleet replay flight.tlog
+  fleet replay flight.tlog.xz log7.bin --speed 4
+  fleet replay one.tlog two.ulg --speed max --router tcp/127.0.0.1:7447
+  fleet replay monday.parauav --results                        what the twins said then, not what they say now
+  fleet replay flight.tlog --copies 50                         fifty aircraft, 500 m apart
+  fleet replay flight.tlog --copies 50 --to 127.0.0.1:14550    the same as MAVLink over UDP
+  fleet replay flight.tlog --copies 500 --to 127.0.0.1:14550 --to 127.0.0.1:14551    250 aircraft a link
+"""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `fleet replay`."""
+    parser.add_argument("file", nargs="+", metavar="FILE", help="recordings of any kind, also compressed")
+    parser.add_argument("--speed", default="1", metavar="N|max", help="times real time, or max (1)")
+    parser.add_argument("--copies", type=int, default=1, metavar="N", help="aircraft for each recorded one (1)")
+    parser.add_argument("--results", action="store_true", help="play also the models, predictions and alerts recorded")
+    parser.add_argument(
+        "--to",
+        action="append",
+        metavar="HOST:PORT",
+        help="send a .tlog as MAVLink over UDP there, on this machine; "
+        f"repeatable: the copies are shared out, at most {MOST_ON_A_LINK} aircraft each",
+    )
+    parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
+    router_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start a gateway that plays the files; its exit code is ours. Or send them as datagrams."""
+    check(args)
+    if args.to:
+        return _send(args)
+    options = [f"--link={link(name, args)}" for name in args.file]
+    options += [*passed_on(args), f"--offset={args.offset}", "--listen-only"]
+    return run_until(stop_on_signal(), "gateway", *options)
+
+
+def _send(args: argparse.Namespace) -> int:
+    """Send every file in a thread of its own; exit code 1 where one could not be sent to its end."""
+    airings, places = [], []
+    for to, numbers in zip(map(address, args.to), shared(args.copies, len(args.to)), strict=True):
+        ids = Ids(1, MOST_ON_A_LINK)
+        for name in args.file if numbers else ():
+            airings.append(Airing(Path(name), read_speed(args.speed), numbers, args.copies, ids))
+            places.append(to)
+    stop = stop_on_signal()
+    pairs = zip(airings, places, strict=True)
+    threads = [threading.Thread(target=airing.send, args=(to, stop), name=airing.name) for airing, to in pairs]
+    with shown(airings, partial(tell, "fleet replay")):
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    for airing in airings:
+        tell("fleet replay", airing.trouble or f"{airing.name}: {airing.words()}")
+    return 1 if any(airing.trouble for airing in airings) else 0
+
+
+def check(args: argparse.Namespace) -> None:
+    """Refuse wrong use before anything is opened.
+
+    Raises:
+        ValueError: when an option makes no sense; the sentence says which.
+    """
+    read_speed(args.speed)
+    if not 1 <= args.copies <= 10_000:
+        raise ValueError(f"--copies: found {args.copies}, expected 1 to 10,000; change it")
+    if args.results and args.copies > 1:
+        raise ValueError("--results: found --copies too, expected one of them; results are of the aircraft recorded")
+
+
+def link(name: str, args: argparse.Namespace) -> str:
+    """Give the gateway's `--link` for one recording, by its name and --speed, --copies and --results."""
+    path = quote(str(Path(name).resolve()), safe="/ ")
+    return f"replay:{path}?speed={args.speed}&copies={args.copies}&results={int(args.results)}"

@@ -1,0 +1,214 @@
+"""Start a whole fleet on this machine: router, aircraft, gateway, worker, viewer."""
+
+import argparse
+import json
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.text import Text
+
+from fleet.access.knock import answers
+from fleet.bus.bus_protocol import Bus
+from fleet.bus.session import connect, open_router
+from fleet.cli import stop_on_signal
+from fleet.commands.live.fly import AIRCRAFT, AUTOPILOTS, fault_arguments, faults_of
+from fleet.commands.live.replay import check as check_playing
+from fleet.commands.live.replay import link
+from fleet.commands.live.status import as_objects, fleet_rows, table
+from fleet.config import entry, passed_on, router_arguments
+from fleet.contract import FleetRow, FleetState, State
+from fleet.process.children import Children
+from fleet.process.logs import tell, timed
+from fleet.process.sanitise import plain
+
+EXAMPLES = """
+  fleet up --uavs 8
+  fleet up --uavs 4 --autopilot px4 --aircraft c172p
+  fleet up --uavs 4 --fault drag_increase,dCD=0.04,at=120 --fault-uav 2      and see whether its twin finds out
+  fleet up --link udpin:0.0.0.0:14550
+  fleet up --link serial:/dev/ttyUSB0:57600 --forward udpin:127.0.0.1:14551      QGroundControl beside us, at 14551
+  fleet up --replay flight.tlog.xz log7.bin --speed 4
+  fleet up --replay monday.parauav --results
+  fleet up --uavs 8 --for 240 --no-viewer --summary summary.json
+  fleet up --router tcp/127.0.0.1:7448 --mavlink 127.0.0.1:14551 --port 8081      a second fleet beside the first
+"""
+_MAVLINK = "127.0.0.1:14550"
+_PLAIN_S = 10.0  # between progress lines where the output is no terminal [s]
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--uavs", type=int, default=8, metavar="N", help="simulated aircraft, ids 0 to N-1 (8)")
+    parser.add_argument("--autopilot", choices=AUTOPILOTS, default="ardupilot", help="theirs (ardupilot)")
+    parser.add_argument("--aircraft", choices=AIRCRAFT, default="small", help="their type (small)")
+    fault_arguments(parser)
+    parser.add_argument("--mavlink", default=_MAVLINK, metavar="HOST:PORT", help=f"where they send UDP ({_MAVLINK})")
+    parser.add_argument("--link", action="append", default=[], help="real aircraft instead, e.g. udpin:0.0.0.0:14550")
+    parser.add_argument("--forward", action="append", default=[], help="another ground station, as in gateway --help")
+    parser.add_argument("--keys", metavar="FILE", help="keys of links that are signed, as in gateway --help")
+    parser.add_argument(
+        "--replay", action="extend", nargs="+", default=[], metavar="FILE", help="recordings of any kind instead"
+    )
+    parser.add_argument("--speed", default="1", help="replay speed, a number or max (1)")
+    parser.add_argument("--copies", type=int, default=1, metavar="N", help="aircraft for each recorded one (1)")
+    parser.add_argument("--results", action="store_true", help="show the results recorded, compute none")
+    parser.add_argument("--for", dest="seconds", type=float, default=0.0, help="stop this long after the first sample")
+    parser.add_argument("--no-viewer", action="store_true", help="without the web page")
+    parser.add_argument("--port", type=int, default=8080, help="port of the web page (8080)")
+    parser.add_argument("--terrain", metavar="FILE", help="heights of the ground for the page, as in viewer --help")
+    parser.add_argument("--imagery", metavar="FILE", help="picture of the ground for the page, as in viewer --help")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the simulated aircraft (1)")
+    router_arguments(parser)
+    parser.add_argument(
+        "--baseline",
+        action="append",
+        default=[],
+        metavar="[ID=]MODEL",
+        help="find mismatches against this model, of one aircraft or of all (each one's own first flight)",
+    )
+    parser.add_argument("--summary", type=Path, metavar="FILE", help="write the last state of every UAV as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start everything, show it, stop it; exit code 1 where a part died, 2 where it refused what it was told."""
+    _check(args)
+    stop = stop_on_signal()
+    at = entry(args)
+    router = None if answers(at) else open_router(at)
+    try:
+        with connect(at) as bus, Children() as children:
+            _start(children, args)
+            return _watch(bus, children, args, stop)
+    finally:
+        if router is not None:
+            router.close()
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse at once what could only fail later.
+
+    Raises:
+        ValueError: when an option makes no sense; the sentence says which.
+    """
+    if not 1 <= args.uavs <= 250:
+        raise ValueError(f"--uavs: found {args.uavs}, expected 1 to 250 aircraft; start several fleets for more")
+    if not 0 <= args.seconds < float("inf"):
+        raise ValueError(f"--for: found {args.seconds} s, expected 0 (until Ctrl-C) or more; change it")
+    check_playing(args)
+    if args.fault and (args.link or args.replay):
+        raise ValueError("--fault: found --link or --replay, expected simulated aircraft to carry it; leave one out")
+    faults_of(args, range(args.uavs))
+    if args.results and not args.replay:
+        raise ValueError("--results: found no --replay, expected a recording made by `fleet record`; name one")
+    for name in args.replay:
+        if not Path(name).is_file():
+            raise ValueError(f"--replay: found no recording {name!r}, expected a file; check the path")
+    if args.summary and not args.summary.absolute().parent.is_dir():
+        raise ValueError(f"--summary: found no folder {str(args.summary.parent)!r}, expected one; make it first")
+    if not (args.link or args.replay):
+        _check_free(args.mavlink)
+
+
+def _check_free(mavlink: str) -> None:
+    host, _, port = mavlink.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
+        raise ValueError(f"--mavlink: found {mavlink!r}, expected HOST:PORT such as {_MAVLINK}; correct it")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+        try:
+            trial.bind((host, int(port)))
+        except OSError as error:
+            reason = f"UDP {mavlink} not free ({error.strerror or error}), expected a port for the simulated aircraft"
+            raise ValueError(f"--mavlink: found {reason}; is a fleet already up? name another") from None
+
+
+def _start(children: Children, args: argparse.Namespace) -> None:
+    router = passed_on(args)
+    if not args.results:
+        ids = "0-999999" if args.replay else "0-249"
+        base = [f"--baseline={text}" for text in args.baseline]
+        children.start("twin worker", "twin_worker", "--uavs", ids, *base, *router)
+    passed = [f"--forward={text}" for text in args.forward] + ([f"--keys={args.keys}"] if args.keys else []) + router
+    links = [f"--link={text}" for text in args.link]
+    links += [f"--link={link(file, args)}" for file in args.replay]
+    if links:
+        children.start("gateway", "gateway", *links, *passed)
+    else:
+        children.start("gateway", "gateway", f"--link=udpin:{args.mavlink}", "--offset=-1", *passed)
+        aircraft = ["--uavs", f"0-{args.uavs - 1}", "--to", args.mavlink, "--seed", str(args.seed)]
+        aircraft += ["--autopilot", args.autopilot, "--aircraft", args.aircraft]
+        aircraft += [f"--fault={text}" for text in args.fault]
+        aircraft += [] if args.fault_uav is None else [f"--fault-uav={args.fault_uav}"]
+        children.start("aircraft", "fleet.cli", "fly", *aircraft)
+    if not args.no_viewer:
+        ground = [f"--{name}={file}" for name in ("terrain", "imagery") if (file := getattr(args, name))]
+        children.start("viewer", "viewer", "--port", str(args.port), *ground, *router)
+
+
+def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threading.Event) -> int:
+    """Show the fleet once a second until told to stop, a part dies or the time is over."""
+    said: list[str] = [""]  # by the worker, the newest last; none is lost between two looks
+    bus.subscribe(
+        FleetState, lambda state, _: said.append(plain(state.sentence)) if plain(state.sentence) != said[-1] else None
+    )
+    rows: list[FleetRow] = []
+    first = None
+    show = _Show(Console(stderr=True))
+    with show.live:
+        while not stop.wait(1.0):
+            rows = fleet_rows(bus) or rows
+            if first is None and any(row.sample_age_s is not None for row in rows):
+                first = time.monotonic()
+            flown = 0.0 if first is None else time.monotonic() - first
+            show.draw(_lines(rows, children, said[-1], flown, args), rows, said)
+            if children.failed() or (args.seconds and flown >= args.seconds):
+                break
+    failed = children.failed()
+    if args.summary:
+        args.summary.write_text(json.dumps(as_objects(rows), indent=1) + "\n")
+    for _, sentence in failed:
+        tell("fleet up", sentence)
+    if stop.is_set():
+        tell("fleet up", "stopping")
+    return (2 if all(code == 2 for code, _ in failed) else 1) if failed else 0
+
+
+class _Show:
+    """The display: a live table on a terminal, elsewhere a line whenever there is news."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.live = Live(console=console, refresh_per_second=4, transient=not console.is_terminal)
+        self._said: set[str] = set()
+        self._due = 0.0
+
+    def draw(self, lines: list[str], rows: list[FleetRow], said: list[str]) -> None:
+        if self.console.is_terminal:
+            self.live.update(Group(Text("\n".join(lines)), table(rows[:40])))
+            return
+        news = [line for line in dict.fromkeys([*said, *lines[1:]]) if line and line not in self._said]
+        if time.monotonic() >= self._due:
+            self._due = time.monotonic() + _PLAIN_S
+            news.insert(0, lines[0])
+        self._said.update(news)
+        for line in news:
+            print(timed(plain(line)), file=sys.stderr, flush=True)
+
+
+def _lines(
+    rows: list[FleetRow], children: Children, sentence: str, flown: float, args: argparse.Namespace
+) -> list[str]:
+    count = {state: sum(row.state is state for row in rows) for state in State}
+    said = ", ".join(f"{n} {state.value}" for state, n in count.items() if n) or "waiting for the first sample"
+    lines = [f"fleet up · {len(rows)} UAVs · {flown:.0f} s since the first sample · {said}"]
+    lines += [sentence] if sentence else []
+    lines += children.words()
+    if args.replay and "gateway" in children.done():
+        lines.append("the recording has ended; the twins fly on alone until Ctrl-C")
+    if not args.no_viewer:
+        lines.append(f"viewer: http://127.0.0.1:{args.port}   (Ctrl-C stops everything)")
+    return lines

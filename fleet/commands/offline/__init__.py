@@ -1,0 +1,1 @@
+"""Verbs of `fleet` that work on files."""

@@ -1,0 +1,75 @@
+"""Fly recordings through the twins as if live, and score every prediction against what then happened."""
+
+import argparse
+from pathlib import Path
+
+from fleet.cli import stop_on_signal
+from fleet.process.children import run_until
+from fleet.process.interrupt import INTERRUPTED
+from fleet.process.logs import tell
+
+EXAMPLES = """
+  fleet assess flight.tlog
+  fleet assess monday/*.tlog.xz --out monday --json monday.json --jobs 2
+  fleet assess flight.tlog --methods route_wind --without-params     ours against one, autopilot parameters withheld
+"""
+OWN = ("auto", "dynamics", "hybrid", "paper")
+METHODS = ("cv", "ct", "imm", "route", "route_wind", "paper", "dynamics")
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options; `python -m twin_worker.evaluation` takes the same."""
+    parser.add_argument("file", nargs="+", type=Path, metavar="FILE", help="recordings of any kind, also compressed")
+    parser.add_argument("--every", type=float, default=5.0, metavar="S", help="between starts (5)")
+    parser.add_argument("--method", default=OWN[0], choices=OWN, help="of our twin (auto: the best it has)")
+    parser.add_argument(
+        "--methods", default=",".join(METHODS), metavar="A,B", help=f"compare with these ({','.join(METHODS)})"
+    )
+    parser.add_argument("--without-params", action="store_true", help="keep the autopilot's parameters from the twins")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="draw figures and write predictions.npz into DIR")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that share the aircraft (1)")
+    parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
+
+
+def check(args: argparse.Namespace) -> None:
+    """Refuse wrong use before anything is read.
+
+    Raises:
+        ValueError: when an option makes no sense; the sentence says which.
+    """
+    if not 1.0 <= args.every <= 600.0:
+        raise ValueError(f"--every: found {args.every:g} s, expected 1..600; a twin predicts once a second")
+    unknown = [name for name in chosen(args.methods) if name not in METHODS]
+    if unknown:
+        raise ValueError(f"--methods: found {', '.join(unknown)}, expected some of {', '.join(METHODS)}; correct it")
+    if not 1 <= args.jobs <= 64:
+        raise ValueError(f"--jobs: found {args.jobs}, expected 1..64; change it")
+    for path in args.file:
+        if not path.is_file():
+            raise ValueError(f"FILE: found no recording {str(path)!r}, expected a file; check the path")
+    if args.json and not args.json.absolute().parent.is_dir():
+        raise ValueError(f"--json: found no folder {str(args.json.parent)!r}, expected one; make it first")
+    if args.json and any(args.json.exists() and path.samefile(args.json) for path in args.file):
+        raise ValueError(f"--json: found the recording {str(args.json)!r} itself, expected another file; rename it")
+    if args.out and args.out.exists() and not args.out.is_dir():
+        raise ValueError(f"--out: found the file {str(args.out)!r}, expected a folder; name another")
+
+
+def chosen(methods: str) -> tuple[str, ...]:
+    """Read the names of methods, ours left out."""
+    return tuple(name for name in dict.fromkeys(methods.split(",")) if name and name != "ours")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start the assessment; its exit code is ours."""
+    check(args)
+    stop = stop_on_signal()
+    options = [f"--{name}={getattr(args, name)}" for name in ("every", "method", "methods", "jobs", "offset")]
+    options += [f"--{name}={value}" for name, value in (("out", args.out), ("json", args.json)) if value]
+    options += ["--without-params"] if args.without_params else []
+    code = run_until(stop, "twin_worker.evaluation", *options, "--", *map(str, args.file))
+    if stop.is_set():
+        tell("assess", "stopped; what was not finished is not written")
+        return INTERRUPTED
+    return code

@@ -1,0 +1,42 @@
+"""Calibrate an aircraft's simulation on nominal flights, for `fleet diagnose`."""
+
+import argparse
+from pathlib import Path
+
+from fleet.cli import stop_on_signal
+from fleet.process.children import run_until
+from fleet.process.interrupt import INTERRUPTED
+from fleet.process.logs import tell
+
+EXAMPLES = """
+  fleet calibrate monday/*.tlog --airframe skywalker --out skywalker.json
+  fleet calibrate calm.tlog windy.tlog --out plane.json         without a card: a unit body, derivatives dimensional
+  fleet calibrate today.tlog --until 120 --out today.json       what a flight did itself in its first two minutes
+  fleet calibrate cal_*.tlog --airframe card.json --out c172.json --json figures.json
+"""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options; `python -m twin_worker.diagnosis.learn` takes the same."""
+    parser.add_argument(
+        "file", nargs="+", type=Path, metavar="NOMINAL", help="recordings without a fault, the livelier the better"
+    )
+    parser.add_argument("--airframe", type=Path, metavar="CARD", help="airframe TOML, its name, or a JSON card (none)")
+    parser.add_argument(
+        "--until", type=float, metavar="SECONDS", help="trust only what came before SECONDS on each flight's clock"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="write the simulation to MODEL")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write what was reached to FILE")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Start the calibration; its exit code is ours."""
+    stop = stop_on_signal()
+    options = [
+        f"--{name}={getattr(args, name)}" for name in ("airframe", "until", "out", "json") if getattr(args, name)
+    ]
+    code = run_until(stop, "twin_worker.diagnosis.learn", *options, "--", *map(str, args.file))
+    if stop.is_set():
+        tell("calibrate", "stopped; no model was written")
+        return INTERRUPTED
+    return code

@@ -1,0 +1,113 @@
+"""Repeat the paper's experiments: fly pretend aircraft, identify them or predict them, draw the figures."""
+
+import argparse
+import contextlib
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event
+
+from fleet.cli import id_range, stop_on_signal
+from fleet.process.children import run_until
+from fleet.process.interrupt import INTERRUPTED
+from fleet.process.logs import tell
+
+EXAMPLES = """
+  fleet paper identify --out figures --json paper.json
+  fleet paper identify --uavs 0-1 --for 180 --first pbsid
+  fleet paper identify flight.tlog.xz          on recordings instead of pretend flights
+  fleet paper predict --out figures --jobs 2   60 s ahead from every start, by the paper's way and by ours
+"""
+_UAVS = {"identify": range(12), "predict": range(16)}
+_LEAST_S = {"identify": (70, "20 + 40 + 8 s"), "predict": (200, "120 + 60 s and some starts")}  # flown time [s]
+_STARTS, _EVERY_S = 20, 5.0  # predictions of the paper; between two of ours [s]
+_BESIDE = "paper,route_wind"  # methods beside ours
+_LOSS = 0.01  # share of frames lost on the way [-]
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        "experiment", choices=tuple(_UAVS), help="identify: figures 7 and 8, first step and refined; predict: figure 9"
+    )
+    parser.add_argument("file", nargs="*", type=Path, metavar="FILE", help="recordings (none: fly pretend aircraft)")
+    parser.add_argument("--uavs", type=id_range, metavar="A-B", help="aircraft to fly (0-11; predict: 0-15)")
+    parser.add_argument("--seed", type=int, default=5, help="draws aircraft, missions, weather and noise (5)")
+    parser.add_argument("--for", dest="seconds", type=float, default=300.0, metavar="S", help="flown time (300)")
+    parser.add_argument("--wind", type=float, default=3.0, metavar="M/S", help="mean wind at 100 m (3)")
+    parser.add_argument("--turbulence", default="1", metavar="LEVEL", help="MIL-F-8785C: none, light … or 0..7 (1)")
+    parser.add_argument(
+        "--first", choices=("projection", "pbsid", "both"), default="both", help="first step: the paper's, PBSID (both)"
+    )
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that share the predictions (1)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="draw the figures into DIR")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the numbers to FILE")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly where no recording is named, then start the experiment; its exit code is ours.
+
+    Raises:
+        ValueError: when an option makes no sense; the sentence says which.
+    """
+    least, why = _LEAST_S[args.experiment]
+    if not least <= args.seconds <= 3600:
+        raise ValueError(f"for: found {args.seconds:.0f} s, expected {least}..3600 ({why} at least); change --for")
+    args.uavs = args.uavs or _UAVS[args.experiment]
+    starts = int((args.seconds - 180) / _EVERY_S) * len(args.uavs)
+    if args.experiment == "predict" and not args.file and starts < _STARTS:
+        raise ValueError(
+            f"for: found time for {starts} starts, expected {_STARTS} as in the paper; raise --for or --uavs"
+        )
+    stop = stop_on_signal()
+    with _recordings(args, stop) as files:
+        return INTERRUPTED if stop.is_set() else _judge(args, files, stop)
+
+
+@contextlib.contextmanager
+def _recordings(args: argparse.Namespace, stop: Event) -> Iterator[list[Path]]:
+    """Give the recordings named, or fly some into a folder that is gone afterwards."""
+    if args.file:
+        yield args.file
+        return
+    with tempfile.TemporaryDirectory(prefix="fleet-paper-") as folder:
+        path = Path(folder) / "flight.tlog"
+        _fly(args, path, stop)
+        yield [path]
+
+
+def _fly(args: argparse.Namespace, path: Path, stop: Event) -> None:
+    """Fly as fast as possible into a recording, under a progress bar."""
+    from rich.progress import Progress
+
+    from fleet.simulator.flight import drive  # loads JSBSim and the compiler: not for --help
+    from fleet.simulator.flight.uav import PretendUav
+    from fleet.simulator.vehicle.weather import turbulence_level
+
+    level = turbulence_level(args.turbulence)
+    uavs = [PretendUav(i, args.seed, wind=args.wind, turbulence=level) for i in args.uavs]
+    with Progress(transient=True) as bar:
+        task = bar.add_task(f"flying {len(uavs)} aircraft", total=args.seconds)
+        drive.to_tlog(
+            path,
+            uavs,
+            seconds=args.seconds,
+            loss=_LOSS,
+            seed=args.seed,
+            progress=lambda t: bar.update(task, completed=t),
+            stop=stop,
+        )
+
+
+def _judge(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
+    """Identify by the paper's two steps, or predict by its method and ours."""
+    options = [f"--{name}={value}" for name, value in (("out", args.out), ("json", args.json)) if value]
+    if args.experiment == "identify":
+        command = ["twin_worker.paper_experiments", args.experiment, f"--first={args.first}"]
+    else:
+        command = ["twin_worker.evaluation", f"--methods={_BESIDE}", f"--every={_EVERY_S}", f"--jobs={args.jobs}"]
+    code = run_until(stop, *command, *options, *map(str, files))
+    if stop.is_set():
+        tell("paper", "stopped; what was not finished is not written")
+        return INTERRUPTED
+    return code

@@ -1,0 +1,1 @@
+"""Checks of `fleet doctor`: this machine, access to the bus, and the fleet behind it."""

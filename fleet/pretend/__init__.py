@@ -1,1 +1,0 @@
-"""The pretend aircraft: JSBSim physics that speaks real MAVLink."""

@@ -1,0 +1,119 @@
+"""Child processes that end with their parent: start by module name, keep their last words, stop cleanly."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from contextlib import AbstractContextManager
+
+from fleet.process.interrupt import PARENT, deferred
+from fleet.process.logs import untimed
+from fleet.process.sanitise import plain
+
+_PATIENCE_S = 8.0  # between the request to stop and the end of patience [s]
+_ALONE_S = 10.0  # the same for a child that is all its parent waits for [s]
+
+
+def run_until(stop: threading.Event, module: str, *options: str) -> int:
+    """Run `python -m module options…` in the foreground until it ends or `stop` is set; give its exit code."""
+    child = subprocess.Popen([sys.executable, "-m", module, *options], env=os.environ | {PARENT: str(os.getpid())})
+    try:
+        while child.poll() is None and not stop.wait(0.2):
+            pass
+    finally:
+        if child.poll() is None:
+            child.terminate()
+    code = child.wait(_ALONE_S)
+    return code if code >= 0 else 128 - code
+
+
+def run_to_end(module: str, *options: str) -> tuple[int, str]:
+    """Run `python -m module options…` to its end and return its exit code and standard error; Ctrl-C ends it too."""
+    child = None
+    try:
+        with deferred():  # otherwise it could be started without being known here
+            command = [sys.executable, "-m", module, *options]
+            child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        _, errors = child.communicate()
+        return child.returncode, errors
+    finally:
+        with deferred():
+            if child is not None and child.poll() is None:
+                child.kill()
+                child.communicate()
+
+
+class Children(AbstractContextManager):
+    """Processes of one fleet."""
+
+    def __init__(self) -> None:
+        self._running: dict[str, subprocess.Popen[str]] = {}
+        self._words: dict[str, deque[str]] = {}
+        self._ears: dict[str, threading.Thread] = {}
+
+    def start(self, name: str, module: str, *options: str) -> None:
+        """Start `python -m module options…`; what it prints becomes its last words."""
+        child = subprocess.Popen(
+            [sys.executable, "-m", module, *options],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            start_new_session=True,  # Ctrl-C reaches the parent alone, which then ends the children in order
+            env=os.environ | {"PYTHONUNBUFFERED": "1", PARENT: str(os.getpid())},
+        )
+        self._running[name] = child
+        self._words[name] = deque(maxlen=6)
+        self._ears[name] = threading.Thread(target=self._listen, args=(name, child), daemon=True)
+        self._ears[name].start()
+
+    def _listen(self, name: str, child: subprocess.Popen[str]) -> None:
+        assert child.stdout is not None
+        with child.stdout:
+            for line in child.stdout:
+                if line.strip():
+                    self._words[name].append(untimed(plain(line.rstrip())))  # who says them again says when
+
+    def words(self) -> list[str]:
+        """Give each child's last line."""
+        return [words[-1] for words in self._words.values() if words]
+
+    def done(self) -> list[str]:
+        """Name the children that ended well."""
+        return [name for name, child in self._running.items() if child.poll() == 0]
+
+    def dead(self) -> list[str]:
+        """Name the children that failed."""
+        return [name for name, child in self._running.items() if child.poll()]
+
+    def failed(self) -> list[tuple[int, str]]:
+        """Give exit code and sentence of the children that failed; a refusal (2) is the child's own sentence."""
+        found = []
+        for name, child in self._running.items():
+            if code := child.poll():
+                self._ears[name].join(timeout=1.0)  # its last words may still be on the way
+                words = self._words[name]
+                refused = code == 2 and words
+                died = f"{name}: found it ended with exit code {code}, expected it to run until stopped; "
+                found.append((code, words[-1] if refused else died + f"its last words: {' | '.join(words) or 'none'}"))
+        return found
+
+    def stop(self) -> None:
+        """Ask all to stop, newest first, then insist."""
+        for child in reversed(self._running.values()):
+            if child.poll() is None:
+                child.send_signal(signal.SIGTERM)
+        patience = time.monotonic() + _PATIENCE_S
+        for child in self._running.values():
+            try:
+                child.wait(timeout=max(patience - time.monotonic(), 0.0))
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()

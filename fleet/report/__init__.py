@@ -1,0 +1,1 @@
+"""HTML report of an inspected recording, tables for the terminal, progress display."""

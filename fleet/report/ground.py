@@ -1,0 +1,144 @@
+"""The ground track on the page: flown path in mode colours, route, waypoints, wind."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.patheffects import withStroke
+
+from fleet.frames import Origin, to_ned
+from fleet.mission import (
+    FIRST,
+    KIND,
+    LOITER_TIME,
+    LOITER_TO_ALT,
+    LOITER_TURNS,
+    LOITER_UNLIMITED,
+    P_E,
+    P_N,
+    RADIUS,
+    SEQ,
+    route,
+)
+from fleet.report.ink import GRID, INK, MUTED, ROUTE, drawn
+from fleet.telemetry.inspection.findings import Findings
+from fleet.telemetry.inspection.survey import Survey, airborne, spells
+from fleet.telemetry.inspection.thinned import inside
+
+_CIRCLES = (LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT)
+_FAR = 2.0  # waypoints further out than this times the flown extent are not shown [-]
+_HALO = [withStroke(linewidth=2.0, foreground="white")]
+_USUAL_RADIUS = 60.0  # ArduPlane's default WP_LOITER_RAD [m]
+
+
+def ground_track(ax: Any, known: Survey, told: Findings, colours: dict[str, str]) -> None:
+    """Draw the map; says so where there is no position."""
+    ax.set_title("Ground track, from its first position", loc="left")
+    t, x = known.rows["position"].rows()
+    origin = known.origin()
+    if origin is None:
+        ax.text(0.5, 0.5, "no position rows", ha="center", va="center", transform=ax.transAxes, color=MUTED)
+        ax.set(xticks=[], yticks=[])
+        return
+    p = to_ned(origin, *x.T)
+    seen = inside(t, airborne(known))
+    seen = seen if seen.any() else np.ones(len(t), bool)
+    _flown(ax, known, t, p, colours)
+    legs = _legs(known, origin)
+    low, high = p[seen, :2].min(axis=0), p[seen, :2].max(axis=0)
+    reach = _FAR * max(*(high - low), 50.0)
+    near = [
+        leg for leg in legs if (leg[P_N : P_E + 1] > low - reach).all() and (leg[P_N : P_E + 1] < high + reach).all()
+    ]
+    _route(ax, near, known)
+    if len(near) < len(legs):
+        ax.text(0.02, 0.02, f"{len(legs) - len(near)} waypoints lie further out", transform=ax.transAxes, color=MUTED)
+    _frame(ax, np.vstack([p[seen, :2], *[leg[None, P_N : P_E + 1] for leg in near]]))
+    _ends(ax, p[seen])
+    _wind(ax, told)
+
+
+def _flown(ax: Any, known: Survey, t: np.ndarray, p: np.ndarray, colours: dict[str, str]) -> None:
+    """Draw the path mode by mode; what was flown before any mode was told, or in none, in grey."""
+    ax.plot(p[:, 1], p[:, 0], color=GRID, lw=2.0, zorder=1)
+    named: set[str] = set()
+    for span, mode in spells(known):
+        there = (t >= span.start) & (t <= span.stop)
+        if there.sum() < 2:
+            continue
+        at, east = drawn(t[there], p[there, 1], np.inf)
+        label = None if mode in named else mode
+        ax.plot(east, np.interp(at, t, p[:, 0]), color=colours[mode], lw=1.3, zorder=3, label=label)
+        named.add(mode)
+
+
+def _legs(known: Survey, origin: Origin) -> list[np.ndarray]:
+    """Unroll the route once: each mission item at most one leg."""
+    seen: dict[int, np.ndarray] = {}
+    first = FIRST.get(known.status.autopilot, 1) if known.status else 1
+    for leg in route(known.items, seq=first, origin=origin, params=known.values, first=first).legs:
+        if leg[SEQ] >= 0:
+            seen.setdefault(int(leg[SEQ]), leg)
+    return [seen[seq] for seq in sorted(seen)]
+
+
+def _route(ax: Any, legs: list[np.ndarray], known: Survey) -> None:
+    if not legs:
+        return
+    east, north = [leg[P_E] for leg in legs], [leg[P_N] for leg in legs]
+    ax.plot(east, north, color=ROUTE, lw=0.9, ls=(0, (5, 3)), marker="D", ms=3.5, mfc="white", zorder=2, label="route")
+    written: set[tuple[int, int]] = set()
+    for leg in legs:
+        at = (round(leg[P_E] / 20), round(leg[P_N] / 20))
+        offset = (4, 4) if at not in written else (4, -9)  # two items on one spot stay readable
+        written.add(at)
+        ax.annotate(
+            str(int(leg[SEQ])),
+            (leg[P_E], leg[P_N]),
+            xytext=offset,
+            textcoords="offset points",
+            color=ROUTE,
+            size=7,
+            zorder=5,
+            path_effects=_HALO,
+        )
+        if int(leg[KIND]) in _CIRCLES:
+            radius = abs(leg[RADIUS]) or abs(known.values.get("WP_LOITER_RAD", _USUAL_RADIUS))
+            a = np.linspace(0, 2 * np.pi, 90)
+            ax.plot(leg[P_E] + radius * np.sin(a), leg[P_N] + radius * np.cos(a), color=ROUTE, lw=0.8, ls=":", zorder=2)
+
+
+def _frame(ax: Any, p: np.ndarray) -> None:
+    """Frame the path and the waypoints with equal scales."""
+    low, high = p.min(axis=0), p.max(axis=0)
+    middle, size = 0.5 * (low + high), 1.12 * np.maximum(high - low, 25.0)
+    box = ax.get_position()
+    width, height = ax.figure.get_size_inches() * (box.width, box.height)
+    scale = max(size[1] / width, size[0] / height)
+    east, north = 0.5 * scale * width, 0.5 * scale * height
+    ax.set(xlim=(middle[1] - east, middle[1] + east), ylim=(middle[0] - north, middle[0] + north), aspect="equal")
+    ax.set_xlabel("east [m]")
+    ax.set_ylabel("north [m]")
+
+
+def _ends(ax: Any, p: np.ndarray) -> None:
+    """Mark where the flight begins and ends, and which way it goes."""
+    ax.plot(p[0, 1], p[0, 0], "o", color=INK, ms=5, mfc="white", zorder=6, label="begins")
+    ax.plot(p[-1, 1], p[-1, 0], "s", color=INK, ms=4.5, zorder=6, label="ends")
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1))])
+    for k in np.searchsorted(way, np.linspace(0, way[-1], 10)[1:-1]):
+        back = max(int(np.searchsorted(way, way[k] - 0.004 * way[-1])) - 1, 0)
+        if back < k:
+            arrow = {"arrowstyle": "-|>", "color": INK, "lw": 0, "mutation_scale": 9, "shrinkA": 0, "shrinkB": 0}
+            ax.annotate("", (p[k, 1], p[k, 0]), (p[back, 1], p[back, 0]), arrowprops=arrow, zorder=4)
+
+
+def _wind(ax: Any, told: Findings) -> None:
+    """Draw where the wind blows to, in the corner."""
+    if told.wind is None or told.wind.speed < 0.1:
+        return
+    to = np.radians(told.wind.from_deg + 180)
+    size = {"units": "inches", "scale_units": "inches", "scale": 1 / 0.36, "width": 0.022}
+    place = {"transform": ax.transAxes, "pivot": "middle", "angles": "uv", "zorder": 6}
+    ax.quiver([0.93], [0.92], [np.sin(to)], [np.cos(to)], color=MUTED, **size, **place)
+    words = f"wind {told.wind.speed:.1f} m/s"
+    ax.text(0.985, 0.815, words, ha="right", color=MUTED, size=7, transform=ax.transAxes, path_effects=_HALO, zorder=6)

@@ -1,0 +1,29 @@
+"""A self-contained page: one file that fetches nothing and runs nothing."""
+
+from html import escape
+from pathlib import Path
+
+from fleet.process.sanitise import plain
+from fleet.report.ink import BAD, GOOD, GRID, INK, LINES, MUTED, ROUTE
+
+_GUARD = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # nothing is fetched, nothing runs
+_COLOURS = {"ink": INK, "muted": MUTED, "line": GRID, "good": GOOD, "bad": BAD, "doubt": LINES[3], "odd": ROUTE}
+
+
+def document(title: str, body: str) -> str:
+    """Give a page in the house's style; `title` is text, `body` is HTML."""
+    colours = "".join(f"--{name}:{colour};" for name, colour in _COLOURS.items())
+    style = f":root{{{colours}}}\n" + Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+    head = (
+        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{_GUARD}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    )
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head>{head}<title>{safe(title)}</title>\n<style>{style}</style></head>\n'
+        f"<body><main>\n{body}\n</main></body></html>\n"
+    )
+
+
+def safe(text: str) -> str:
+    """Escape what came with the data: a flight is named after its file."""
+    return escape(plain(text))

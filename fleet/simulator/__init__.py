@@ -1,0 +1,1 @@
+"""Simulated aircraft: JSBSim flight dynamics with a MAVLink interface."""

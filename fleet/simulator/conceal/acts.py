@@ -1,0 +1,115 @@
+"""Does a hidden effect act on its flight: what it changes, over the noise of the sensors.
+
+Two comparisons. Within one flight, ten times a second: the same aircraft in the same state with the effect and without,
+in commands, readings, forces and moments; it decides. And two flights of one seed, one with the effect and one without:
+whatever acts makes them part.
+"""
+
+import numpy as np
+
+from fleet.simulator.conceal.plan import Planned
+from fleet.simulator.conceal.record import Log, fly
+from fleet.simulator.faults.carried import Carried
+from fleet.simulator.faults.fault import Fault
+from fleet.simulator.faults.oddities import ODD
+from fleet.simulator.faults.physics import CHANGES, WINDS
+from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.vehicle.jsbsim import DT
+
+_AT_ONCE: dict[str, float] = {  # what can be seen in one channel of one instant, as `sensors` has it
+    **dict.fromkeys(("aileron", "elevator", "rudder", "throttle"), 0.01),  # share of full travel
+    **dict.fromkeys(("p", "q", "r"), 0.003),  # [rad/s]
+    **dict.fromkeys(("a_x", "a_y", "a_z"), 0.07),  # [m/s2]
+    **dict.fromkeys(("phi", "theta", "psi"), 0.0044),  # [rad]
+    **dict.fromkeys(("v_n", "v_e", "v_d"), 0.075),  # [m/s]
+    "Va": 0.25,
+    "baro": 0.4,  # [m/s], [m]
+    **dict.fromkeys(("p_dot", "q_dot", "r_dot"), 0.006),  # of the gyros, derived up to 1.5 Hz [rad/s2]
+    **dict.fromkeys(("f_x", "f_y", "f_z"), 0.07),  # [m/s2]
+    **dict.fromkeys(("w_n", "w_e", "w_d"), 0.25),  # [m/s]
+}
+_FLOWN: dict[str, float] = {  # columns of `Log.seen`
+    **{name: _AT_ONCE[name] for name in ("p", "q", "r", "a_x", "a_y", "a_z", "phi", "theta", "psi")},
+    **{name: _AT_ONCE[name] for name in ("v_n", "v_e", "v_d")},
+    **dict.fromkeys(("p_n", "p_e", "p_d"), 0.5),  # [m]
+    "Va": 0.25,
+    "baro": 0.4,
+    "satellites": 1.5,  # [m/s], [m], [m]
+    **{name: _AT_ONCE[name] for name in ("aileron", "elevator", "throttle", "rudder")},
+}
+_LATE = ("turbulence", "flap_deployed", "thrust_loss", "_surging_engine")  # no instant tells them
+_SHAKEN = ("p", "q", "r", "a_y", "a_z", "Va")
+LEAST = 2.0  # rms over the noise
+
+
+def acts(planned: Planned, fault: Fault, log: Log) -> dict[str, object]:
+    """Tell how strongly one hidden effect acts while it is there.
+
+    Args:
+        planned: the flight
+        fault: one of those it hides
+        log: the flight with all it hides
+    Returns:
+        name; over_noise, channel: rms over the noise in the most telling channel; flown_over_noise, flown_channel: rms
+        difference between two flights
+    """
+    without, _ = fly(planned, tuple(x for x in planned.hidden if x is not fault))
+    there = np.array([fault.share(t) > 0 for t in log.t])
+    flown = _flown(log.seen[there], without.seen[there], shaken=fault.name == "turbulence")
+    late = fault.name in _LATE and not (fault.name == "thrust_loss" and planned.job.airframe == "small")
+    best = flown if late else _at_once(planned, fault, there)
+    return {
+        "name": fault.name,
+        "over_noise": round(best[0], 1),
+        "channel": best[1],
+        "flown_over_noise": round(flown[0], 1),
+        "flown_channel": flown[1],
+    }
+
+
+def _flown(with_it: np.ndarray, without: np.ndarray, shaken: bool) -> tuple[float, str]:
+    """Compare two flights; what only shakes is seen in the scatter. Where it flew is no evidence."""
+    names = list(_FLOWN)
+    difference = with_it - without
+    turns = [names.index(name) for name in ("phi", "psi")]
+    difference[:, turns] = np.angle(np.exp(1j * difference[:, turns]))
+    size = np.sqrt(np.mean(difference**2, axis=0))
+    if shaken:
+        size = np.sqrt(np.maximum(with_it.var(axis=0) - without.var(axis=0), 0.0))
+    rms = dict(zip(names, size / np.array(list(_FLOWN.values())), strict=True))
+    telling = _SHAKEN if shaken else [x for x in names if x not in ("p_n", "p_e", "v_n", "v_e", "satellites")]
+    return _most(rms, telling)
+
+
+def _most(rms: dict[str, float], telling: object) -> tuple[float, str]:
+    best = max(telling, key=lambda name: rms[name])  # type: ignore[call-overload]
+    return float(rms[best]), best
+
+
+def _at_once(planned: Planned, fault: Fault, there: np.ndarray) -> tuple[float, str]:
+    """Fly again, and compare within the flight."""
+    rows: list[np.ndarray] = []
+    fly(planned, planned.hidden, look=lambda uav: rows.append(_changed(uav, fault)))
+    size = np.sqrt(np.mean(np.array(rows)[there] ** 2, axis=0)) / np.array(list(_AT_ONCE.values()))
+    return _most(dict(zip(_AT_ONCE, size, strict=True)), list(_AT_ONCE))
+
+
+def _changed(uav: PretendUav, fault: Fault) -> np.ndarray:
+    """Give what one fault changes at this instant, columns as in `_AT_ONCE`."""
+    t, carried = uav.tick * DT, uav.carried
+    assert carried is not None
+    felt, blown = np.zeros(6), np.zeros(3)
+    if fault.name in CHANGES or fault.name in ODD:
+        felt = _forces(uav, carried, fault, t)
+    if fault.name in WINDS:
+        blown = fault.share(t) * WINDS[fault.name](fault.values, -float(uav.now.p[2]))
+    return np.concatenate([carried.moved[fault], carried.spoilt[fault], felt, blown])
+
+
+def _forces(uav: PretendUav, carried: Carried, fault: Fault, t: float) -> np.ndarray:
+    """Work out moments and forces with and without a fault; servos move on a little each time, so with it twice."""
+    before = uav.aircraft.ponder()
+    carried.press(t, without=fault)
+    without = uav.aircraft.ponder()
+    carried.press(t)
+    return np.asarray((before + uav.aircraft.ponder()) / 2 - without)

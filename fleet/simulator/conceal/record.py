@@ -1,0 +1,97 @@
+"""Fly a planned flight: into a recording, or only to see what it does; and whether it stays where flying is sane."""
+
+import struct
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet.simulator.conceal.plan import SETTLE_S, Planned
+from fleet.simulator.faults.fault import Fault
+from fleet.simulator.flight.drive import TICK_S, write
+from fleet.simulator.flight.link import Link
+from fleet.simulator.flight.uav import PretendUav
+from fleet.simulator.vehicle.jsbsim import Truth
+from fleet.simulator.vehicle.sensors import Estimate, pressure_height
+
+LOG_S = 0.1
+LOSS, FADES_S = 0.02, 45.0  # share of frames lost; mean time between two silences [s]
+_ATTITUDE = bytes((30, 0, 0))  # MAVLink message id
+_SANE = {"c172p": 0.20, "small": 0.21}  # greatest angle of attack: the wing is attached [rad]
+_LOW_M, _BANK, _SLIP, _SPEEDS = 30.0, np.radians(75), np.radians(16), (0.72, 1.4)  # speeds in shares of cruise
+
+
+_Row = tuple[float, Truth, Estimate, tuple[int, ...]]
+
+
+class Log(NamedTuple):
+    """A flight at 10 Hz."""
+
+    t: np.ndarray  # since the world began, (n,) [s]
+    seen: np.ndarray  # what is recorded, columns as in `acts.NOISE`, (n, 21)
+    Va: np.ndarray  # true airspeed, (n,) [m/s]
+    alpha: np.ndarray
+    beta: np.ndarray
+    bank: np.ndarray
+    height: np.ndarray  # above home [m]
+    rho: np.ndarray  # air density [kg/m3]
+
+
+def fly(
+    planned: Planned,
+    faults: tuple[Fault, ...],
+    path: Path | None = None,
+    look: Callable[[PretendUav], None] = lambda _: None,
+) -> tuple[Log, float]:
+    """Fly with `faults`, into a recording if a path is given; let somebody look at the aircraft ten times a second.
+
+    Returns:
+        the log, and the time of the first ATTITUDE recorded, since the world began [s]
+    """
+    uav = planned.uav(faults)
+    uav.step(SETTLE_S)
+    link = Link(np.random.default_rng((planned.flight, 6)), LOSS, FADES_S)
+    rows: list[_Row] = []
+    arrived = [(SETTLE_S, frame) for frame in uav.introduce()]
+    for k in range(1, round(planned.seconds / LOG_S) + 1):
+        until = SETTLE_S + k * LOG_S
+        for tick in range(round((until - LOG_S) / TICK_S) + 1, round(until / TICK_S) + 1):
+            link.send(tick * TICK_S, uav.step(tick * TICK_S))
+        arrived += link.receive(until)
+        look(uav)
+        rows.append((until, uav.aircraft.truth(), uav.now, uav.pulses))
+    if path is not None:
+        with path.open("wb") as file:
+            write(file, arrived)
+    return _laid(rows), first_attitude(frame for _, frame in arrived) - uav.boot_s
+
+
+def _laid(rows: list[_Row]) -> Log:
+    t, truth, now, pulses = zip(*rows, strict=True)
+    heights = [(pressure_height(e.pressure), e.satellites) for e in now]
+    body = [np.concatenate([e.rates, e.force, e.euler, e.v, e.p, [e.Va]]) for e in now]
+    seen = np.column_stack([np.array(body), np.array(heights), (np.array(pulses) - 1500) / 400])
+    columns = np.array([(x.Va, x.alpha, x.beta, x.euler[0], -x.p[2], x.rho) for x in truth]).T
+    return Log(np.array(t), seen, *columns)
+
+
+def first_attitude(frames: Iterable[bytes]) -> float:
+    """Give the time stamp of the first ATTITUDE among MAVLink 2 frames, since boot [s]."""
+    stamps = (struct.unpack_from("<I", frame, 10)[0] for frame in frames if frame[7:10] == _ATTITUDE)
+    return next(stamps) * 1e-3
+
+
+def why_not_sane(planned: Planned, log: Log) -> str:
+    """Say why a flight is none to be examined; an empty string when it is one."""
+    airframe = planned.job.airframe
+    speed = log.Va / {"c172p": 48.0, "small": 23.0}[airframe]
+    limits = {
+        "too short": log.t[-1] < SETTLE_S + planned.seconds - 1,
+        "too low": log.height.min() < _LOW_M,
+        "stalled": log.alpha.max() > _SANE[airframe],
+        "banked": np.abs(log.bank).max() > _BANK,
+        "slipped": np.abs(log.beta).max() > _SLIP,
+        "too slow or too fast": speed.min() < _SPEEDS[0] or speed.max() > _SPEEDS[1],
+    }
+    return next((why for why, is_so in limits.items() if is_so), "")

@@ -1,0 +1,77 @@
+"""How many flights hide what: controls, one effect, two that do not hide each other, one in no catalogue."""
+
+from math import ceil
+
+import numpy as np
+
+from fleet.simulator.conceal.effects import HIDDEN, UNKNOWN
+
+_SINGLE, _COMPOUND, _UNKNOWN = 50 / 140, 16 / 140, 14 / 140
+_BLUR = (  # channels that hide what happens in one another
+    {"air", "airspeed"},
+    {"air", "heading"},
+    {"air", "gps"},
+    {"force", "imu"},
+    {"imu", "heading"},
+    {"force", "pitch"},
+    {"gps", "baro"},
+)
+_ALIKE = {"air_density", "turbulence"}  # changes everything: no partner
+Wanted = tuple[str, ...]
+"""Names of the effects one flight hides."""
+
+
+def counts(flights: int) -> dict[str, int]:
+    """Share flights among the roles.
+
+    Raises:
+        ValueError: when there are too few for one of each.
+    """
+    if flights < 6:
+        raise ValueError(f"flights: found {flights}, expected 6 at least, so that each role has one; ask for more")
+    single, compound = ceil(flights * _SINGLE), ceil(flights * _COMPOUND)
+    unknown = max(round(flights * _UNKNOWN), 1)
+    control = flights - single - compound - unknown
+    return {"control": control, "single": single, "compound": compound, "unknown": unknown}
+
+
+def singles(rng: np.random.Generator, airframe: str, n: int) -> list[Wanted]:
+    """Draw `n` effects; none comes twice before all have come."""
+    return [(name,) for name in _round(rng, [x for x, h in HIDDEN.items() if airframe in h.airframes], n)]
+
+
+def unknowns(rng: np.random.Generator, airframe: str, n: int) -> list[Wanted]:
+    """Draw `n` effects that no catalogue lists."""
+    return [(name,) for name in _round(rng, [x for x, h in UNKNOWN.items() if airframe in h.airframes], n)]
+
+
+def compounds(rng: np.random.Generator, airframe: str, n: int) -> list[Wanted]:
+    """Draw `n` pairs."""
+    names = [x for x, h in HIDDEN.items() if airframe in h.airframes]
+    pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :] if go_together(a, b)]
+    used: dict[str, int] = dict.fromkeys(names, 0)
+    out: list[Wanted] = []
+    for _ in range(n):
+        least = min(used[a] + used[b] for a, b in pairs)
+        rare = [pair for pair in pairs if used[pair[0]] + used[pair[1]] == least]
+        a, b = rare[int(rng.integers(len(rare)))]
+        used[a], used[b] = used[a] + 1, used[b] + 1
+        out.append((a, b))
+    return out
+
+
+def go_together(a: str, b: str) -> bool:
+    """Tell whether two effects can both be seen in one flight."""
+    if {a, b} & _ALIKE:
+        return False
+    channels = {HIDDEN[a].channel, HIDDEN[b].channel}
+    if len(channels) == 1 or channels in _BLUR:
+        return False
+    return not ("servo" in channels and channels & {"roll", "pitch", "yaw"})
+
+
+def _round(rng: np.random.Generator, names: list[str], n: int) -> list[str]:
+    out: list[str] = []
+    while len(out) < n:
+        out += [names[i] for i in rng.permutation(len(names))]
+    return out[:n]

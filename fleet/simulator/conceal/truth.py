@@ -1,0 +1,78 @@
+"""What is hidden, in the units a report uses: as drawn where the draw knows, else by JSBSim's own account."""
+
+import numpy as np
+
+from fleet.simulator.conceal.effects import told
+from fleet.simulator.conceal.paths import FIELD
+from fleet.simulator.conceal.plan import Planned, quiet
+from fleet.simulator.conceal.record import Log
+from fleet.simulator.faults.fault import Fault
+from fleet.simulator.faults.physics import World
+from fleet.simulator.vehicle.jsbsim import DT, Aircraft
+from fleet.simulator.vehicle.sensors import pressure_at
+
+_R = 287.05  # of dry air [J/(kg K)]
+_SEA_LEVEL_K, _LAPSE_K = 288.15, 0.0065  # standard atmosphere [K, K/m]
+_SPEEDS, _THROTTLES = (44.0, 48.0, 52.0), (0.6, 0.75, 0.9)  # of the Cessna at work [m/s, -]
+_SPOOL_S = 6.0  # until the propeller turns steadily
+
+
+def effect(planned: Planned, fault: Fault, log: Log, first: float) -> dict[str, object]:
+    """Describe one hidden effect.
+
+    Args:
+        planned: the flight
+        fault: one of those it hides
+        log: the flight with all it hides
+        first: time of the first ATTITUDE recorded, since the world began [s]
+    Returns:
+        name, of, surface, params in a report's units, and times in seconds since that ATTITUDE
+    """
+    params = told(fault.name, planned.job.airframe, fault.values) | _measured(planned, fault, log)
+    out: dict[str, object] = {"name": fault.name, "params": {key: round(x, 6) for key, x in params.items()}}
+    if fault.of:
+        out["surface" if fault.name.startswith(("actuator", "control")) else "of"] = fault.of
+    if fault.t0 > 0:
+        out["t0"] = round(fault.t0 - first, 3)
+    if np.isfinite(fault.t1):
+        out["t1"] = round(fault.t1 - first, 3)
+    elif fault.ramp_s > 0:
+        out["ramp_s"] = round(fault.ramp_s, 3)
+    return out
+
+
+def _measured(planned: Planned, fault: Fault, log: Log) -> dict[str, float]:
+    if fault.name == "air_density":
+        return {"density_ratio": density_ratio(log)}
+    if fault.name == "thrust_loss" and planned.job.airframe == "c172p":
+        return {"fraction": thrust_lost(planned, fault)}
+    return {}
+
+
+def density_ratio(log: Log) -> float:
+    """Give air density over that of the standard day at the same height, mean over a flight."""
+    height = log.height + FIELD.alt_mm * 1e-3
+    standard = [pressure_at(h) / (_R * (_SEA_LEVEL_K - _LAPSE_K * h)) for h in height]
+    return float(np.mean(log.rho / np.array(standard)))
+
+
+def thrust_lost(planned: Planned, fault: Fault) -> float:
+    """Give the share of thrust lost at the same throttle and speed, mean over a few of each."""
+    aircraft = Aircraft(FIELD, planned.seed, kind=quiet(planned.job.airframe))
+    lost = [1 - _thrust(aircraft, v, u, fault) / _thrust(aircraft, v, u, None) for v in _SPEEDS for u in _THROTTLES]
+    return float(np.mean(lost))
+
+
+def _thrust(aircraft: Aircraft, Va: float, delta_t: float, fault: Fault | None) -> float:
+    """Hold the engine at one throttle and about one speed until it turns steadily; give its thrust [lbf]."""
+    name = aircraft.kind.strength
+    usual = aircraft[name]
+    aircraft.start(np.array([0.0, 0.0, -200.0]), 0.0, Va, (0.0, 0.0))
+    if fault is not None:
+        World([fault._replace(t0=0.0)], aircraft).press(0.0)
+    for _ in range(round(_SPOOL_S / DT)):
+        aircraft.drive(0.0, 0.0, 0.0, delta_t)
+        aircraft.step()
+    thrust = aircraft["propulsion/engine/thrust-lbs"]
+    aircraft[name] = usual
+    return thrust

@@ -1,0 +1,95 @@
+"""What a faulty sensor makes of a good estimate: the autopilot flies on it and reports it."""
+
+from collections import deque
+from collections.abc import Callable
+from math import radians
+
+import numpy as np
+
+from fleet.simulator.faults.fault import Fault
+from fleet.simulator.vehicle.sensors import Estimate, pressure_at, pressure_height
+
+_OLDEST_S = 3.0  # fixes that are remembered
+
+Spoil = Callable[[Estimate, float], Estimate]
+"""(estimate, share of the fault) to estimate; may remember."""
+
+
+def _airspeed_scale(fault: Fault, dt: float) -> Spoil:
+    return lambda e, share: e._replace(Va=e.Va * (1 + share * (fault.values["scale"] - 1)))
+
+
+def _airspeed_bias(fault: Fault, dt: float) -> Spoil:
+    return lambda e, share: e._replace(Va=e.Va + share * fault.values["bias_mps"])
+
+
+def _gps_latency(fault: Fault, dt: float) -> Spoil:
+    fixes: deque[tuple[np.ndarray, np.ndarray, float]] = deque(maxlen=round(_OLDEST_S / dt))
+
+    def spoil(e: Estimate, share: float) -> Estimate:
+        fixes.appendleft((e.p, e.v, e.satellites))
+        p, v, satellites = fixes[min(round(share * fault.values["latency_s"] / dt), len(fixes) - 1)]
+        return e._replace(p=p, v=v, satellites=satellites)
+
+    return spoil
+
+
+def _imu_misalignment(fault: Fault, dt: float) -> Spoil:
+    """Give rates and forces in the axes of a unit turned against the body by a rotation vector."""
+    turn = np.radians([fault.values.get(name, 0.0) for name in ("roll_deg", "pitch_deg", "yaw_deg")])
+
+    def spoil(e: Estimate, share: float) -> Estimate:
+        axes = _rotation(-share * turn)
+        return e._replace(rates=axes @ e.rates, force=axes @ e.force)
+
+    return spoil
+
+
+def _rotation(turn: np.ndarray) -> np.ndarray:
+    """Give the matrix that rotates by a rotation vector [rad], (3, 3): exp of its cross product matrix."""
+    angle = float(np.linalg.norm(turn))
+    x, y, z = turn / angle if angle > 0 else turn
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
+
+
+def _along(fault: Fault, axes: str) -> np.ndarray:
+    return np.eye(3)[axes.index(fault.of)]
+
+
+def _gyro_bias(fault: Fault, dt: float) -> Spoil:
+    bias = radians(fault.values["bias_dps"]) * _along(fault, "pqr")
+    return lambda e, share: e._replace(rates=e.rates + share * bias)
+
+
+def _accel_bias(fault: Fault, dt: float) -> Spoil:
+    bias = fault.values["bias_mps2"] * _along(fault, "xyz")
+    return lambda e, share: e._replace(force=e.force + share * bias)
+
+
+def _heading_bias(fault: Fault, dt: float) -> Spoil:
+    bias = np.array([0.0, 0.0, radians(fault.values["bias_deg"])])
+    return lambda e, share: e._replace(euler=e.euler + share * bias)
+
+
+def _baro_bias(fault: Fault, dt: float) -> Spoil:
+    """Let the static port tell another height; the estimator's height follows it."""
+    up = fault.values["bias_m"]
+
+    def spoil(e: Estimate, share: float) -> Estimate:
+        pressure = pressure_at(pressure_height(e.pressure) + share * up)
+        return e._replace(p=e.p - np.array([0.0, 0.0, share * up]), pressure=pressure)  # p is NED
+
+    return spoil
+
+
+SPOILS: dict[str, Callable[[Fault, float], Spoil]] = {
+    "airspeed_scale": _airspeed_scale,
+    "airspeed_bias": _airspeed_bias,
+    "gps_latency": _gps_latency,
+    "imu_misalignment": _imu_misalignment,
+    "gyro_bias": _gyro_bias,
+    "accel_bias": _accel_bias,
+    "heading_bias": _heading_bias,
+    "baro_bias": _baro_bias,
+}

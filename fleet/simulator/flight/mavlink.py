@@ -1,0 +1,172 @@
+"""The voice of a pretend aircraft: MAVLink 2 as ArduPlane or PX4 speak it, telemetry out, questions in, answers out.
+
+What is told unasked is in `mavlink_said`.
+Source: MAVLink common and ardupilotmega dialects.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from fleet.contract import Item
+from fleet.simulator.flight.mavlink_messages import DIALECTS, Dialect, Flight, value_message
+
+TICK_HZ = 100
+COMPONENT = mav.MAV_COMP_ID_AUTOPILOT1
+MOST_AIRCRAFT = 250  # system ids 1..250 belong to vehicles
+_CAPABILITIES = (
+    mav.MAV_PROTOCOL_CAPABILITY_MISSION_FLOAT
+    | mav.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+    | mav.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+    | mav.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+)
+_ANSWERS_PER_TICK = 2  # parameters are streamed, not thrown
+
+
+class Voice:
+    """One MAVLink system: counts its frames, knows its mission and parameters, answers."""
+
+    def __init__(
+        self,
+        system: int,
+        items: tuple[Item, ...],
+        params: Mapping[str, float],
+        dialect: Dialect = DIALECTS["ardupilot"],
+    ):
+        """Speak as `system`.
+
+        Args:
+            system: MAVLink system id, 1..250
+            items: the mission on board
+            params: parameters in the autopilot's names and units
+            dialect: how the autopilot speaks
+        """
+        self._out = mav.MAVLink(None, srcSystem=system, srcComponent=COMPONENT)
+        self._in = mav.MAVLink(None)
+        self._in.robust_parsing = True
+        self._items = items
+        self._names = sorted(params)
+        self._params, self._dialect = params, dialect
+        self._waiting: deque[int] = deque()  # parameters still to be streamed
+
+    def _frame(self, message: Any) -> bytes:
+        packed = bytes(message.pack(self._out))
+        self._out.seq = (self._out.seq + 1) % 256
+        return packed
+
+    def telemetry(self, tick: int, flight: Callable[[], Flight]) -> list[bytes]:
+        """Give the frames due at this tick of 10 ms; `flight` is asked only when one is."""
+        due = [make for rate, phase, make in self._dialect.telemetry if (tick - phase) % round(TICK_HZ / rate) == 0]
+        now = flight() if due else None
+        frames = [self._frame(make(now)) for make in due if now is not None]
+        return frames + self.stream(_ANSWERS_PER_TICK)
+
+    def stream(self, most: int) -> list[bytes]:
+        """Give up to `most` of the parameters that were asked for."""
+        count = min(most, len(self._waiting))
+        return [self._frame(self._param(self._waiting.popleft())) for _ in range(count)]
+
+    def hear(self, data: bytes, t: float) -> list[bytes]:
+        """Listen to bytes from the ground at `t` since boot [s] and give the answers; noise is passed over."""
+        try:
+            messages: Iterable[Any] = self._in.parse_buffer(data) or ()
+        except (mav.MAVError, ValueError):  # a wrong checksum, or text that is no text
+            return []
+        answers: list[Any] = []
+        for message in messages:
+            answer = _ANSWERS.get(message.get_type())
+            if answer is not None and getattr(message, "target_system", 0) in (0, self._out.srcSystem):
+                answers += answer(self, message, t)
+        return [self._frame(answer) for answer in answers]
+
+    def _param(self, index: int, asked_by_name: bool = False) -> Any:
+        name = self._names[index]
+        shown = 65_535 if asked_by_name else index
+        return value_message(name, self._params[name], (len(self._names), shown), self._dialect)
+
+    def _param_list(self, message: Any, t: float) -> list[Any]:
+        del message, t
+        self._waiting = deque(range(len(self._names)))
+        return []
+
+    def _param_read(self, message: Any, t: float) -> list[Any]:
+        del t
+        if message.param_index >= 0:
+            return [self._param(message.param_index)] if message.param_index < len(self._names) else []
+        name = message.param_id
+        return [self._param(self._names.index(name), asked_by_name=True)] if name in self._params else []
+
+    def _mission_list(self, message: Any, t: float) -> list[Any]:
+        del t
+        count = len(self._items) if message.mission_type == 0 else 0  # no fence, no rally points
+        return [mav.MAVLink_mission_count_message(*_sender(message), count, message.mission_type)]
+
+    def _mission_item(self, message: Any, t: float) -> list[Any]:
+        del t
+        if message.mission_type != 0 or message.seq >= len(self._items):
+            kind = mav.MAV_MISSION_INVALID_SEQUENCE
+            return [mav.MAVLink_mission_ack_message(*_sender(message), kind, message.mission_type)]
+        i = self._items[message.seq]
+        head = (*_sender(message), i.seq, i.frame, i.command, 0, 1, i.param1, i.param2, i.param3, i.param4)
+        if message.get_type() == "MISSION_REQUEST_INT":
+            return [mav.MAVLink_mission_item_int_message(*head, i.lat_e7, i.lon_e7, i.alt_m)]
+        return [mav.MAVLink_mission_item_message(*head, i.lat_e7 * 1e-7, i.lon_e7 * 1e-7, i.alt_m)]
+
+    def _command(self, message: Any, t: float) -> list[Any]:
+        del t
+        wanted = mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+        asks_version = message.command == mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
+            message.command == mav.MAV_CMD_REQUEST_MESSAGE and message.param1 == wanted  # which may be no number
+        )
+        fine = asks_version or message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL  # the rates are as they should be
+        result = mav.MAV_RESULT_ACCEPTED if fine else mav.MAV_RESULT_UNSUPPORTED
+        ack = mav.MAVLink_command_ack_message(message.command, result, 0, 0, *_sender(message))
+        return [ack, self._version()] if asks_version else [ack]
+
+    def _version(self) -> Any:
+        none = [0] * 8
+        uid = self._out.srcSystem
+        return mav.MAVLink_autopilot_version_message(
+            _CAPABILITIES, self._dialect.version, 0, 0, 0, none, none, none, 0, 0, uid
+        )
+
+    def _timesync(self, message: Any, t: float) -> list[Any]:
+        return [mav.MAVLink_timesync_message(round(t * 1e9), message.ts1)] if message.tc1 == 0 else []
+
+
+def _sender(message: Any) -> tuple[int, int]:
+    return message.get_srcSystem(), message.get_srcComponent()
+
+
+_ANSWERS: dict[str, Callable[[Voice, Any, float], list[Any]]] = {
+    "PARAM_REQUEST_LIST": Voice._param_list,
+    "PARAM_REQUEST_READ": Voice._param_read,
+    "MISSION_REQUEST_LIST": Voice._mission_list,
+    "MISSION_REQUEST_INT": Voice._mission_item,
+    "MISSION_REQUEST": Voice._mission_item,
+    "COMMAND_LONG": Voice._command,
+    "TIMESYNC": Voice._timesync,
+}
+
+
+class Ground:
+    """The few questions a recording begins with, so that it holds mission and parameters by itself."""
+
+    def __init__(self, system: int):
+        """Speak to `system` as a ground station."""
+        self._mav = mav.MAVLink(None, srcSystem=255, srcComponent=mav.MAV_COMP_ID_MISSIONPLANNER)
+        self._to = (system, COMPONENT)
+
+    def questions(self, items: int) -> list[bytes]:
+        """Ask for the version, every mission item and the parameter list, in this order."""
+        version = (mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 0, 0, 0, 0, 0, 0)
+        asked = [
+            mav.MAVLink_command_long_message(*self._to, *version),
+            mav.MAVLink_mission_request_list_message(*self._to),
+            *(mav.MAVLink_mission_request_int_message(*self._to, seq) for seq in range(items)),
+            mav.MAVLink_param_request_list_message(*self._to),
+        ]
+        return [bytes(message.pack(self._mav)) for message in asked]

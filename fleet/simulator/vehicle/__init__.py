@@ -1,0 +1,1 @@
+"""The simulated airframe: JSBSim model, sensors, weather and mission of one aircraft."""

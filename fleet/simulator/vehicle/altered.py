@@ -1,0 +1,125 @@
+"""Aircraft files with knobs: what may go wrong with the airframe becomes a JSBSim property.
+
+The files are read where they are installed, and changed in memory; no copy is kept. At its default every knob does
+nothing, and the aircraft flies as before; only the Cessna's inertial unit is no longer at the pilot's eyes.
+
+    conceal/C_D         drag coefficient added                      conceal/lift    factor of all lift
+    conceal/C_n_beta, C_Y_beta, C_l_p, C_m_q    factors of those derivatives (c172p; the small one has its own, vary/*)
+    conceal/slipstream  share of the propeller's wash that the tail's surfaces feel (c172p; 1 as JSBSim has it)
+    conceal/p_factor    the thrust line moves aside by so much per angle of attack (c172p) [in/rad]
+    and one more point mass at the empty centre of gravity, the last in the list
+"""
+
+from functools import cache
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+from fleet.simulator.vehicle.jsbsim import model_file
+from fleet.simulator.vehicle.types import TYPES, Type
+
+_FACTORS = {  # knob: functions it multiplies
+    "conceal/C_n_beta": ("aero/coefficient/Cnb",),
+    "conceal/C_Y_beta": ("aero/coefficient/CYb",),
+    "conceal/C_l_p": ("aero/coefficient/Clp",),
+    "conceal/C_m_q": ("aero/coefficient/Cmq", "aero/coefficient/Cmadot"),
+}
+_UNIT_IN = (41.9, -0.7, 37.3)
+_WASH = "aero/function/qbar-induced-psf"
+_TAIL = ("aero/coefficient/Cmde", "aero/coefficient/Cndr")
+_P_FACTOR = {"z": ("-1", "aero/alpha-rad"), "y": ("1", "aero/beta-rad")}  # thrust moves right: the nose goes left
+
+
+def altered(name: str) -> Type:
+    """Give the type `name` of `types.TYPES` with knobs on it."""
+    return TYPES[name]._replace(file=_file(name))
+
+
+@cache
+def _file(name: str) -> str:
+    """Write the file of one type."""
+    kind = TYPES[name]
+    root = ElementTree.parse(model_file(kind)).getroot()
+    _knob_forces(root)
+    if kind.shipped:
+        _measure_in_the_middle(root)
+        _knob_derivatives(root)
+        _knob_propeller(root)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _knob_forces(root: Element) -> None:
+    """Add knobs of drag, lift and mass."""
+    air = _one(root, "aerodynamics")
+    for knob, value in (("conceal/C_D", "0"), ("conceal/lift", "1")):
+        air.insert(0, _property(knob, value))
+    for function in _one(air, "axis[@name='LIFT']").findall("function"):
+        SubElement(_one(function, "product"), "property").text = "conceal/lift"
+    drag = SubElement(_one(air, "axis[@name='DRAG']"), "function", name="conceal/drag")
+    _product(drag, "aero/qbar-psf", "metrics/Sw-sqft", "conceal/C_D")
+    balance = _one(root, "mass_balance")
+    mass = SubElement(balance, "pointmass", name="concealed")
+    SubElement(mass, "weight", unit="LBS").text = "0"
+    mass.append(_one(balance, "location[@name='CG']"))
+
+
+def _measure_in_the_middle(root: Element) -> None:
+    """Put the inertial unit where the loaded Cessna's centre of gravity is; JSBSim measures at the pilot's eyes."""
+    eyes = _one(root, "metrics/location[@name='EYEPOINT']")
+    for axis, inches in zip("xyz", _UNIT_IN, strict=True):
+        _one(eyes, axis).text = str(inches)
+
+
+def _knob_derivatives(root: Element) -> None:
+    air = _one(root, "aerodynamics")
+    for knob, names in _FACTORS.items():
+        air.insert(0, _property(knob, "1"))
+        for name in names:
+            SubElement(_one(air, f".//function[@name='{name}']/product"), "property").text = knob
+
+
+def _knob_propeller(root: Element) -> None:
+    """Let the wash over the tail be a matter of degree, and the thrust line move with the flow."""
+    air = _one(root, "aerodynamics")
+    felt = Element("function", name="conceal/qbar-tail-psf")
+    whole = SubElement(felt, "sum")
+    SubElement(whole, "property").text = "aero/qbar-psf"
+    more = SubElement(whole, "product")
+    SubElement(more, "property").text = "conceal/slipstream"
+    difference = SubElement(more, "difference")
+    for name in (_WASH, "aero/qbar-psf"):
+        SubElement(difference, "property").text = name
+    air.insert(list(air).index(_one(air, f"function[@name='{_WASH}']")) + 1, felt)
+    air.insert(0, _property("conceal/slipstream", "1"))
+    for name in _TAIL:
+        for found in air.findall(f".//function[@name='{name}']/product/property"):
+            found.text = "conceal/qbar-tail-psf" if found.text == _WASH else found.text
+    outside = Element("external_reactions")
+    outside.append(_property("conceal/p_factor", "0"))
+    for axis, (sign, angle) in _P_FACTOR.items():
+        moment = SubElement(outside, "moment", name=f"p-factor-{axis}", frame="BODY")
+        arm = _product(SubElement(moment, "function"), "propulsion/engine/thrust-lbs", "conceal/p_factor", angle)
+        SubElement(arm, "value").text = str(1 / 12)
+        way = SubElement(moment, "direction")
+        for name in "xyz":
+            SubElement(way, name).text = sign if name == axis else "0"
+    root.insert(list(root).index(air), outside)
+
+
+def _one(root: Element, path: str) -> Element:
+    found = root.find(path)
+    if found is None:
+        raise RuntimeError(f"jsbsim: found no {path} in its aircraft file, expected one; install JSBSim 1.3")
+    return found
+
+
+def _property(name: str, value: str) -> Element:
+    knob = Element("property", value=value)
+    knob.text = name
+    return knob
+
+
+def _product(parent: Element, *names: str) -> Element:
+    product = SubElement(parent, "product")
+    for name in names:
+        SubElement(product, "property").text = name
+    return product

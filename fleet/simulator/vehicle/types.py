@@ -1,0 +1,61 @@
+"""The types of pretend aircraft: what JSBSim loads, how fast it flies, how large its missions are, what differs."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+from fleet.simulator.vehicle.missions import SMALL, Field
+
+CRUISE = 23.0  # of the small one [m/s]
+
+
+class Type(NamedTuple):
+    """One type of aircraft."""
+
+    model: str  # JSBSim's name
+    shipped: bool  # it comes with JSBSim, and has an engine to be started
+    cruise: float  # [m/s]
+    motor: str  # JSBSim's property of the throttle, 0..1
+    field: Field  # what its missions look like
+    payload_kg: tuple[float, float]  # least and most
+    spread: dict[str, float]  # standard deviation of each factor vary/* between aircraft of one type [-]
+    offsets: dict[str, float]  # of each offset vary/*: what building by hand leaves askew [-]
+    strength: str  # JSBSim's property that the thrust of its engine goes with
+    varied: str  # index of the point mass that differs from one to the next
+    load: str  # index of the point mass that may slide
+    extra: str  # index of the point mass that `altered` adds
+    file: str | None = None  # its aircraft file, where it is another one than the installed
+    settings: Mapping[str, float] = MappingProxyType({})  # JSBSim's properties, where not as in the file
+
+
+_SPREAD = {
+    "C_L_alpha": 0.04,
+    "C_D_p": 0.08,
+    "C_Y_beta": 0.08,
+    "C_l_beta": 0.08,
+    "C_l_p": 0.07,
+    "C_l_delta_a": 0.07,
+    "C_m_alpha": 0.08,
+    "C_m_q": 0.08,
+    "C_m_delta_e": 0.07,
+    "C_n_beta": 0.08,
+    "C_n_r": 0.10,
+    "C_n_delta_r": 0.07,
+    "thrust": 0.05,
+}
+_OFFSETS = {"C_l_0": 0.001, "C_m_0": 0.004, "C_n_0": 0.0004}
+
+TYPES = {
+    # 9.5 kg empty, span 2.9 m, electric; ours, after Beard & McLain's Aerosonde
+    "small": Type(
+        *("aerosonde", False, CRUISE, "fcs/motor-cmd-norm", SMALL, (0.5, 2.5), _SPREAD, _OFFSETS),
+        *("vary/thrust", "", "", "[1]"),
+    ),
+    # Cessna 172P, a ton and a piston engine, as it comes with JSBSim: only its load differs from one to the next
+    "c172p": Type(
+        *("c172p", True, 48.0, "fcs/throttle-cmd-norm"),
+        Field(scale=5.0, circle=4.5, height=2.0, climb=0.045, sink=0.04),
+        *((0.0, 90.0), {}, {}),
+        *("propulsion/engine/volumetric-efficiency", "[1]", "", "[5]"),
+    ),
+}

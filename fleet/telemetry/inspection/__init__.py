@@ -1,0 +1,1 @@
+"""What a recording contains: rows, rates, gaps, and what can be done with it."""

@@ -1,0 +1,1 @@
+"""State of many aircraft in arrays: one pass costs the same few calls for one aircraft or a thousand."""

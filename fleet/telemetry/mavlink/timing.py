@@ -1,0 +1,119 @@
+"""How an aircraft's clock and its link are: drift, delay, round trip, and what the satellites say the time is."""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from math import sqrt
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from fleet.telemetry.mavlink.parsing.decode import IDS, Frames
+from fleet.telemetry.mavlink.parsing.scan import ID
+from fleet.telemetry.tables import clock as c
+
+EVERY_S = 10.0  # between two looks at the offset [s]
+OFFSET_SIGMA_S = 3e-3  # of the offset, as the filter of least delay leaves it [s]
+DRIFT_SIGMA = 1e-4  # of clocks in general [s/s]
+WANDER = 1e-7  # of a drift in a second [1/s]
+KNOWN = 3e-5  # a drift is told once it is known so well [s/s]
+_EARLIEST_S = 1e9  # a satellite time before that is none [s since 1970]
+_LONGEST_TRIP_S = 10.0
+_SMOOTH = 0.1
+_TRIPS = 10  # of which the quickest counts
+
+
+class Timing:
+    """What is known of one aircraft's time.
+
+    Args:
+        clocks: gives its clocks, (3, LENGTH), read here and changed elsewhere; but for the worst delay, which is taken
+    """
+
+    def __init__(self, clocks: Callable[[], np.ndarray]) -> None:
+        self._clocks = clocks
+        self._filter: KalmanFilter | None = None
+        self._looked = float("-inf")
+        self._steps = 0.0  # jumps, and the sum of what was re-anchored
+        self._satellites: float | None = None
+        self._trips: deque[float] = deque(maxlen=_TRIPS)
+
+    def satellites(self, unix_s: float, boot_s: float) -> None:
+        """Take satellite time `unix_s` [s since 1970] at the aircraft's time `boot_s` [s]."""
+        boot = self._clocks()[c.BOOT]
+        if unix_s > _EARLIEST_S and not np.isnan(boot[c.NEWEST]):
+            offset = float(c.unwrap(boot, boot_s) + boot[c.OFFSET]) - unix_s
+            before = offset if self._satellites is None else self._satellites
+            self._satellites = before + _SMOOTH * (offset - before)
+
+    def trip(self, sent: float, back: float) -> None:
+        """Take the way of a question, sent and answered at fleet times [s since 1970]."""
+        if 0.0 <= back - sent < _LONGEST_TRIP_S:
+            self._trips.append(back - sent)
+
+    def told(self, now: float) -> dict[str, Any]:
+        """Give the fields of `Status` that tell of time; `now` is fleet time [s since 1970]."""
+        boot = self._clocks()[c.BOOT]
+        self._look(boot, now)
+        worst, boot[c.WORST] = float(boot[c.WORST]), 0.0
+        return {
+            "clock_offset_s": float(boot[c.OFFSET]),
+            "clock_drift": self.drift,
+            "latency_s": float(boot[c.DELAY]),
+            "latency_worst_s": worst,
+            "round_trip_s": min(self._trips) if self._trips else None,
+            "gps_offset_s": self._satellites,
+        }
+
+    @property
+    def drift(self) -> float | None:
+        """Give what the clock loses on the fleet's [s/s]; None as long as that is not known well."""
+        if self._filter is None or sqrt(self._filter.P[1, 1]) > KNOWN:
+            return None
+        return float(self._filter.x[1, 0])
+
+    def _look(self, boot: np.ndarray, now: float) -> None:
+        """Filter offset and drift: x = (offset, drift), x' = F x, z = offset."""
+        passed = now - self._looked
+        if 0 <= passed < EVERY_S or np.isnan(boot[c.NEWEST]):
+            return
+        self._looked = now
+        steps = float(boot[c.JUMPS] + boot[c.ADVANCE])
+        if self._filter is None or steps != self._steps or not passed < 10 * EVERY_S:
+            self._steps, self._satellites = steps, None
+            self._filter = _anchored(float(boot[c.OFFSET]))
+            return
+        step = np.array([[1.0, passed], [0.0, 1.0]])
+        noise = np.array([[passed**3 / 3, passed**2 / 2], [passed**2 / 2, passed]]) * WANDER**2
+        self._filter.predict(F=step, Q=noise)
+        self._filter.update(float(boot[c.OFFSET]))
+
+
+def _anchored(offset_s: float) -> KalmanFilter:
+    found = KalmanFilter(dim_x=2, dim_z=1)
+    found.x = np.array([[offset_s], [0.0]])
+    found.P = np.diag([OFFSET_SIGMA_S**2, DRIFT_SIGMA**2])
+    found.H, found.R = np.array([[1.0, 0.0]]), np.array([[OFFSET_SIGMA_S**2]])
+    return found
+
+
+def time(frames: Frames, owner: np.ndarray, timings: Sequence[Timing]) -> None:
+    """Give every aircraft what SYSTEM_TIME and the answers to TIMESYNC say.
+
+    Args:
+        frames: what was heard
+        owner: number in `timings` of each frame's aircraft, -1 for nobody's, (n,)
+        timings: of the aircraft on this link
+    """
+    which = np.flatnonzero((frames.at[:, ID] == IDS["SYSTEM_TIME"]) & (owner >= 0))
+    if len(which):
+        last = which[len(which) - 1 - np.unique(owner[which][::-1], return_index=True)[1]]  # of each aircraft
+        fields = frames.fields(last, "SYSTEM_TIME")
+        unix_s, boot_s = fields.time_unix_usec * 1e-6, fields.time_boot_ms * 1e-3
+        for number, unix, boot in zip(owner[last].tolist(), unix_s.tolist(), boot_s.tolist(), strict=True):
+            timings[number].satellites(unix, boot)
+    which = np.flatnonzero((frames.at[:, ID] == IDS["TIMESYNC"]) & (owner >= 0))
+    if len(which):
+        fields = frames.fields(which, "TIMESYNC")
+        for i in np.flatnonzero(fields.tc1 != 0).tolist():
+            timings[owner[which[i]]].trip(float(fields.ts1[i]) * 1e-9, float(frames.arrival[which[i]]))

@@ -1,0 +1,1 @@
+"""Readers of the logs that autopilots write on board."""

@@ -1,0 +1,1 @@
+"""Reader of ArduPilot DataFlash logs, binary and text."""

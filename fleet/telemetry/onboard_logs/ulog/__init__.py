@@ -1,0 +1,1 @@
+"""Reader of PX4 ULog files."""

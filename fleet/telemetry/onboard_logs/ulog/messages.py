@@ -1,0 +1,110 @@
+"""What a ULog says besides rows: who the aircraft is, its modes, its transitions, and what time it was."""
+
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from fleet.telemetry.mavlink import heartbeat
+from fleet.telemetry.mavlink.onboard_log import Said
+from fleet.telemetry.onboard_logs.ulog.topic import Topic
+from fleet.telemetry.tables.ulog import ARMED, AUTOSTART, TRANSITIONS, VEHICLE_TYPE, mode
+
+_EARLIEST_US, _LATEST_US = 1.2e15, 4e15  # believable satellite time: 2008 to 2096
+_GRADES = ((192, " RC"), (128, " beta"), (64, " alpha"))  # last byte of ver_sw_release; 255 is a release
+_INFO = 6  # severity of what we word ourselves
+
+Topics = Mapping[str, Topic]
+
+
+def system(params: Mapping[str, float], topics: Topics) -> int:
+    """Give the MAVLink system id, 1 where the log does not say."""
+    said = params.get("MAV_SYS_ID", _latest(topics, "system_id"))
+    return int(said) if said is not None and 1 <= said <= 255 else 1
+
+
+def vehicle(params: Mapping[str, float], topics: Topics) -> str:
+    """Name the kind of vehicle as `Status.vehicle` does."""
+    if _latest(topics, "is_vtol"):
+        return heartbeat.QUADPLANE
+    for mav_type in (_latest(topics, "system_type"), params.get("MAV_TYPE")):
+        kind = heartbeat.vehicle(SimpleNamespace(type=int(mav_type or 0)))
+        if kind != heartbeat.UNKNOWN:
+            return kind
+    rotary = _latest(topics, "is_rotary_wing")  # until 1.8
+    if rotary is not None:
+        return heartbeat.MULTIROTOR if rotary else heartbeat.FIXED_WING
+    told = VEHICLE_TYPE.get(int(_latest(topics, "vehicle_type") or 0))
+    start = int(params.get("SYS_AUTOSTART", 0))
+    return told or next((kind for ids, kind in AUTOSTART if start in ids), heartbeat.UNKNOWN)
+
+
+def release(info: Mapping[str, Any]) -> tuple[int, int]:
+    """Give the release of PX4, major and minor; beyond any where the log does not say."""
+    number = info.get("ver_sw_release")
+    return (number >> 24 & 0xFF, number >> 16 & 0xFF) if isinstance(number, int) and number > 0 else (99, 0)
+
+
+def firmware(info: Mapping[str, Any]) -> str:
+    """Word the firmware, or leave it empty."""
+    number = info.get("ver_sw_release")
+    if isinstance(number, int) and number > 0:
+        grade = next((word for least, word in _GRADES if least <= number & 0xFF < 255), "")
+        return f"PX4 v{number >> 24 & 0xFF}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}{grade}"
+    return f"PX4 {info['ver_sw'][:10]}" if info.get("ver_sw") else ""
+
+
+def epoch(topics: Topics) -> float | None:
+    """Give fleet time minus log time [s] as the satellites told it; late by a receiver's delay, 0.1 s.
+
+    `time_ref_utc` is no help: it is the time zone the logger was set to.
+    """
+    for name in ("vehicle_gps_position", "sensor_gps"):
+        if name in topics and hasattr(topics[name], "time_utc_usec"):
+            utc = topics[name].time_utc_usec
+            told = (utc > _EARLIEST_US) & (utc < _LATEST_US)
+            if told.any():
+                return float(np.median(utc[told] * 1e-6 - topics[name].t[told]))
+    return None
+
+
+def said_by_topics(topics: Topics, version: tuple[int, int]) -> list[Said]:
+    """Give modes, arming and transitions, each where it changes."""
+    said: list[Said] = []
+    status = topics.get("vehicle_status")
+    if status is not None and hasattr(status, "nav_state"):
+        said += [Said(t, "mode", mode(int(state), version)) for t, state in _changes(status.t, status.nav_state)]
+    if status is not None and hasattr(status, "arming_state"):
+        said += [Said(t, "armed", bool(a)) for t, a in _changes(status.t, status.arming_state == ARMED)]
+    vtol = topics.get("vtol_vehicle_status")
+    if vtol is not None:
+        changes = _changes(vtol.t, _phase(vtol))
+        said += [Said(t, "text", (_INFO, f"VTOL: {TRANSITIONS[int(p)]}")) for t, p in changes if int(p) in TRANSITIONS]
+    return said
+
+
+def _phase(vtol: Topic) -> np.ndarray:
+    if hasattr(vtol, "vehicle_vtol_state"):  # since 1.13
+        return vtol.vehicle_vtol_state
+    if not all(hasattr(vtol, name) for name in ("vtol_in_rw_mode", "vtol_in_trans_mode", "in_transition_to_fw")):
+        return np.zeros(len(vtol))
+    moving = np.where(vtol.in_transition_to_fw != 0, 1, 2)
+    return np.where(vtol.vtol_in_trans_mode != 0, moving, np.where(vtol.vtol_in_rw_mode != 0, 3, 4))
+
+
+def _changes(t: np.ndarray, values: np.ndarray) -> list[tuple[float, Any]]:
+    at = np.flatnonzero(np.concatenate([[True], values[1:] != values[:-1]])) if len(t) else np.array([], int)
+    return [(float(t[i]), values[i]) for i in at[:_MOST_CHANGES]]
+
+
+_MOST_CHANGES = 1000  # of one kind taken from one log
+
+
+def _latest(topics: Topics, field: str) -> float | None:
+    """Give what vehicle_status said most often, so that a damaged row does not decide."""
+    status = topics.get("vehicle_status")
+    if status is None or not hasattr(status, field):
+        return None
+    values, counts = np.unique(getattr(status, field), return_counts=True)
+    return float(values[np.argmax(counts)])

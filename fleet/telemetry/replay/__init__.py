@@ -1,0 +1,1 @@
+"""Replay of recordings over UDP, also as many aircraft at once."""

@@ -1,0 +1,205 @@
+"""THE TABLE of DataFlash: one row per message and `Sample` field, ArduPilot from 2013 to 2026. A newcomer adds a row.
+
+The only place where degrees, per cent and centimetres become SI, NED, FRD and rad. ArduPilot renames its fields:
+a row fits a log when that log has every field the row reads, and of the rows that fit and flow the highest rank wins.
+Numbers arrive as the format's letter scales them (`c` in units, `L` in degrees), the same from binary and text logs.
+
+A field whose columns come from several messages has `PARTS`: the first part gives the instants, the others are
+interpolated onto them. What no message tells is left out: copters log no cross-track error, so they have no `command`.
+Source: ArduPilot's Log.cpp of Plane and Copter and AP_Logger's LogStructure.h, releases 2013 to 2026.
+"""
+
+from math import pi
+from typing import Any
+
+import numpy as np
+
+from fleet.frames import wrap
+from fleet.telemetry.tables.row import HIGHEST, Row
+
+DEG = pi / 180  # [rad/deg]
+
+PARTS: dict[str, tuple[tuple[str, int], ...]] = {
+    "attitude": (("attitude", 3), ("attitude: rates", 3)),
+    "air": (("air", 1), ("air: throttle", 1), ("air: climb", 1)),
+    "command": (("command", 2), ("command: errors", 3)),
+}
+"""`Sample` field -> its parts, (name as in `Row.field`, how many columns), in column order."""
+
+ANGLES, RATES = "attitude", "attitude: rates"
+
+_FIX = 3  # GPS status from here on: position in three dimensions
+_NO_FIX_DEG = 0.01  # a kilometre round zero, zero
+_LAST_NAV = 95  # MAV_CMD: up to here navigation, beyond conditions and actions, but for
+_NAV_TOO = (213, 42702, 42703)  # set yaw and speed, script time, attitude time
+
+
+def _angles(m: Any) -> tuple[Any, ...]:
+    return (m.Roll * DEG, m.Pitch * DEG, wrap(m.Yaw * DEG))
+
+
+def _gyro(m: Any) -> tuple[Any, ...]:
+    return (m.GyrX, m.GyrY, m.GyrZ)
+
+
+def _rate(m: Any, unit: Any) -> tuple[Any, ...]:
+    return (m.R * unit, m.P * unit, m.Y * unit)
+
+
+def _imu(m: Any) -> tuple[Any, ...]:
+    return (m.AccX, m.AccY, m.AccZ, m.GyrX, m.GyrY, m.GyrZ)
+
+
+def _place(m: Any) -> tuple[Any, ...]:
+    return (np.rint(m.Lat * 1e7), np.rint(m.Lng * 1e7), np.rint(m.Alt * 1e3))
+
+
+def _somewhere(m: Any) -> Any:
+    return (abs(m.Lat) > _NO_FIX_DEG) | (abs(m.Lng) > _NO_FIX_DEG)
+
+
+def _fix(m: Any) -> Any:
+    return (m.Status >= _FIX) & _somewhere(m)
+
+
+def _course(m: Any) -> tuple[Any, ...]:
+    return (m.Spd * np.cos(m.GCrs * DEG), m.Spd * np.sin(m.GCrs * DEG), m.VZ)
+
+
+def _ned(m: Any) -> tuple[Any, ...]:
+    return (m.VN, m.VE, m.VD)
+
+
+def _started(m: Any) -> Any:
+    return (m.VN != 0) | (m.VE != 0) | (m.VD != 0)  # a filter that has not started says zero to the last digit
+
+
+def _wind(m: Any) -> tuple[Any, ...]:
+    return (m.VWN, m.VWE)  # where it blows to
+
+
+def _blows(m: Any) -> Any:
+    return (m.VWN != 0) | (m.VWE != 0)  # exact zeros: this filter does not estimate wind, or not yet
+
+
+def _outputs(m: Any, names: str) -> tuple[Any, ...]:
+    given = tuple(getattr(m, name) for name in names.split())
+    return (*given, *(given[0] * 0.0,) * (8 - len(given)))  # an output that is not logged is off, as MAVLink has it
+
+
+def _is_plane(m: Any) -> Any:
+    return np.isfinite(m.NavRoll)  # Copter's message of the same name has none
+
+
+def _copter_throttle(m: Any) -> tuple[Any, ...]:
+    return (m.ThrOut * np.where(m.whole("ThrOut"), 1e-3, 1.0) + 0.0 * m.AngBst,)  # integers run to 1000, floats to 1
+
+
+def _target(m: Any, altitude: Any) -> tuple[Any, ...]:
+    return (np.rint(m.TLat * 1e7), np.rint(m.TLng * 1e7), np.rint(altitude * 1e3))
+
+
+def _has_target(m: Any) -> Any:
+    return (abs(m.TLat) > _NO_FIX_DEG) | (abs(m.TLng) > _NO_FIX_DEG)
+
+
+def _is_leg(m: Any) -> Any:
+    return ((m.CId <= _LAST_NAV) | np.isin(m.CId, _NAV_TOO)) & (m.CNum > 0)
+
+
+TABLE: tuple[Row, ...] = (
+    Row("ATT", "attitude", _angles, rank=3),
+    Row("AHR2", "attitude", _angles, rank=2),
+    Row("EKF1", "attitude", _angles, rank=1),
+    Row("IMU", "attitude: rates", _gyro, rank=4, when=lambda m: m.I == 0),
+    Row("IMU", "attitude: rates", _gyro, rank=3),
+    Row("GYR", "attitude: rates", _gyro, rank=2, when=lambda m: m.I == 0),
+    Row("RATE", "attitude: rates", lambda m: _rate(m, DEG + 0.0 * m.AOutSlew), rank=1),
+    Row("RATE", "attitude: rates", lambda m: _rate(m, DEG / 100 + 0.0 * m.TimeMS), rank=1),  # between: either unit
+    Row("IMU", "imu", _imu, rank=2, when=lambda m: m.I == 0),
+    Row("IMU", "imu", _imu, rank=1),
+    Row("POS", "position", _place, rank=4, when=_somewhere),
+    Row("GPS", "position", _place, rank=3, when=lambda m: (m.I == 0) & _fix(m)),
+    Row("GPS", "position", _place, rank=2, when=_fix),
+    Row("AHR2", "position", _place, rank=1, when=_somewhere),
+    Row("XKF1", "velocity", _ned, rank=8, when=lambda m: (m.C == 0) & _started(m)),
+    Row("XKF1", "velocity", _ned, rank=7, when=_started),
+    Row("NKF1", "velocity", _ned, rank=6, when=lambda m: (m.C == 0) & _started(m)),
+    Row("NKF1", "velocity", _ned, rank=5, when=_started),
+    Row("EKF1", "velocity", _ned, rank=4, when=_started),
+    Row("GPS", "velocity", _course, rank=2, when=lambda m: (m.I == 0) & _fix(m)),
+    Row("GPS", "velocity", _course, rank=1, when=_fix),
+    Row("CTUN", "air", lambda m: (m.As,), rank=6),
+    Row("CTUN", "air", lambda m: (m.Aspd,), rank=5),
+    Row("ARSP", "air", lambda m: (m.Airspeed,), rank=4, when=lambda m: (m.I == 0) & (m.U != 0)),
+    Row("ARSP", "air", lambda m: (m.Airspeed,), rank=3, when=lambda m: m.U != 0),
+    Row("ARSP", "air", lambda m: (m.Airspeed,), rank=2),
+    Row("NTUN", "air", lambda m: (m.Arspd,), rank=1),
+    Row("CTUN", "air: throttle", lambda m: (m.ThO * 1e-2,), rank=4, when=_is_plane),  # per cent
+    Row("CTUN", "air: throttle", lambda m: (m.ThrOut * 1e-2,), rank=3, when=_is_plane),  # per cent
+    Row("CTUN", "air: throttle", lambda m: (m.ThO + 0.0 * m.ABst,), rank=2),  # Copter since 3.5, 0..1
+    Row("CTUN", "air: throttle", _copter_throttle, rank=1),
+    Row("XKF1", "air: climb", lambda m: (-m.VD,), rank=8, when=lambda m: (m.C == 0) & _started(m)),
+    Row("XKF1", "air: climb", lambda m: (-m.VD,), rank=7, when=_started),
+    Row("NKF1", "air: climb", lambda m: (-m.VD,), rank=6, when=lambda m: (m.C == 0) & _started(m)),
+    Row("NKF1", "air: climb", lambda m: (-m.VD,), rank=5, when=_started),
+    Row("EKF1", "air: climb", lambda m: (-m.VD,), rank=4, when=_started),
+    Row("BARO", "air: climb", lambda m: (m.CRt,), rank=3, when=lambda m: m.I == 0),
+    Row("BARO", "air: climb", lambda m: (m.CRt,), rank=2),
+    Row("GPS", "air: climb", lambda m: (-m.VZ,), rank=1, when=_fix),
+    Row("RCOU", "servo", lambda m: _outputs(m, "C1 C2 C3 C4 C5 C6 C7 C8"), rank=9),
+    Row("RCOU", "servo", lambda m: _outputs(m, "Ch1 Ch2 Ch3 Ch4 Ch5 Ch6 Ch7 Ch8"), rank=8),
+    Row("RCOU", "servo", lambda m: _outputs(m, "Chan1 Chan2 Chan3 Chan4 Chan5 Chan6 Chan7 Chan8"), rank=8),
+    Row("RCOU", "servo", lambda m: _outputs(m, "Ch1 Ch2 Ch3 Ch4 Ch5 Ch6"), rank=7),
+    Row("RCOU", "servo", lambda m: _outputs(m, "Ch1 Ch2 Ch3 Ch4"), rank=6),
+    Row("MOT", "servo", lambda m: _outputs(m, "Mot1 Mot2 Mot3 Mot4 Mot5 Mot6 Mot7 Mot8"), rank=5),
+    Row("MOT", "servo", lambda m: _outputs(m, "Mot1 Mot2 Mot3 Mot4 Mot5 Mot6"), rank=4),
+    Row("MOT", "servo", lambda m: _outputs(m, "Mot1 Mot2 Mot3 Mot4"), rank=3),
+    Row("ATT", "command", lambda m: (m.DesRoll * DEG, m.DesPitch * DEG), rank=3),
+    Row("CTUN", "command", lambda m: (m.NavRoll * DEG, m.NavPitch * DEG), rank=2),
+    Row("ATT", "command", lambda m: (m.RollIn * DEG, m.PitchIn * DEG), rank=1),
+    Row("NTUN", "command: errors", lambda m: (m.XT, m.AltE, m.AsE), rank=3),
+    Row("NTUN", "command: errors", lambda m: (m.XT, m.AltErr, m.AspdE), rank=2),
+    Row("NTUN", "command: errors", lambda m: (m.XT, m.AltErr, m.ArspdErr), rank=1),
+    Row("MISE", "leg", lambda m: (m.CNum,), rank=2, when=_is_leg),
+    Row("CMD", "leg", lambda m: (m.CNum,), rank=1, when=_is_leg),  # those that were carried out; lists are missions
+    Row("XKF2", "wind", _wind, rank=5, when=lambda m: (m.C == 0) & _blows(m)),
+    Row("XKF2", "wind", _wind, rank=4, when=_blows),
+    Row("NKF2", "wind", _wind, rank=3, when=lambda m: (m.C == 0) & _blows(m)),
+    Row("NKF2", "wind", _wind, rank=2, when=_blows),
+    Row("EKF2", "wind", _wind, rank=1, when=_blows),
+    Row("NTUN", "target", lambda m: _target(m, m.TAW), rank=2, when=_has_target),
+    Row(
+        "NTUN",
+        "target",
+        lambda m: _target(m, m.TAlt * np.where(m.whole("TAlt"), 1e-2, 1.0)),  # centimetres while it was an integer
+        rank=1,
+        when=_has_target,
+    ),
+    Row("BARO", "pressure", lambda m: (m.Press,), rank=2, when=lambda m: (m.I == 0) & (m.Press > 0)),
+    Row("BARO", "pressure", lambda m: (m.Press,), rank=1, when=lambda m: m.Press > 0),
+    Row("GPS", "gnss", lambda m: (np.rint(m.Alt * 1e3),), rank=2, when=lambda m: (m.I == 0) & _fix(m)),
+    Row("GPS", "gnss", lambda m: (np.rint(m.Alt * 1e3),), rank=1, when=_fix),
+)
+
+ROWS: dict[str, tuple[Row, ...]] = {
+    name: tuple(row for row in TABLE if row.message == name) for name in {row.message for row in TABLE}
+}
+
+COLUMNS_OF: dict[str, slice] = {
+    part: slice(sum(n for _, n in parts[:i]), sum(n for _, n in parts[: i + 1]))
+    for parts in PARTS.values()
+    for i, (part, _) in enumerate(parts)
+}
+"""Which columns of its `Sample` field a part fills; a field without parts fills them all."""
+
+
+def field_of(part: str) -> str:
+    """Name the `Sample` field a part belongs to."""
+    return part.split(":")[0]
+
+
+def believable(part: str, values: np.ndarray) -> np.ndarray:
+    """Tell for each row of a part, (n, k), whether every column is finite and within its largest magnitude, (n,)."""
+    highest = np.array(HIGHEST[field_of(part)])[COLUMNS_OF.get(part, slice(None))]
+    return (np.abs(values) <= highest).all(axis=-1)

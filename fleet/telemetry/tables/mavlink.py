@@ -1,0 +1,149 @@
+"""THE TABLE of MAVLink: one row per message and `Sample` field, with the clock its time comes from.
+
+The only place where degrees, centimetres, milli-g and per cent become SI, NED, FRD and rad. A newcomer adds a row.
+Source: MAVLink common.xml; for what ArduPilot really sends, its GCS_Common.cpp and GCS_MAVLink_Plane.cpp.
+"""
+
+from math import pi
+from typing import Any
+
+import numpy as np
+
+from fleet.telemetry.tables.clock import BOOT, NONE, USEC, USEC32
+from fleet.telemetry.tables.row import Row, euler
+
+DEG = pi / 180  # [rad/deg]
+MILLI_G = 9.80665e-3  # [m/s2 per milli-g]
+
+
+def _imu_milli(m: Any) -> tuple[Any, ...]:
+    acc = (m.xacc * MILLI_G, m.yacc * MILLI_G, m.zacc * MILLI_G)
+    return (*acc, m.xgyro * 1e-3, m.ygyro * 1e-3, m.zgyro * 1e-3)
+
+
+def _command(m: Any, alt_error: Any, va_error: Any) -> tuple[Any, ...]:
+    return (m.nav_roll * DEG, m.nav_pitch * DEG, m.xtrack_error, alt_error, va_error)
+
+
+def _servo(m: Any) -> tuple[Any, ...]:
+    raw = (m.servo1_raw, m.servo2_raw, m.servo3_raw, m.servo4_raw, m.servo5_raw, m.servo6_raw, m.servo7_raw)
+    return (*raw, m.servo8_raw)
+
+
+_NO_ITEM = 65535
+_FIX_3D = 3
+_NO_FIX_E7 = 100_000  # a kilometre round zero, zero [1e-7 deg]
+
+
+def _has_fix(m: Any) -> Any:
+    return _somewhere(m.lat, m.lon)  # without a fix autopilots say zero, zero, or drift around it
+
+
+def _somewhere(lat: Any, lon: Any) -> Any:
+    return (abs(lat) > _NO_FIX_E7) | (abs(lon) > _NO_FIX_E7)
+
+
+_ABS_PRESSURE = 1 << 9  # HIGHRES_IMU_UPDATED_FLAGS
+
+
+def _started(m: Any) -> Any:
+    """Tell where there is a velocity: an estimator that has none says zero to the last digit, or not a number."""
+    return np.isfinite(m.vx + m.vy + m.vz) & ((m.vx != 0) | (m.vy != 0) | (m.vz != 0))
+
+
+def _measured(m: Any) -> Any:
+    return ((m.fields_updated & _ABS_PRESSURE) != 0) & np.isfinite(m.abs_pressure) & (m.abs_pressure > 0)
+
+
+def _wind(m: Any) -> tuple[Any, ...]:
+    return (-m.speed * np.cos(m.direction * DEG), -m.speed * np.sin(m.direction * DEG))  # it names where from
+
+
+TABLE: tuple[Row, ...] = (
+    Row(
+        "ATTITUDE",
+        "attitude",
+        lambda m: (m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed),
+        BOOT,
+    ),
+    Row("HIGHRES_IMU", "imu", lambda m: (m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro), USEC, rank=3),
+    Row("SCALED_IMU", "imu", _imu_milli, BOOT, rank=2),
+    Row("RAW_IMU", "imu", _imu_milli, USEC, rank=1, autopilots=("ardupilot",)),  # elsewhere raw has no unit
+    Row("GLOBAL_POSITION_INT", "position", lambda m: (m.lat, m.lon, m.alt), BOOT, when=_has_fix),
+    Row(
+        "GLOBAL_POSITION_INT",
+        "velocity",
+        lambda m: (m.vx * 1e-2, m.vy * 1e-2, m.vz * 1e-2),
+        BOOT,
+        when=_has_fix,
+    ),
+    Row(
+        "LOCAL_POSITION_NED",  # the same estimator without rounding, and often faster
+        "velocity",
+        lambda m: (m.vx, m.vy, m.vz),
+        BOOT,
+        rank=1,
+        when=_started,
+        given="position",  # without a fix PX4 sends what drifts, in a frame that need not face north
+    ),
+    Row("VFR_HUD", "air", lambda m: (m.airspeed, m.throttle * 1e-2, m.climb), NONE),
+    Row("SERVO_OUTPUT_RAW", "servo", _servo, USEC32, when=lambda m: m.port == 0),
+    Row(
+        "NAV_CONTROLLER_OUTPUT",
+        "command",
+        lambda m: _command(m, m.alt_error, m.aspd_error * 1e-2),  # ArduPilot sends cm/s, not the m/s of common.xml
+        NONE,
+        autopilots=("ardupilot",),
+    ),
+    Row(
+        "NAV_CONTROLLER_OUTPUT",
+        "command",
+        lambda m: _command(m, -m.alt_error, -m.aspd_error),  # PX4 sends flown minus wanted
+        NONE,
+        autopilots=("px4",),
+    ),
+    Row(
+        "NAV_CONTROLLER_OUTPUT",
+        "command",
+        lambda m: _command(m, m.alt_error, m.aspd_error),
+        NONE,
+        autopilots=("generic",),
+    ),
+    Row(
+        "ATTITUDE_TARGET",
+        "command",
+        lambda m: (*euler(np.asarray(m.q, float).T)[:2], np.nan, np.nan, np.nan),
+        BOOT,
+        rank=1,  # PX4 sends the set points of its attitude loop here, at a rate; in the other only some builds do
+        autopilots=("px4",),
+    ),
+    Row("MISSION_CURRENT", "leg", lambda m: (np.where(m.seq == _NO_ITEM, -1.0, m.seq),), NONE),
+    Row("WIND", "wind", _wind, NONE, rank=1),
+    Row("WIND_COV", "wind", lambda m: (m.wind_x, m.wind_y), USEC, rank=2),
+    Row(
+        "POSITION_TARGET_GLOBAL_INT",
+        "target",
+        lambda m: (m.lat_int, m.lon_int, m.alt * 1e3),
+        BOOT,
+        when=lambda m: ((m.coordinate_frame == 0) | (m.coordinate_frame == 5)) & _somewhere(m.lat_int, m.lon_int),
+    ),
+    Row("HIGHRES_IMU", "pressure", lambda m: (m.abs_pressure * 1e2,), USEC, rank=1, when=_measured),
+    Row("GLOBAL_POSITION_INT", "height", lambda m: (m.relative_alt * 1e-3,), BOOT, when=_has_fix),
+    Row(
+        "SCALED_PRESSURE",
+        "pressure",
+        lambda m: (m.press_abs * 1e2,),
+        BOOT,
+        when=lambda m: m.press_abs != 0,  # zero: no barometer
+    ),
+    # its time is since boot here, of the receiver there: it would upset the clock that other messages share
+    Row("GPS_RAW_INT", "gnss", lambda m: (m.alt,), NONE, when=lambda m: m.fix_type >= _FIX_3D),
+)
+
+_OWN_TIME = {BOOT: lambda m: m.time_boot_ms * 1e-3, USEC: lambda m: m.time_usec * 1e-6, NONE: lambda m: 0.0}
+_OWN_TIME[USEC32] = _OWN_TIME[USEC]
+
+
+def own_seconds(row: Row, message: Any) -> Any:
+    """Read the messages' own time on whatever clock the row names [s]; 0 where it names none."""
+    return _OWN_TIME[row.tick](message)

@@ -1,0 +1,345 @@
+"""THE TABLE of ULog: one row per PX4 topic and `Sample` field, from PX4 1.6 (2017) to 1.16.
+
+PX4 moves things between topics from release to release. A row whose topic, sister topic or fields a log lacks does not
+apply; the highest rank that flows wins. So a new release is a new row, and no row asks for a version.
+A row reads its topic's fields as arrays; `beside` reads another topic at the same times. A newcomer adds a row.
+Source: PX4-Autopilot msg/ at the release tags; what it tells by radio: src/modules/mavlink/streams/.
+"""
+
+from collections.abc import Callable, Iterator
+from math import pi
+from typing import Any
+
+import numpy as np
+
+from fleet.telemetry.tables.row import Row, euler
+
+DEG = pi / 180  # [rad/deg]
+_NO_FIX_DEG = 0.01  # a kilometre round zero, zero [deg]
+_FIX_3D = 3
+_RAREST_PA = 2_000.0  # at 26 km; no air is 2,000 millibar dense
+_IDLE = 5  # position_setpoint.type: nothing to steer for
+_EARTH_M = 6_371_000.0  # the sphere on which PX4 projects its local frame
+_SHORTEST_US, _LONGEST_US = 700.0, 2300.0  # pulse widths a servo knows
+
+Columns = Callable[[Any], tuple[Any, ...]]
+
+
+def _somewhere(lat_deg: Any, lon_deg: Any) -> Any:
+    return (np.abs(lat_deg) > _NO_FIX_DEG) | (np.abs(lon_deg) > _NO_FIX_DEG)
+
+
+def _place(lat_deg: Any, lon_deg: Any, alt_m: Any) -> tuple[Any, ...]:
+    return np.rint(lat_deg * 1e7), np.rint(lon_deg * 1e7), np.rint(alt_m * 1e3)
+
+
+def _local(m: Any) -> tuple[Any, ...]:
+    """Undo PX4's azimuthal equidistant projection. Source: PX4 src/lib/geo, MapProjection::reproject."""
+    lat, lon = m.ref_lat * DEG, m.ref_lon * DEG
+    c = np.hypot(m.x, m.y) / _EARTH_M
+    k = np.sinc(c / pi)  # sin(c) / c
+    n, e = m.x / _EARTH_M * k, m.y / _EARTH_M * k
+    north = np.arcsin(np.clip(np.cos(c) * np.sin(lat) + n * np.cos(lat), -1, 1))
+    east = lon + np.arctan2(e, np.cos(lat) * np.cos(c) - n * np.sin(lat))
+    return _place(north / DEG, (east / DEG + 180) % 360 - 180, m.ref_alt - m.z)
+
+
+# --- air: where the airspeed is, and where the throttle -----------------------------------------------------------
+# Calibrated before true: it is what PX4 sends in VFR_HUD, what its controllers hold and what ArduPilot sends.
+
+_AIRSPEED: tuple[tuple[str, Columns], ...] = (
+    ("airspeed_validated", lambda m: (m.calibrated_airspeed_m_s,)),  # since 1.12
+    ("airspeed_validated", lambda m: (m.equivalent_airspeed_m_s,)),  # 1.10, 1.11
+    ("airspeed", lambda m: (m.indicated_airspeed_m_s,)),
+)
+
+
+def _thrust(m: Any) -> Any:
+    return np.sqrt(sum(axis**2 for axis in m.xyz))
+
+
+_THROTTLE: tuple[Callable[[Any], Any], ...] = (  # of a VTOL whichever pushes more, as VFR_HUD has it
+    lambda m: np.fmax(m.beside("actuator_controls_0").control[3], m.beside("actuator_controls_1").control[3]),
+    lambda m: m.beside("actuator_controls_0").control[3],  # until 1.13
+    lambda m: np.fmax(_thrust(m.beside("vehicle_thrust_setpoint")), _thrust(m.beside("vehicle_thrust_setpoint.1"))),
+    lambda m: _thrust(m.beside("vehicle_thrust_setpoint")),  # since 1.14
+    lambda m: m.beside("actuator_motors").control[0],
+)
+
+
+def _air_row(topic: str, airspeed: Columns, throttle: Callable[[Any], Any], rank: int) -> Row:
+    def columns(m: Any) -> tuple[Any, ...]:
+        return (*airspeed(m), throttle(m), -m.beside("vehicle_local_position").vz)
+
+    return Row(topic, "air", columns, rank=rank)
+
+
+def _air_rows() -> Iterator[Row]:
+    pairs = [(topic, airspeed, throttle) for topic, airspeed in _AIRSPEED for throttle in _THROTTLE]
+    for rank, (topic, airspeed, throttle) in enumerate(reversed(pairs)):
+        yield _air_row(topic, airspeed, throttle, rank)
+
+
+# --- servo --------------------------------------------------------------------------------------------------------
+
+
+def _output(m: Any) -> tuple[Any, ...]:
+    return tuple(np.where(np.isfinite(output), output, 0.0) for output in m.output[:8])
+
+
+def _pulses(m: Any) -> Any:
+    """Tell where outputs are pulse widths: since 1.13 they may be ESC counts or rad/s; all zero drives nothing."""
+    outputs = np.array(_output(m))
+    fits = ((outputs == 0) | ((outputs > _SHORTEST_US) & (outputs < _LONGEST_US))).all(axis=0)
+    driven = (outputs != 0).any(axis=0)
+    return fits & driven & (np.sum(fits & driven) >= 0.9 * np.sum(driven))
+
+
+def _widths(m: Any, middle: float, reach: float) -> tuple[Any, ...]:
+    """Give pulse widths [us] for a control of -1..1; not finite is not driven."""
+    pulses = [np.where(np.isfinite(c), middle + reach * np.clip(c, -1, 1), 0.0) for c in m.control[:8]]
+    return (*pulses, *([np.zeros_like(pulses[0])] * (8 - len(pulses))))
+
+
+def _driven(m: Any) -> Any:
+    return np.isfinite(np.array(m.control[:8])).any(axis=0)
+
+
+# --- command: set points of a fixed wing, errors are wanted minus flown as in the house ----------------------------
+
+_WANTED: tuple[tuple[Columns, str, Columns], ...] = (  # roll and pitch, path topic, altitude and airspeed error
+    (
+        lambda m: euler(m.q_d)[:2],  # 1.16 has no roll_body
+        "position_controller_status",
+        lambda m: (
+            m.beside("tecs_status").altitude_sp - m.beside("vehicle_global_position").alt,
+            m.beside("tecs_status").true_airspeed_sp - m.beside("tecs_status").true_airspeed_filtered,
+        ),
+    ),
+    (
+        lambda m: (m.roll_body, m.pitch_body),  # 1.14, 1.15: TECS no longer tells its own altitude
+        "position_controller_status",
+        lambda m: (
+            m.beside("tecs_status").altitude_sp - m.beside("vehicle_global_position").alt,
+            m.beside("tecs_status").true_airspeed_sp - m.beside("tecs_status").true_airspeed_filtered,
+        ),
+    ),
+    (
+        lambda m: (m.roll_body, m.pitch_body),  # 1.11 to 1.13
+        "position_controller_status",
+        lambda m: (
+            m.beside("tecs_status").altitude_sp - m.beside("tecs_status").altitude_filtered,
+            m.beside("tecs_status").true_airspeed_sp - m.beside("tecs_status").true_airspeed_filtered,
+        ),
+    ),
+    (
+        lambda m: (m.roll_body, m.pitch_body),  # 1.9, 1.10
+        "position_controller_status",
+        lambda m: (
+            m.beside("tecs_status").altitude_sp - m.beside("tecs_status").altitude_filtered,
+            m.beside("tecs_status").airspeed_sp - m.beside("tecs_status").airspeed_filtered,
+        ),
+    ),
+    (
+        lambda m: (m.roll_body, m.pitch_body),  # 1.8
+        "fw_pos_ctrl_status",
+        lambda m: (
+            m.beside("tecs_status").altitude_sp - m.beside("tecs_status").altitude_filtered,
+            m.beside("tecs_status").airspeed_sp - m.beside("tecs_status").airspeed_filtered,
+        ),
+    ),
+    (
+        lambda m: (m.roll_body, m.pitch_body),  # 1.6, 1.7
+        "fw_pos_ctrl_status",
+        lambda m: (
+            m.beside("tecs_status").altitudeSp - m.beside("tecs_status").altitude_filtered,
+            m.beside("tecs_status").airspeedSp - m.beside("tecs_status").airspeed_filtered,
+        ),
+    ),
+)
+
+
+def _command_row(attitude: Columns, path: str, errors: Columns, rank: int) -> Row:
+    def columns(m: Any) -> tuple[Any, ...]:
+        return (*attitude(m), m.beside(path).xtrack_error, *errors(m))
+
+    return Row("vehicle_attitude_setpoint", "command", columns, rank=rank)
+
+
+# --- pressure and satellites --------------------------------------------------------------------------------------
+
+
+def _baro(m: Any) -> tuple[Any, ...]:
+    return (m.pressure * np.where(m.pressure < _RAREST_PA, 100.0, 1.0),)  # millibar until 1.13
+
+
+def _fix(m: Any) -> Any:
+    return m.fix_type >= _FIX_3D
+
+
+# --- the table ----------------------------------------------------------------------------------------------------
+
+TABLE: tuple[Row, ...] = (
+    Row("vehicle_attitude", "attitude", lambda m: (*euler(m.q), *m.beside("vehicle_angular_velocity").xyz), rank=3),
+    Row(
+        "vehicle_attitude",  # until 1.9
+        "attitude",
+        lambda m: (*euler(m.q), m.rollspeed, m.pitchspeed, m.yawspeed),
+        rank=2,
+    ),
+    Row("vehicle_attitude", "attitude", lambda m: (*euler(m.q), *m.beside("sensor_combined").gyro_rad), rank=1),
+    Row("sensor_combined", "imu", lambda m: (*m.accelerometer_m_s2, *m.gyro_rad), rank=2),
+    Row("vehicle_acceleration", "imu", lambda m: (*m.xyz, *m.beside("vehicle_angular_velocity").xyz), rank=1),
+    Row(
+        "vehicle_global_position",
+        "position",
+        lambda m: _place(m.lat, m.lon, m.alt),
+        rank=6,
+        when=lambda m: _somewhere(m.lat, m.lon),
+    ),
+    Row(
+        "vehicle_local_position",
+        "position",
+        _local,
+        rank=5,
+        when=lambda m: (m.xy_global != 0) & (m.z_global != 0) & _somewhere(m.ref_lat, m.ref_lon),
+    ),
+    *(
+        row
+        for topic, rank in (("vehicle_gps_position", 3), ("sensor_gps", 1))
+        for row in (
+            Row(
+                topic,
+                "position",
+                lambda m: _place(m.latitude_deg, m.longitude_deg, m.altitude_msl_m),  # since 1.14
+                rank=rank + 1,
+                when=_fix,
+            ),
+            Row(topic, "position", lambda m: (m.lat, m.lon, m.alt), rank=rank, when=_fix),
+        )
+    ),
+    Row(
+        "vehicle_local_position",
+        "velocity",
+        lambda m: (m.vx, m.vy, m.vz),
+        rank=3,
+        when=lambda m: (m.v_xy_valid != 0) & (m.v_z_valid != 0),
+    ),
+    Row("vehicle_global_position", "velocity", lambda m: (m.vel_n, m.vel_e, m.vel_d), rank=2),  # until 1.10
+    Row(
+        "vehicle_gps_position",
+        "velocity",
+        lambda m: (m.vel_n_m_s, m.vel_e_m_s, m.vel_d_m_s),
+        rank=1,
+        when=lambda m: (m.vel_ned_valid != 0) & (m.fix_type >= _FIX_3D),
+    ),
+    *_air_rows(),
+    Row("actuator_outputs", "servo", _output, rank=3, when=_pulses),
+    Row("actuator_servos", "servo", lambda m: _widths(m, 1500.0, 500.0), rank=2, when=_driven),
+    Row("actuator_motors", "servo", lambda m: _widths(m, 1000.0, 1000.0), rank=1, when=_driven),
+    *(_command_row(*wanted, len(_WANTED) - i) for i, wanted in enumerate(_WANTED)),
+    Row("mission_result", "leg", lambda m: (np.where(m.seq_current < 0, -1.0, m.seq_current),), rank=4),
+    Row("navigator_mission_item", "leg", lambda m: (m.sequence_current,), rank=3),
+    Row("mission", "leg", lambda m: (np.where(m.current_seq < 0, -1.0, m.current_seq),), rank=2),
+    Row("offboard_mission", "leg", lambda m: (np.where(m.current_seq < 0, -1.0, m.current_seq),), rank=1),  # 1.6
+    *(
+        Row(
+            topic,
+            "wind",
+            lambda m: (m.windspeed_north, m.windspeed_east),
+            rank=rank,
+            when=lambda m: (m.windspeed_north != 0) | (m.windspeed_east != 0),  # exactly zero: no estimate yet
+        )
+        for topic, rank in (("wind", 3), ("wind_estimate", 2), ("airspeed_wind", 1))
+    ),
+    Row(
+        "position_setpoint_triplet",
+        "target",
+        lambda m: _place(m.current.lat, m.current.lon, m.current.alt),
+        when=lambda m: (m.current.valid != 0) & (m.current.type != _IDLE) & _somewhere(m.current.lat, m.current.lon),
+    ),
+    Row("vehicle_air_data", "pressure", lambda m: (m.baro_pressure_pa,), rank=2, when=lambda m: m.baro_pressure_pa > 0),
+    Row("sensor_baro", "pressure", _baro, rank=1, when=lambda m: m.pressure > 0),
+    *(
+        row
+        for topic, rank in (("vehicle_gps_position", 3), ("sensor_gps", 1))
+        for row in (
+            Row(topic, "gnss", lambda m: (np.rint(m.altitude_msl_m * 1e3),), rank=rank + 1, when=_fix),  # since 1.14
+            Row(topic, "gnss", lambda m: (m.alt,), rank=rank, when=_fix),
+        )
+    ),
+)
+
+FLOWS_HZ = {"attitude": 4.0, "imu": 4.0, "position": 1.0, "velocity": 1.0, "air": 2.0, "servo": 2.0, "command": 1.0}
+"""Below this rate a source trickles: a lower rank that flows wins, else whichever has the most rows [Hz]."""
+
+CALCULATED = {
+    "actuator_servos": "servo: calculated as 1500 ± 500 us from actuator_servos, in PX4's order of surfaces",
+    "actuator_motors": "servo: calculated as 1000 to 2000 us from actuator_motors, in PX4's order of motors",
+}
+"""What to say where a field is not as it was logged."""
+
+HELD = ("vehicle_status", "vtol_vehicle_status", "mission_result", "mission", "position_setpoint_triplet")
+"""Topics told on change: what was said last before the log began is in force when it begins."""
+
+_SISTERS = (
+    *("vehicle_angular_velocity", "actuator_controls_0", "actuator_controls_1", "vehicle_thrust_setpoint"),
+    *("position_controller_status", "fw_pos_ctrl_status", "tecs_status", "vehicle_status", "vtol_vehicle_status"),
+)
+TOPICS: frozenset[str] = frozenset({row.message for row in TABLE} | set(_SISTERS))
+
+FIELDS = tuple(dict.fromkeys(row.field for row in TABLE))
+ROWS: dict[str, tuple[Row, ...]] = {
+    field: tuple(sorted((row for row in TABLE if row.field == field), key=lambda row: -row.rank)) for field in FIELDS
+}
+
+# --- modes and vehicles -------------------------------------------------------------------------------------------
+
+ARMED = 2  # vehicle_status.arming_state
+MODES: dict[int, tuple[tuple[tuple[int, int], str], ...]] = {
+    0: (((0, 0), "MANUAL"),),
+    1: (((0, 0), "ALTCTL"),),
+    2: (((0, 0), "POSCTL"),),
+    3: (((0, 0), "MISSION"),),
+    4: (((0, 0), "LOITER"),),
+    5: (((0, 0), "RTL"),),
+    6: (((0, 0), "RCRECOVER"), ((1, 15), "POSITION_SLOW")),
+    7: (((0, 0), "RTGS"),),
+    8: (((0, 0), "LANDENGFAIL"), ((1, 16), "ALTITUDE_CRUISE")),
+    9: (((0, 0), "LANDGPSFAIL"),),
+    10: (((0, 0), "ACRO"),),
+    12: (((0, 0), "DESCEND"),),
+    13: (((0, 0), "TERMINATION"),),
+    14: (((0, 0), "OFFBOARD"),),
+    15: (((0, 0), "STABILIZED"),),
+    16: (((0, 0), "RATTITUDE"),),
+    17: (((0, 0), "TAKEOFF"),),
+    18: (((0, 0), "LAND"),),
+    19: (((0, 0), "FOLLOWME"),),
+    20: (((0, 0), "PRECLAND"),),
+    21: (((0, 0), "ORBIT"),),
+    22: (((0, 0), "VTOL_TAKEOFF"),),
+    **{23 + i: (((0, 0), f"EXTERNAL{i + 1}"),) for i in range(8)},
+}
+"""vehicle_status.nav_state -> (since which release, name), names as a heartbeat gives them where it has one."""
+
+
+def mode(nav_state: int, release: tuple[int, int]) -> str:
+    """Name a nav_state as `release` (major, minor) meant it."""
+    names = [name for since, name in MODES.get(nav_state, ()) if since <= release]
+    return names[-1] if names else f"nav_state {nav_state}"
+
+
+AUTOSTART: tuple[tuple[range, str], ...] = (
+    (range(2_000, 4_000), "fixed_wing"),
+    (range(4_000, 13_000), "multirotor"),
+    (range(13_000, 14_000), "quadplane"),
+    (range(14_000, 16_000), "multirotor"),
+    (range(16_000, 17_000), "helicopter"),
+    (range(17_000, 18_000), "fixed_wing"),
+)
+"""SYS_AUTOSTART -> kind of vehicle, where nothing else tells. Source: PX4 ROMFS/px4fmu_common/init.d/airframes."""
+
+VEHICLE_TYPE = {1: "multirotor", 2: "fixed_wing"}  # vehicle_status.vehicle_type, since 1.9
+TRANSITIONS = {1: "transition to fixed wing", 2: "transition to multicopter", 3: "hovers", 4: "flies as a fixed wing"}
+"""What vtol_vehicle_status says, numbered as its `vehicle_vtol_state` since 1.13."""

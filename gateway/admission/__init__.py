@@ -1,0 +1,1 @@
+"""Which frames are accepted: message filter, signature check, limits."""

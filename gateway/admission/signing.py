@@ -1,0 +1,136 @@
+"""MAVLink 2 signatures: keys from a file, what is heard verified, what we say signed.
+
+Source: MAVLink "Message Signing": the first 48 bits of SHA-256 over key, frame, link id and time; time counts 10 us
+since 2015. Other than in pymavlink, a time is remembered only once its signature was found right: a forged one from the
+far future would else lock the real aircraft out.
+"""
+
+import hashlib
+import hmac
+import os
+import re
+import stat
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from fleet.telemetry.mavlink.parsing.decode import Frames
+from fleet.telemetry.mavlink.parsing.scan import COMPONENT, EXTRA, START, STOP, SYSTEM, V2
+from fleet.telemetry.mavlink.parsing.scan import SIGNED as FLAG
+
+FORGED, REPLAYED, STALE, UNSIGNED = (
+    "signature: wrong",
+    "signature: its time was used before",
+    "signature: its time lies more than a minute back",
+    "signature: none, and this link requires one",
+)
+_EPOCH_S = 1_420_070_400  # 2015-01-01 [s since 1970]
+_UNITS = 100_000  # of a time stamp [1/s]
+_WINDOW = 60 * _UNITS  # a sender not heard before may lie back so far
+_TAIL, _STAMP, _SIGNATURE = 13, 6, 6  # link id, time, signature [bytes]
+MOST_SENDERS = 4096  # whose times are remembered
+
+
+def read_keys(path: Path) -> dict[str, bytes]:
+    """Read keys by name: lines of `NAME KEY`, KEY being 64 hex digits; # begins a comment.
+
+    Raises:
+        ValueError: when others may read the file, or a line is none.
+        OSError: when it cannot be read.
+    """
+    with path.open() as file:
+        found = os.fstat(file.fileno())
+        mode = stat.S_IMODE(found.st_mode)
+        if not stat.S_ISREG(found.st_mode) or mode & 0o077 or found.st_uid not in (0, os.geteuid()):
+            whose = f"mode {mode:04o}, owner {found.st_uid}"
+            raise ValueError(f"keys {path}: found {whose}, expected a file for its owner alone; chmod 600 {path}")
+        lines = [line.split("#")[0].split() for line in file.read().splitlines()]
+    keys: dict[str, bytes] = {}
+    for number, words in enumerate(lines, start=1):
+        if words and (len(words) != 2 or not re.fullmatch(r"[0-9a-fA-F]{64}", words[1]) or words[0] in keys):
+            raise ValueError(
+                f"keys {path}: found line {number} unlike the others, expected a new name and 64 hex digits; correct it"
+            )
+        if words:
+            keys[words[0]] = bytes.fromhex(words[1])
+    return keys
+
+
+def pick(keys: dict[str, bytes], name: str, link: str) -> bytes:
+    """Give the key of a link: the one it names, or the only one.
+
+    Raises:
+        ValueError: when there is no such key.
+    """
+    if name in keys or (not name and len(keys) == 1):
+        return keys.get(name) or next(iter(keys.values()))
+    found = f"no key {name!r}" if name else f"{len(keys)} keys and none named"
+    raise ValueError(f"link {link}: found {found}, expected one of --keys FILE; write #sign=require&key=NAME")
+
+
+def stamp_now() -> int:
+    """Give the time as signatures have it [10 us since 2015]."""
+    return round((time.time() - _EPOCH_S) * _UNITS)
+
+
+class Signing:
+    """The signatures of one link.
+
+    Args:
+        key: 32 bytes both ends know
+        require: refuse what is not signed
+        link: number of ours, 0..255
+        clock: gives the time as signatures have it
+    """
+
+    def __init__(self, key: bytes, require: bool, link: int = 0, clock: Callable[[], int] = stamp_now) -> None:
+        self._key, self._require, self._link, self._clock = key, require, link & 0xFF, clock
+        self._last: dict[tuple[int, int, int], int] = {}  # newest verified time, by system, component, their link id
+        self._said = 0  # newest time of ours
+
+    def passes(self, frames: Frames, refused: Counter[str]) -> np.ndarray:
+        """Tell of every frame whether it may pass, (n,) bool; those that may not are counted by reason."""
+        passed = np.ones(len(frames.at), bool)
+        for i in range(len(frames.at)):
+            at = frames.at[i]
+            why = self._objection(frames.buf[at[START] : at[STOP]].tobytes(), int(at[SYSTEM]), int(at[COMPONENT]))
+            if why:
+                passed[i] = False
+                refused[why] += 1
+        return passed
+
+    def _objection(self, frame: bytes, system: int, component: int) -> str:
+        """Say what speaks against a frame; nothing: an empty string."""
+        if frame[0] != V2 or not frame[2] & FLAG:
+            return UNSIGNED if self._require else ""
+        if not hmac.compare_digest(self._signature(frame[:-_SIGNATURE]), frame[-_SIGNATURE:]):
+            return FORGED
+        sender = system, component, frame[-_TAIL]
+        stamp = int.from_bytes(frame[-_TAIL + 1 : -_SIGNATURE], "little")
+        last = self._last.get(sender)
+        if last is not None and stamp <= last:
+            return REPLAYED
+        if last is None and stamp < self._clock() - _WINDOW:
+            return STALE
+        if last is None and len(self._last) >= MOST_SENDERS:
+            self._last.pop(next(iter(self._last)))
+        self._last[sender] = stamp
+        self._said = max(self._said, stamp)  # whose clock is ahead would take ours for a replay
+        return ""
+
+    def sign(self, frame: bytes) -> bytes:
+        """Sign one frame of MAVLink 2."""
+        body = bytearray(frame[:-2])
+        body[2] |= FLAG
+        extra = int(EXTRA[int.from_bytes(body[7:10], "little")])
+        body += dialect.x25crc(bytes(body[1:]) + bytes([extra])).crc.to_bytes(2, "little")
+        self._said = max(self._said + 1, self._clock())
+        body += bytes([self._link]) + self._said.to_bytes(_STAMP, "little")
+        return bytes(body) + self._signature(bytes(body))
+
+    def _signature(self, signed: bytes) -> bytes:
+        return hashlib.sha256(self._key + signed).digest()[:_SIGNATURE]

@@ -1,0 +1,163 @@
+"""A recording as a link: played in its own time, faster, or as fast as it can be read, by one cast or many."""
+
+import contextlib
+import itertools
+import logging
+import queue
+import threading
+from collections.abc import Hashable, Iterator, Sequence
+from typing import Any
+
+from fleet.contract import FleetState
+from fleet.telemetry.mavlink.steps import STEP_S
+from fleet.telemetry.recording.fleet_news import renumbered
+from fleet.telemetry.recording.ids import Ids
+from fleet.telemetry.recording.pace import Pace
+from fleet.telemetry.recording.recordings import Recording
+from fleet.telemetry.replay.offset_copies import Copies
+from gateway.links.link import POLL_S, QUEUE, Batch
+from gateway.settings.link_spec import Spec
+
+LOOK_S = 3.0  # recorded time looked ahead to learn who is there [s]
+_MOST_LOOK = 100  # steps looked at where nobody shows
+_IN_FLIGHT = 4096  # messages between playing and publishing, about
+
+_log = logging.getLogger(__name__)
+
+
+class Replay:
+    """A recording, played at a multiple of its own time.
+
+    Args:
+        spec: the link
+        ids: who is who, shared by all recordings that play together
+    Raises:
+        ValueError: when it is no recording.
+        OSError: when it cannot be read.
+    """
+
+    def __init__(self, spec: Spec, ids: Ids | None = None) -> None:
+        self.spec = spec
+        self.dropped = self.unsent = 0
+        self.greets: Sequence[Hashable] = ()
+        self.recording = Recording(spec.where, spec.offset)
+        self.pace = Pace(spec.speed)
+        self._ids = Ids() if ids is None else ids
+        self._copies = Copies(spec.copies)
+        self._known: dict[int, int] = {}  # UAV id by the recorded one
+        self._steps: Iterator[tuple[float, list[Any]]] | None = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def name(self) -> str:
+        """Name the file."""
+        return self.recording.name
+
+    @property
+    def damage(self) -> str:
+        """Say what could not be read of it, known once it is at its end; empty: nothing."""
+        return "; ".join(self.recording.skipped)
+
+    @property
+    def share(self) -> float:
+        """Tell how far reading has come, 0..1."""
+        return self.recording.share
+
+    def words(self) -> str:
+        """Say how far it has been played, and how fast."""
+        return self.pace.words() if self.pace.passed_s else "looking through it"
+
+    def look(self, stop: threading.Event) -> None:
+        """Read a little ahead, so that everybody gets an id before anybody speaks.
+
+        Raises:
+            ValueError: when there is nothing in it.
+            OSError: when it cannot be read.
+        """
+        self.recording.source.stop = stop
+        steps = self.recording.steps(self.spec.results)
+        ahead: list[tuple[float, list[Any]]] = []
+        met: float | None = None
+        try:
+            for now, news in steps:
+                ahead.append((now, news))
+                met = now if met is None and news else met
+                if len(ahead) >= _MOST_LOOK or (met is not None and now > met + LOOK_S):
+                    break
+        except ValueError:
+            if not stop.is_set():
+                raise
+        self._meet([message for _, news in ahead for message in news])
+        self._steps = itertools.chain(ahead, steps)
+
+    def _meet(self, news: Sequence[Any]) -> None:
+        """Give an id to whoever is new: first to those recorded, then to their copies, copy by copy."""
+        new = sorted({m.uav for m in news if not isinstance(m, FleetState)} - self._known.keys())
+        for uav in new:
+            self._known[uav] = self._ids.give((self, uav, 0), uav)
+            if self._known[uav] != uav:
+                _log.warning("%s: uav-%d is taken, shown as uav-%d", self.name, uav, self._known[uav])
+        ids = [[self._ids.give((self, uav, copy), self._known[uav]) for uav in new]
+               for copy in range(1, self.spec.copies)]  # fmt: skip
+        for k, uav in enumerate(new):
+            self._copies.name(self._known[uav], [row[k] for row in ids])
+
+    def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
+        """Play in a thread."""
+        if self._steps is None:
+            self.look(stop)
+        self._thread = threading.Thread(target=self._play, args=(number, out, stop), name=self.spec.text)
+        self._thread.start()
+
+    def _play(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
+        try:
+            self._play_steps(number, out, stop)
+        except (ValueError, OSError) as error:  # a disk that fails half-way, a file without any aircraft
+            if not stop.is_set():
+                _log.warning("%s", error)
+        finally:
+            for sentence in [] if stop.is_set() else self.recording.skipped:
+                _log.warning("%s", sentence)
+            _put(out, Batch(number, ended=True), stop, QUEUE)
+
+    def _play_steps(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
+        assert self._steps is not None
+        most = max(_IN_FLIGHT // self.spec.copies, 8)
+        now = 0.0
+        for now, news in self._steps:
+            if self.pace.wait(now, stop):
+                return
+            self._meet(news)
+            mine = self._named(news)
+            copied = self._copies.step(mine)
+            if mine or copied:
+                _put(out, Batch(number, news=mine, copies=copied), stop, most)
+        for k, copied in enumerate(self._copies.last(), start=1):
+            if self.pace.wait(now + k * STEP_S, stop):
+                return
+            _put(out, Batch(number, copies=copied), stop, most)
+
+    def _named(self, news: Sequence[Any]) -> list[Any]:
+        """Give everybody the id found for them."""
+        if all(uav == known for uav, known in self._known.items()):
+            return list(news)
+        renamed = (renumbered(message, lambda uav: self._known.get(uav, uav)) for message in news)
+        return [message for message in renamed if message is not None]
+
+    def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
+        """Do nothing: a recording does not answer."""
+
+    def close(self) -> None:
+        """Wait for the thread."""
+        if self._thread is not None:
+            self._thread.join()
+
+
+def _put(out: "queue.Queue[Batch]", batch: Batch, stop: threading.Event, most: int) -> None:
+    """Queue a batch once fewer than `most` wait there."""
+    while not stop.is_set():
+        if out.qsize() >= most:
+            stop.wait(0.005)
+            continue
+        with contextlib.suppress(queue.Full):
+            return out.put(batch, timeout=POLL_S)

@@ -1,0 +1,74 @@
+"""A link to one far end over a stream, opened again whenever it fails: `tcp` and `serial`."""
+
+import logging
+import queue
+import selectors
+import threading
+from collections.abc import Hashable, Sequence
+
+from gateway.links.backoff import BackOff
+from gateway.links.link import POLL_S, Batch, Outlet
+from gateway.links.stream import Stream, offer, open_stream
+from gateway.settings.link_spec import Spec
+
+_log = logging.getLogger(__name__)
+
+
+class Dialled:
+    """A TCP client or a serial line; what is sent while it is down is counted, not kept."""
+
+    def __init__(self, spec: Spec) -> None:
+        self.spec = spec
+        self.dropped = self.unsent = 0
+        self.greets: Sequence[Hashable] = (spec.text,)  # the one far end; the same after every reconnection
+        self._stream: Stream | None = None
+        self._thread: threading.Thread | None = None
+
+    def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
+        """Call and receive in a thread."""
+        outlet = Outlet(number, out, self)
+        self._thread = threading.Thread(target=self._run, args=(outlet, stop), name=self.spec.text)
+        self._thread.start()
+
+    def _run(self, outlet: Outlet, stop: threading.Event) -> None:
+        back_off, said = BackOff(), ""
+        while not stop.is_set():
+            try:
+                stream = self._stream = open_stream(self.spec.kind, self.spec.where, self.spec.port)
+                try:
+                    _log.info("link %s: open", self.spec.text)
+                    said = ""
+                    self._receive(stream, outlet, back_off, stop)
+                finally:
+                    self._stream = None
+                    stream.close()
+                    self.unsent += stream.outbox.close()
+            except OSError as error:
+                reason = error.strerror or str(error)
+                if reason != said:
+                    _log.warning("link %s: %s; trying again", self.spec.text, reason)
+                    said = reason
+                back_off.wait(stop)
+
+    def _receive(self, stream: Stream, outlet: Outlet, back_off: BackOff, stop: threading.Event) -> None:
+        """Receive until the far end is gone, which is an OSError."""
+        read, both = selectors.EVENT_READ, selectors.EVENT_READ | selectors.EVENT_WRITE
+        with selectors.DefaultSelector() as ready:
+            ready.register(stream, read)
+            while not stop.is_set():
+                ready.modify(stream, both if stream.outbox.waits() else read)
+                for _, events in ready.select(POLL_S):
+                    if events & selectors.EVENT_WRITE:
+                        stream.outbox.flush()
+                    if events & selectors.EVENT_READ and (data := stream.read()):
+                        back_off.reset()
+                        outlet.piece(self.spec.text, data)
+
+    def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
+        """Send to the far end, if it is there and has room."""
+        self.unsent += offer(self._stream, data, messages)
+
+    def close(self) -> None:
+        """Wait for the thread; it closes what is open."""
+        if self._thread is not None:
+            self._thread.join()

@@ -1,0 +1,1 @@
+"""Publication of samples on the bus, and the history kept for late subscribers."""

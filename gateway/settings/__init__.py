@@ -1,0 +1,1 @@
+"""Link specifications from the command line, and which messages a link carries."""

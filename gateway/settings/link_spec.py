@@ -1,0 +1,93 @@
+"""The `--link` and `--forward` arguments, read."""
+
+import contextlib
+from typing import NamedTuple
+from urllib.parse import parse_qsl, unquote
+
+from fleet.telemetry.recording.pace import read_speed
+from gateway.settings.message_filter import SETTINGS, Sieve, read_sieve
+
+LOOPBACK = "127.0.0.1"
+MOST_COPIES = 10_000
+NETWORK = ("udpin", "udpout", "udpbcast", "tcpin", "tcp")
+KINDS = (*NETWORK, "serial", "replay")
+BAUD = 57_600  # of a telemetry radio
+_HIGHEST_BAUD = 4_000_000
+LISTENING = ("udpin", "tcpin")  # these may leave out the host: loopback
+SIGN = ("accept", "require")
+
+
+class Spec(NamedTuple):
+    """A link, as it was asked for."""
+
+    text: str
+    kind: str  # one of KINDS
+    where: str  # host or path
+    port: int  # or baud
+    speed: float = 1.0  # recorded seconds per second; inf: as fast as it can be read
+    offset: int = 0  # UAV id = MAVLink system id + offset
+    copies: int = 1  # aircraft in place of each recorded one, itself included
+    results: bool = False  # play also what workers said, where it was recorded
+    sieve: Sieve = Sieve()
+    sign: str = ""  # one of SIGN; empty: signatures are not looked at
+    key: str = ""  # name of a key; empty: the only one there is
+
+
+def read_spec(text: str, offset: int = 0) -> Spec:
+    """Read a link, e.g. `udpin:HOST:PORT`, `serial:PATH:BAUD` or `replay:PATH?speed=N`, each with settings behind a #.
+
+    In PATH, `%3F` stands for ?, `%23` for # and `%25` for %.
+
+    Raises:
+        ValueError: when it is none, or a value does not fit.
+    """
+    body, _, fragment = text.partition("#")
+    kind, _, rest = body.partition(":")
+    settings = dict(parse_qsl(fragment, keep_blank_values=True))
+    found = None
+    with contextlib.suppress(ValueError):
+        offset = int(settings.pop("offset", str(offset)))
+        found = _bare(text, kind, rest)
+    if found is not None and kind != "replay":
+        found = found._replace(sieve=read_sieve(settings), sign=settings.pop("sign", ""), key=settings.pop("key", ""))
+    if found is None or settings or found.sign not in ("", *SIGN) or (found.key and not found.sign):
+        raise ValueError(
+            f"--link: found {text!r}, expected udpin:HOST:PORT, udpout, udpbcast, tcpin or tcp likewise, "
+            "serial:PATH:BAUD or replay:FILE?speed=4&copies=10&results=1, with #offset=-1 if wanted, and but for "
+            f"recordings {', '.join(SETTINGS)}, sign={'|'.join(SIGN)}, key=NAME, joined by &; write one of these"
+        )
+    return found._replace(offset=offset)
+
+
+def read_forward(text: str) -> Spec:
+    """Read a link to another ground station.
+
+    Raises:
+        ValueError: when it is none, or carries what only aircraft have.
+    """
+    found = read_spec(text)
+    if found.kind == "replay" or found.offset:
+        raise ValueError(f"--forward: found {text!r}, expected a link to a ground station without offset; change it")
+    return found
+
+
+def _bare(text: str, kind: str, rest: str) -> Spec | None:
+    """Read a link without its settings; None where it is none."""
+    if kind in NETWORK:
+        host, _, port = rest.rpartition(":")
+        if port.isdecimal() and 0 < int(port) < 65536 and (host or kind in LISTENING):
+            return Spec(text, kind, host.strip("[]") or LOOPBACK, int(port))
+    elif kind == "serial":
+        path, _, baud = rest.rpartition(":")
+        path, baud = (path, baud) if baud.isdecimal() else (rest, str(BAUD))  # device names may hold colons
+        if path and 0 < int(baud) <= _HIGHEST_BAUD:
+            return Spec(text, kind, unquote(path), int(baud))
+    elif kind == "replay":
+        path, _, query = rest.partition("?")
+        asked = dict(parse_qsl(query))
+        speed = read_speed(asked.pop("speed", "1"))
+        copies, results = int(asked.pop("copies", "1")), asked.pop("results", "0")
+        fits = 1 <= copies <= MOST_COPIES and (results == "0" or (results == "1" and copies == 1))
+        if path and not asked and fits:
+            return Spec(text, kind, unquote(path), 0, speed, copies=copies, results=results == "1")
+    return None

@@ -1,0 +1,1 @@
+"""Statistics of links and aircraft, as printed, published and exported."""

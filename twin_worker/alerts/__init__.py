@@ -1,0 +1,1 @@
+"""Alerts derived from predictions: conflict, geofence, ground, feasibility."""

@@ -1,0 +1,40 @@
+"""Whether a predicted flight comes too near to the ground. Terrain is unknown: height is above home, and said so."""
+
+import numpy as np
+from scipy.special import ndtr
+
+from fleet.contract import AlertKind
+from fleet.frames import Origin
+from twin_worker.alerts.gaussian_forecast import Forecast
+from twin_worker.alerts.hysteresis import Finding
+
+WINGS_M, ROTORS_M = 30.0, 5.0  # least height above home where it does not land, on wings and on rotors [m]
+_SLIGHT = 0.02  # what is less probable is warned of by nobody, and not described [-]
+_OVER = "height is kept"
+
+
+def above(flight: Forecast, home: Origin) -> np.ndarray:
+    """Give the mean height above home, (n,) [m]."""
+    return (flight.made.origin[2] - home.alt_mm) * 1e-3 - flight.path[:, 2]
+
+
+def sinks(flight: Forecast, home: Origin, margin: float, until: float = np.inf) -> Finding:
+    """Judge a predicted flight against a least height above home [m], up to an instant [s since 1970].
+
+    The vertical error is one draw for the whole flight, so the worst instant alone decides:
+
+        p = max over t of Phi((margin - height(t)) / sigma(t))
+    """
+    k = max(int(np.searchsorted(flight.t, until, side="right")), 1)
+    height, sigma = above(flight, home)[:k], flight.sigma[:k, 2]
+    z = (margin - height) / sigma
+    p = float(ndtr(z.max()))
+    if p < _SLIGHT:
+        return Finding(AlertKind.GROUND, p, "", _OVER)
+    first = int(np.flatnonzero(z >= min(z.max(), 0.0))[0])  # where the mean goes below, else where it comes nearest
+    at = float(flight.t[first])
+    danger = (
+        f"{p:.0%} chance that it sinks below {margin:.0f} m above home (terrain unknown) in "
+        f"{max(at - flight.made.t, 0.0):.0f} s; lowest {height.min():.0f} m"
+    )
+    return Finding(AlertKind.GROUND, p, danger, _OVER, -1, at, flight.place(first))

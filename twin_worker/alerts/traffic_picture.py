@@ -1,0 +1,93 @@
+"""The newest prediction of every aircraft, side by side, so that one judgement reads them all at once."""
+
+from dataclasses import dataclass, field
+from math import inf
+
+import numpy as np
+
+from fleet.contract import Prediction
+from fleet.frames import Origin, to_geodetic, to_ned
+from twin_worker.alerts.gaussian_forecast import LONGEST_S, STEP, Forecast, forecast
+
+_ROWS = int(LONGEST_S / STEP) + 1
+_MOST = 4_096  # aircraft on one board; more are a stranger's
+_NEWS_S = 2.0  # what follows the last that was heard sooner hardly says anything new: paths are flown minutes ahead [s]
+_FAR = np.array([1e4, 1e4, -1e4])  # corner whose image gives the scale from one NED frame to another [m]
+
+
+@dataclass
+class Board:
+    """Predictions in slots; a UAV keeps its slot, which is written anew when it is first judged after news."""
+
+    _slots: dict[int, int] = field(default_factory=dict)  # slot by UAV id
+    _news: dict[int, Prediction] = field(default_factory=dict)  # heard, not yet laid
+    _heard: dict[int, float] = field(default_factory=dict)  # when the newest was made [s since 1970]
+    _laid: list[Forecast | None] = field(default_factory=list)
+    first: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    rows: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    path: np.ndarray = field(default_factory=lambda: np.zeros((0, _ROWS, 3)))
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, _ROWS, 4)))
+    uav: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    t: np.ndarray = field(default_factory=lambda: np.zeros(0))  # when it was made [s since 1970]
+    origin: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [1e-7 deg, 1e-7 deg, mm]
+    corner: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # geodetic place of _FAR, the same units
+
+    def hear(self, made: Prediction) -> None:
+        """Keep the newest prediction of each aircraft; safe to call from another thread."""
+        last = self._heard.get(made.uav, -inf)
+        if last < made.t < last + _NEWS_S:
+            return
+        if made.uav in self._slots or len(self._slots) + len(self._news) < _MOST:
+            self._heard[made.uav], self._news[made.uav] = made.t, made
+
+    def settle(self) -> None:
+        """Lay what was heard since into its slots; what cannot be judged empties its slot."""
+        while self._news:
+            uav, made = self._news.popitem()
+            slot = self._slots.setdefault(uav, len(self._slots))
+            if slot >= len(self.uav):
+                self._grow(max(2 * len(self.uav), 8))
+            self._lay(slot, uav, made)
+
+    def _grow(self, slots: int) -> None:
+        for name in ("first", "rows", "path", "covariance", "uav", "t", "origin", "corner"):
+            old = getattr(self, name)
+            new = np.zeros((slots, *old.shape[1:]), old.dtype)
+            new[: len(old)] = old
+            setattr(self, name, new)
+        self._laid += [None] * (slots - len(self._laid))
+
+    def _lay(self, slot: int, uav: int, made: Prediction) -> None:
+        found = forecast(made)
+        self._laid[slot], self.uav[slot], self.rows[slot] = found, uav, 0
+        self.t[slot] = made.t if np.isfinite(made.t) else -np.inf
+        if found is None:
+            return
+        n = len(found.path)
+        self.first[slot], self.rows[slot] = found.first, n
+        self.path[slot, :n], self.covariance[slot, :n] = found.path, found.covariance()
+        if made.origin != tuple(self.origin[slot]):
+            self.origin[slot] = made.origin
+            self.corner[slot] = to_geodetic(made.ned_origin(), _FAR)
+
+    def of(self, uav: int) -> tuple[int, Forecast] | None:
+        """Give slot and prediction of one aircraft; None where it has none that can be judged."""
+        slot = self._slots.get(uav)
+        found = None if slot is None else self._laid[slot]
+        return None if slot is None or found is None else (slot, found)
+
+    def others(self, slot: int, now: float, stale_s: float) -> np.ndarray:
+        """Give the slots of aircraft with a higher id and a prediction made within `stale_s` of `now`, (m,)."""
+        n = len(self._slots)
+        near = (self.uav[:n] > self.uav[slot]) & (self.rows[:n] > 0) & (np.abs(self.t[:n] - now) <= stale_s)
+        return np.flatnonzero(near)
+
+    def into(self, slot: int, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Give scale and shift that take the others' NED to that of `slot`, (m, 3) each [-, m].
+
+        Both are straight in latitude and longitude (`fleet.frames`), so the images of two places tell all.
+        """
+        origin = Origin(*map(int, self.origin[slot]))
+        shift = to_ned(origin, *self.origin[others].T)
+        corner = to_ned(origin, *self.corner[others].T)
+        return (corner - shift) / _FAR, shift

@@ -1,0 +1,1 @@
+"""Prediction regions and the confidence horizon by conformal prediction."""

@@ -1,0 +1,1 @@
+"""Fit and evaluation of calibration tables from scored predictions."""

@@ -1,1 +1,0 @@
-"""Alerts from predictions: pure judgement in data time; nothing here knows a bus."""

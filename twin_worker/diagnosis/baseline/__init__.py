@@ -1,0 +1,1 @@
+"""Calibration of the baseline model, also from the aircraft's own past."""

@@ -1,0 +1,211 @@
+"""Calibrate on a flight's own trusted past, so that what follows can be diagnosed without any other flight.
+
+A short past excites few axes. What it leaves open stays open: every direction in which the coefficients are doubtful,
+and which the rest of the flight makes use of, is a nuisance; an equation that does not foretell the pieces left out is
+not covered; what was there from the start is part of the baseline, and never a finding.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from fleet.effects import Onset, Stage, catalogue
+from fleet.process.sanitise import below
+from twin_worker.diagnosis.baseline.calibrate import settled
+from twin_worker.diagnosis.baseline.fit import Rows, axial, fit, fit_timing, pitch
+from twin_worker.diagnosis.data.card import Card
+from twin_worker.diagnosis.data.flight import Flight
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.model import equations as eq
+from twin_worker.diagnosis.model.baseline import CHANNELS, DEAF, Baseline, Noise, silenced
+from twin_worker.diagnosis.model.residual import Case, Terms
+from twin_worker.diagnosis.model.weather import CORRELATED, wind
+
+PIECES = 4  # of the past, each foretold by the others
+LEAST_S = 40.0  # of trusted past
+BEFORE_S = 30.0  # of the past stay in what is diagnosed, so that an onset has something before it
+NEVER = 1e9  # gain that nothing reaches
+_RIDGE = 0.02  # little data determine few numbers
+_FADED = 4.0  # rows that count as one where the coefficients' doubt is reckoned: whitening is never whole
+_SHOWS = 0.1  # of an equation's own scatter, from which a doubtful direction is kept
+_LEAST_GAIN = 400.0  # of any effect
+_WIND = 2.5  # a mean wind is weather, and known no better [m/s]
+_ANY_BIAS = 50.0  # floors of a sensor's bias, in which any is found
+_AIRSPEED = 0.3  # least scatter of airspeed [m/s]
+_PRIOR = (0.1, 10.0, 10.0, 1.0, 1.0)  # of airspeed's scale, of wind [m/s], of its growth with height [m/s per 100 m]
+_WORSE = -0.5  # share of variance foretold, below which an equation says nothing
+
+Say = Callable[[str], None]
+
+
+def calibrate_past(
+    flight: Flight, until: float, card: Card, say: Say = lambda word: None, shown: Flight | None = None
+) -> Baseline:
+    """Calibrate on what a flight did before `until` [s, on its own clock].
+
+    Args:
+        flight: all that was recorded, of which only the past is used, the rest for what it makes use of
+        until: end of the trusted past
+        card: the aircraft, or `card.UNKNOWN`
+        say: takes words of progress
+        shown: the same with channels concealed as they will be later: noise and chance are learnt from it
+    Raises:
+        ValueError: when that holds too little flight; the sentence says how much.
+    """
+    past = before(flight, until)
+    if past.seconds < LEAST_S:
+        raise ValueError(
+            f"{flight.name}: found {below(past.seconds, LEAST_S)} s of trusted flight before {until:.0f} s, expected "
+            f"{LEAST_S:.0f} s at least; trust a longer past, or calibrate on other flights"
+        )
+    say(f"{flight.name}: its own past, {past.seconds:.0f} s of trusted flight")
+    timing = fit_timing([past], card, past.vane)
+    card = replace(card, body=replace(card.body, lag=timing.servo + timing.delay))
+    base, (weather,) = fit([past], card, timing, past.vane, _RIDGE)
+    pieces = split(past)
+    left = [fit([replace(past, ok=past.ok & ~piece.ok)], card, timing, past.vane, _RIDGE) for piece in pieces]
+    winds = [w for _, (w,) in left]
+    cases = [Case(piece, without) for piece, (without, _) in zip(pieces, left, strict=True)]
+    base = replace(base, others=_doubts(flight, past, base, weather), r2=_foretold(cases, winds))
+    if shown is not None:
+        veiled = [replace(before(shown, until), ok=piece.ok) for piece in pieces]
+        cases = [Case(piece, case.base) for piece, case in zip(veiled, cases, strict=True)]
+    base = settled(base, cases, winds, say, level=True)
+    later = since(flight, until).seconds
+    base = silenced(base, [name for name, share in base.r2.items() if share < _WORSE])
+    here = Case(past, base)
+    return replace(
+        base,
+        noise=_without_baro(base.noise),
+        spread=base.spread | _biases(here, weather) | _weather(here, weather),
+        chance=_chance(base, max(later, past.seconds) * len(pieces) / past.seconds),
+    )
+
+
+def before(flight: Flight, until: float) -> Flight:
+    """Give the part of a flight before `until` [s, on its own clock]."""
+    return _part(flight, slice(0, int(np.searchsorted(flight.t, until))))
+
+
+def since(flight: Flight, start: float) -> Flight:
+    """Give the part of a flight from `start` on [s, on its own clock]."""
+    return _part(flight, slice(int(np.searchsorted(flight.t, start)), None))
+
+
+def _part(flight: Flight, rows: slice) -> Flight:
+    readings = {name: x[rows] for name, x in flight.readings.items()}
+    t, commands, place, ok = (x[rows] for x in (flight.t, flight.commands, flight.place, flight.ok))
+    return replace(flight, t=t, readings=readings, commands=commands, place=place, ok=ok)
+
+
+def split(past: Flight, pieces: int = PIECES) -> list[Flight]:
+    """Give pieces of equal trusted length, each trusted where the others are not."""
+    edges = np.quantile(past.t[past.ok], np.linspace(0.0, 1.0, pieces + 1)[1:-1])
+    which = np.searchsorted(edges, past.t, side="right")
+    return [replace(past, ok=past.ok & (which == k)) for k in range(pieces)]
+
+
+def _rows(cases: list[Case], made: list[Terms]) -> dict[str, Rows]:
+    """Give the rows of every equation that is fitted on its own."""
+    coef = cases[0].base.coef
+    out = {name: Rows(cases, made, name) for name in ("alpha", "beta", "L", "N")}
+    return out | {"X": axial(cases, made), "M": pitch(cases, made, coef)}
+
+
+def _joined(coef: dict[str, np.ndarray], name: str) -> np.ndarray:
+    return np.concatenate([coef["X"], coef["T"]]) if name == "X" else coef[name]
+
+
+def _foretold(cases: list[Case], winds: list[np.ndarray]) -> dict[str, float]:
+    """Give the share of variance of every equation that the other pieces foretell."""
+    missed: dict[str, list[np.ndarray]] = {}
+    told: dict[str, list[np.ndarray]] = {}
+    for case, w in zip(cases, winds, strict=True):
+        for name, rows in _rows([case], [case.terms(wind(w))]).items():
+            for kept, x in ((missed, rows.told(_joined(case.base.coef, name))), (told, rows.y[rows.ok])):
+                kept.setdefault(name, []).append(x - x.mean())  # trim may differ
+    sums = {name: [float((np.concatenate(kept[name]) ** 2).sum()) for kept in (missed, told)] for name in missed}
+    return {name: 1.0 - left / max(whole, 1e-12) for name, (left, whole) in sums.items()}
+
+
+def _doubts(flight: Flight, past: Flight, base: Baseline, weather: np.ndarray) -> tuple[dict[str, np.ndarray], ...]:
+    """Give the directions in which coefficients may be wrong by one standard deviation, those the flight makes use of.
+
+    The posterior of each equation's coefficients under a prior as wide as each term alone explaining everything,
+    turned to the axes along which it is felt most on the whole flight.
+    Source: Klein & Morelli 2006, section 5.1 (Bayesian estimation); Golub & Van Loan 2013, section 8.7.
+    """
+    here, whole = Case(past, base), Case(flight, base)
+    known, used = (_rows([case], [case.terms(wind(weather))]) for case in (here, whole))
+    out = []
+    for name, rows in known.items():
+        x = _joined(base.coef, name)
+        white = rows.whitener(x)
+        A, e = white(rows.A)[rows.whole], white(rows.y - rows.A @ x)[rows.whole]
+        widest = np.sqrt((rows.y[rows.ok] ** 2).mean() / ((rows.A[rows.ok] ** 2).mean(axis=0) + 1e-12))
+        precision = A.T @ A / (_FADED * e.var()) + np.diag(widest**-2.0)
+        root = np.linalg.cholesky(np.linalg.inv(precision))
+        B = used[name].A[used[name].ok] @ root
+        felt, turned = np.linalg.eigh(B.T @ B / len(B))
+        kept = np.sqrt(np.maximum(felt, 0.0)) > _SHOWS * rows.told(x).std()
+        out += [_direction(base, name, d) for d in (root @ turned[:, kept]).T]
+    return tuple(out)
+
+
+def _direction(base: Baseline, name: str, d: np.ndarray) -> dict[str, np.ndarray]:
+    out = {equation: np.zeros_like(x) for equation, x in base.coef.items()}
+    if name == "X":
+        return out | {"X": d[: len(eq.X)], "T": d[len(eq.X) :]}
+    return out | {name: d}
+
+
+def _without_baro(noise: Noise) -> Noise:
+    """Give the noise, the barometer's said to be anything: it drifts over minutes, pieces of the past are too short."""
+    return Noise(noise.ar, np.where(np.arange(len(CHANNELS)) == CHANNELS.index("baro"), DEAF, noise.sigma))
+
+
+def _biases(case: Case, weather: np.ndarray) -> dict[str, float]:
+    """Give spreads as wide as the biases that sensors had in the past: they are no finding later."""
+    sight = Sight(case, wind(weather))
+    floors = np.array([n.floor for n in sight.nuisances])
+    sensors = np.array([n.effect.stage is Stage.SENSOR for n in sight.nuisances])
+    k = len(floors)
+    precision = sight.precision.copy()
+    precision[:k] = np.where(sensors, (_ANY_BIAS * floors) ** -2.0, precision[:k])
+    x = np.linalg.solve(sight.Ann - np.diag(sight.precision) + np.diag(precision), sight.bn)[:k]
+    told = zip(sight.nuisances, x, sensors, strict=True)
+    return {n.name: max(case.base.spread[n.name], 2.0 * abs(float(bias))) for n, bias, sensor in told if sensor}
+
+
+def _weather(case: Case, weather: np.ndarray) -> dict[str, float]:
+    """Give spreads that leave open what the past cannot tell: wind, and airspeed's scale without turns to and fro.
+
+    Airspeed on the headings and at the heights flown tells scale, wind and its growth with height together.
+    """
+    s, flow = case.sensed(()), case.terms(wind(weather)).flow
+    along = np.array([s["v_n"], s["v_e"]]) / np.maximum(np.hypot(s["v_n"], s["v_e"]), 1.0)
+    H = np.stack([flow.Va, *along, *(along * flow.height / 100.0)], axis=1)[case.ok]
+    e = case.residuals(wind(weather))[case.ok, CHANNELS.index("airspeed")]
+    precision = H.T @ H / (CORRELATED * max(e.var(), _AIRSPEED**2)) + np.diag(np.array(_PRIOR) ** -2.0)
+    scale = float(np.sqrt(np.linalg.inv(precision)[0, 0]))
+    out = {"airspeed_scale:log_scale": max(scale, case.base.spread["airspeed_scale:log_scale"])}
+    for axis in ("w_n", "w_e"):
+        out[f"wind_steady:{axis}"] = max(_WIND, case.base.spread[f"wind_steady:{axis}"])
+    return out
+
+
+def _chance(base: Baseline, longer: float) -> dict[str, float]:
+    """Give what the rest of the flight may reach by chance, pieces being so many times shorter.
+
+    What acts all along acted in the past: it is part of the baseline.
+    """
+    out = {kind: max(_LEAST_GAIN, longer * gain) for kind, gain in base.chance.items()}
+    for effect in catalogue().values():
+        for of in effect.of or ("",):
+            label = f"{effect.name}:{of}" if of else effect.name
+            for onset in effect.onsets:
+                out.setdefault(f"{label}|{onset}", _LEAST_GAIN)
+                if onset is Onset.ALWAYS:
+                    out[f"{label}|{onset}"] = NEVER
+    return out

@@ -1,0 +1,71 @@
+"""What the autopilot held in the past and lost later: where and since when, without a word on why.
+
+Where commands are not told (surfaces, throttle) no simulation can say what should have happened. But an autopilot holds
+energy, and an aircraft turns as it banks; when that leaves its past range for good, something is different since then.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet.frames import G
+from twin_worker.diagnosis.data.flight import Flight
+from twin_worker.diagnosis.data.smooth import DT
+
+ENERGY, TURN, PITCH = "energy held", "turn by bank", "pitch attitude"
+_MEAN_S = 2.0  # running mean
+_STAYS_S = 2.0  # what returns sooner was a gust
+_GOOD = 0.7  # share of what is left of the flight that it must be out
+_BEYOND = 0.5  # of its past range, above and below it
+_USUAL = 5.0, 95.0  # percentiles that make the past range
+_CLEAR = {ENERGY: 4.0, TURN: np.radians(4.0), PITCH: np.radians(6.0)}  # least excess [m, rad/s, rad]
+
+
+@dataclass(frozen=True)
+class Lost:
+    """What was held no more: of which signal, since when [s], by how many past ranges at most."""
+
+    what: str
+    since: float
+    by: float
+
+
+def lost(flight: Flight, until: float) -> Lost | None:
+    """Give the first signal that left for good the range it kept before `until` [s, on the flight's clock]."""
+    t = flight.t
+    found = [one for name, x in _signals(flight).items() if (one := _left(name, t, x, flight.ok, until)) is not None]
+    return min(found, key=lambda one: one.since, default=None)
+
+
+def _signals(flight: Flight) -> dict[str, np.ndarray]:
+    """Give what should be held, (n,) each: energy lacking as a height [m], turn rate over that of the bank [rad/s]."""
+    r = flight.readings
+    speed = np.maximum(r.get("Va", np.hypot(r["v_n"], r["v_e"])), 5.0)
+    turning = np.gradient(np.unwrap(r["psi"]), DT)
+    out = {TURN: turning - G / speed * np.tan(np.clip(r["phi"], -1.2, 1.2)), PITCH: r["theta"]}
+    if "low" in r:
+        out[ENERGY] = r["low"] + speed / G * r["slow"]
+    width = round(_MEAN_S / DT)
+    return {
+        name: np.convolve(np.pad(x, width // 2, mode="edge"), np.ones(width) / width, "same")[width // 2 :][: len(x)]
+        for name, x in out.items()
+    }
+
+
+def _left(name: str, t: np.ndarray, x: np.ndarray, ok: np.ndarray, until: float) -> Lost | None:
+    past, later = ok & (t < until), t >= until
+    low, middle, high = np.percentile(x[past], [_USUAL[0], 50.0, _USUAL[1]])
+    room = max(_BEYOND * (high - low), _CLEAR[name])
+    out = np.where(x > high, (x - high) / room, np.where(x < low, (low - x) / room, 0.0))
+    out[~later | ~ok] = 0.0
+    stays = round(_STAYS_S / DT)
+    beyond = np.convolve(out > 1.0, np.ones(stays), "full")[: len(t)] >= stays
+    if not beyond.any():
+        return None
+    first = int(np.argmax(beyond)) - stays + 1
+    if (out[first:][ok[first:]] > 1.0).mean() < _GOOD:
+        return None
+    side = np.sign(x[first] - middle)
+    before = np.flatnonzero(side * (x[:first] - middle) <= 0.0)
+    since = float(t[before[-1]]) if len(before) else float(t[first])
+    return Lost(name, since, float(out.max()))

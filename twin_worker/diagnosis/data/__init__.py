@@ -1,0 +1,1 @@
+"""Recorded flight, aircraft card and fault hypotheses."""

@@ -1,0 +1,103 @@
+"""The operator's card of an aircraft: mass, inertia, geometry, servo mapping; an airframe TOML or a JSON card."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+
+from fleet.airframes import Airframe, load
+from fleet.airframes.airframe import servo_map
+from fleet.effects import Body
+
+_WANTED = ("m", "S", "b", "c", "Ixx", "Iyy", "Izz", "Ixz")
+_MOST = 1e6
+_THROWS = ("aileron", "elevator", "throttle", "rudder")
+
+
+@dataclass(frozen=True)
+class Card:
+    """What is known of the aircraft before any flight.
+
+    Attributes:
+        name: whose card
+        body: mass and geometry
+        inertia: J_x J_y J_z J_xz [kg m2]
+        throw: surface angle at full command, down and up, aileron elevator rudder, (3, 2) [rad]; ones where unknown
+        pulses: the card's own servo mapping, else the autopilot's parameters tell
+        known: False for the unit body of an aircraft without a card
+    """
+
+    name: str
+    body: Body
+    inertia: tuple[float, float, float, float]
+    throw: tuple[tuple[float, float], ...] = ((1.0, 1.0),) * 3
+    pulses: bool = False
+    known: bool = True
+
+    def commands(self, pulses: np.ndarray, params: Mapping[str, float]) -> np.ndarray:
+        """Turn servo pulses (n, 8) [us] into delta_a delta_e delta_r delta_t in shares of full command, (n, 4)."""
+        if not self.pulses:
+            return servo_map(params).inputs(pulses)
+        u = (pulses[:, [0, 1, 3]] - 1500.0) / 500.0
+        return np.column_stack([u, (pulses[:, 2] - 1000.0) / 1000.0])
+
+    def angles(self, surface: int) -> Callable[[np.ndarray], np.ndarray]:
+        """Give the function from command [-] to angle [rad] of one surface."""
+        low, high = self.throw[surface]
+        return lambda u: np.where(u > 0, high, low) * u
+
+
+UNKNOWN = Card("no card", Body(), (1.0, 1.0, 1.0, 0.0), known=False)
+"""Unit mass, geometry and inertia: derivatives become dimensional, and forces specific."""
+
+
+def read(path: Path) -> Card:
+    """Read a card.
+
+    Raises:
+        ValueError: when it is none; the sentence names what to mend.
+        OSError: when there is no such file.
+    """
+    if path.suffix != ".json":
+        return _of_airframe(load(str(path) if path.suffix or path.exists() else path.name))
+    try:
+        found = json.loads(path.read_text())
+    except (ValueError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path.name}: found no JSON ({error}), expected an airframe card; correct it") from None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path.name}: found a {type(found).__name__}, expected an airframe card; correct it")
+    value = {name: _number(path.name, found, name) for name in _WANTED}
+    diameter = _number(path.name, found, "Dprop") if "Dprop" in found else value["c"]
+    body = Body(value["m"], value["S"], value["b"], value["c"], diameter)
+    throw = _throws(path.name, found.get("surface_full_deg"))
+    inertia = (value["Ixx"], value["Iyy"], value["Izz"], value["Ixz"])
+    return Card(str(found.get("airframe", path.stem)), body, inertia, throw, pulses="servo" in found)
+
+
+def _of_airframe(airframe: Airframe) -> Card:
+    v = airframe.value
+    body = Body(v["mass"], v["S"], v["b"], v["c"], v["c"])
+    return Card(airframe.name, body, (v["J_x"], v["J_y"], v["J_z"], v["J_xz"]))
+
+
+def _number(file: str, found: Mapping[str, object], name: str) -> float:
+    value = found.get(name)
+    good = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value) and abs(value) < _MOST
+    if not good or (name != "Ixz" and not float(value) > 0):  # type: ignore[arg-type]
+        raise ValueError(f"{file}: found {name} = {value!r}, expected a number above 0; correct it")
+    return float(value)  # type: ignore[arg-type]
+
+
+def _throws(file: str, found: object) -> tuple[tuple[float, float], ...]:
+    if not isinstance(found, dict):
+        return ((1.0, 1.0),) * 3
+    out = []
+    for name in ("aileron", "elevator", "rudder"):
+        pair = found.get(name)
+        if not isinstance(pair, list) or len(pair) != 2 or not all(isinstance(x, int | float) for x in pair):
+            raise ValueError(f"{file}: found surface_full_deg.{name} = {pair!r}, expected [down, up]; correct it")
+        out.append((abs(float(np.radians(pair[0]))), abs(float(np.radians(pair[1])))))
+    return tuple(out)

@@ -1,0 +1,1 @@
+"""From residuals to a decision: which effect, how certain, what alternatives."""

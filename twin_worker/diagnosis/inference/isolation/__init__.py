@@ -1,0 +1,1 @@
+"""Isolation of fault hypotheses in whitened residuals."""

@@ -1,0 +1,112 @@
+"""What a channel would gain if its equation were another one since some instant: every term let go, or one alone."""
+
+from collections.abc import Iterator
+from copy import copy
+
+import numpy as np
+from scipy.signal import lfilter
+
+from fleet.effects import Onset
+from twin_worker.diagnosis.data.smooth import STEP_S
+from twin_worker.diagnosis.inference.isolation.isolate import PRICE, WELL, gates_of, normals, solved
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.model import equations as eq
+from twin_worker.diagnosis.model.baseline import CHANNELS, SHOWN_BY
+from twin_worker.diagnosis.model.residual import Terms
+
+_AIR_LAG_S = 4.0  # of a pressure line that is partly blocked
+_APART_S = 25.0  # least of what is compared, before and after
+_NOBODYS = {  # terms no effect of the catalogue stands for: damping, stability, a crossed surface, loads that run about
+    "L": ("beta", "p", "r", "delta_r"),
+    "M": ("q", "c_x"),
+    "N": ("beta", "p", "r", "delta_a"),
+}
+_SLOW, _RATE = "lagging", "rate"  # and of sensors: an airspeed that comes late, a gyro that reads a share too much
+Gain = tuple[float, float]
+"""Gain beyond its price, and since when [s]."""
+
+
+class Equation:
+    """One channel's whitened terms.
+
+    Args:
+        sight: what is left of the flight
+        channel: one of `CHANNELS`
+        terms: name -> course, (n,)
+    """
+
+    def __init__(self, sight: Sight, channel: str, terms: dict[str, np.ndarray]) -> None:
+        c = CHANNELS.index(channel)
+        self.channel, self.names = channel, tuple(terms)
+        laid = np.zeros((len(sight.case.t), len(CHANNELS), len(terms)))
+        laid[:, c] = np.transpose(list(terms.values()))
+        white = sight.noise.whiten(laid)[:, c] * sight.ok[:, None]
+        self._J = (white / (np.linalg.norm(white, axis=0) + 1e-12))[:, None, :]
+        self._sight = copy(sight)  # of this channel alone, but what the others say of the nuisances is kept
+        self._sight.e, self._sight.Jn = sight.e[:, [c]], sight.Jn[:, [c]]
+
+    def all_of_it(self) -> Gain:
+        """Let every term go since the best instant."""
+        return _since(self._sight, self._J)
+
+    def in_flight(self) -> Gain:
+        """Let every term go throughout, and tell what more it gains to change: no calibration need be trusted."""
+        return _since(_freed(self._sight, self._J), self._J, _APART_S)
+
+    def one_by_one(self) -> Iterator[tuple[str, Gain]]:
+        """Let those terms go alone that no effect stands for."""
+        equation = next((name for name, channel in SHOWN_BY.items() if channel == self.channel), "")
+        for k, name in enumerate(self.names):
+            if name in (*_NOBODYS.get(equation, ()), _SLOW, _RATE):
+                yield name, _since(self._sight, self._J[:, :, [k]])
+
+
+def equations_of(sight: Sight) -> Iterator[Equation]:
+    """Give every channel that was calibrated well enough, with the terms it may change by."""
+    made = sight.case.terms(sight.granted)
+    for equation, channel in SHOWN_BY.items():
+        if sight.base.r2.get(equation, 1.0) > WELL:
+            own = made.terms[equation] * made.scale.get(equation, 1.0)
+            yield Equation(sight, channel, dict(zip(eq.TERMS[equation], own, strict=False)) | _more(channel, made))
+    flow = made.flow
+    even = np.ones_like(flow.Va)
+    if "Va" in sight.case.flight.readings:
+        late = _lagged(flow.Va, _AIR_LAG_S) - flow.Va
+        yield Equation(sight, "airspeed", {"1": even, "Va": flow.Va, _SLOW: late})
+    for channel, rate in (("gyro_roll", flow.p), ("gyro_pitch", flow.q), ("gyro_yaw", flow.r)):
+        yield Equation(sight, channel, {"1": even, _RATE: rate})
+
+
+def _since(sight: Sight, J: np.ndarray, apart_s: float = 0.0) -> Gain:
+    """Give what terms, (n, 1, k), gain since their best instant, so far from the ends [s]."""
+    t = sight.case.t
+    rows, whens = gates_of(t, Onset.STEP)
+    gain, _ = solved(sight, *normals(sight, J, rows, Onset.STEP))
+    gain = np.where((t[rows] > t[0] + apart_s) & (t[rows] < t[-1] - apart_s), gain, 0.0)
+    best = int(np.argmax(gain))
+    return float(gain[best]) - PRICE * J.shape[2], whens[best].t0
+
+
+def _freed(sight: Sight, J: np.ndarray) -> Sight:
+    """Give the same with terms, (n, 1, k), free throughout the flight, as nuisances are."""
+    out = copy(sight)
+    out.Jn = np.concatenate([sight.Jn, J], axis=2)
+    between = np.einsum("tci,tcj->ij", sight.Jn, J)
+    own = np.einsum("tci,tcj->ij", J, J) + 1e-6 * np.eye(J.shape[2])
+    out.Ann = np.block([[sight.Ann, between], [between.T, own]])
+    out.bn = np.concatenate([sight.bn, -np.einsum("tci,tc->i", J, sight.e)])
+    return out
+
+
+def _more(channel: str, made: Terms) -> dict[str, np.ndarray]:
+    """Give what a channel may feel that no wing does: thrust, and loads that shift with the force on them."""
+    f_x, f_y, _ = made.aside["f"]
+    more = {"force_x": {"thrust": made.terms["T"][0]}, "roll": {"f_y": f_y}, "pitch": {"f_x": f_x}}
+    return more.get(channel, {})
+
+
+def _lagged(x: np.ndarray, tau: float) -> np.ndarray:
+    """Give x, (n,), behind a first-order lag [s]."""
+    kept = np.exp(-STEP_S / tau)
+    out: np.ndarray = lfilter([1.0 - kept], [1.0, -kept], x, zi=[kept * x[0]])[0]
+    return out

@@ -1,0 +1,168 @@
+"""What differs from flight to flight without being missing physics: turn-on biases, weather, trim, small scatter.
+
+Each has a spread: of the sensor's specification, or learnt from nominal flights left out. Within it a difference is
+absorbed; past it the difference is handed to the hypotheses.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleet.effects import Effect, Parameter, Stage, catalogue
+from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, Guess
+
+_SHARE = 0.03  # least scatter of a derivative without the vane [-]
+WIDEST = 4.0  # a learnt spread over its floor
+RELEASED = 2.5  # spreads past which a difference is no nuisance any more
+SOUND = 3.3  # and of a sensor's bias, which a data sheet allows for
+WEATHER_MPS = 1.0  # nominal flights that differ by more had weather: a mean wind is then never a finding
+
+WAVES = 3  # slow courses a wandering nuisance may take
+_WANDERS = {  # what sensors and weather do not keep to during a flight: effect -> floor over that of its mean
+    "accel_bias": 0.4,
+    "gyro_bias": 0.3,
+    "heading_bias": 0.25,
+    "imu_misalignment": 0.4,
+    "wind_steady": 0.1,
+}
+
+_SHARES = ("L:delta_a", "L:p", "L:beta", "M:delta_e", "M:c_z", "M:q", "N:delta_r", "N:r", "N:beta")
+_OFFSETS = ("C_L", "C_D", "C_l", "C_m", "C_n", "thrust", "rho", "side")
+_QNH_M, _LAPSE = 30.0, 5.0  # sea level pressure as a height [m], and lapse rate [m per 100 m], unknown
+
+
+def _act(flow: object, x: object, of: str) -> dict[str, object]:
+    return {of: x}
+
+
+SCATTER = Effect(
+    name="scatter",
+    stage=Stage.WRENCH,
+    channel="",
+    equation="coefficient + offset",
+    source="spread of nominal flights",
+    parameters=(Parameter("x", "-", "offset", step=0.01, low=-1.0, high=1.0),),
+    act=_act,
+    examples=((0.01,),),
+    of=(*_SHARES, *_OFFSETS),
+)
+LAPSE = replace(SCATTER, name="lapse", act=lambda flow, x: {"baro": x * flow.height / 100.0}, of=())
+DENSITY = replace(SCATTER, stage=Stage.AIR)
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """One number that may differ.
+
+    Attributes:
+        name: for the spreads
+        effect, of, index: what it is a parameter of
+        floor: least spread
+        step: for slopes
+    """
+
+    name: str
+    effect: Effect
+    of: str
+    index: int
+    floor: float
+    step: float
+
+    def guess(self, x: float) -> Guess:
+        """Give it at work."""
+        par = [0.0] * self.effect.size
+        par[self.index] = x
+        return Guess(self.effect, self.of, tuple(par), ALWAYS)
+
+    @property
+    def sensor(self) -> bool:
+        """Tell whether it is a sensor's bias."""
+        return self.effect.name in ("accel_bias", "gyro_bias", "heading_bias", "imu_misalignment")
+
+    @property
+    def released(self) -> float:
+        """Give the spreads past which it is no nuisance any more."""
+        return SOUND if self.sensor else RELEASED
+
+    @property
+    def scatter(self) -> bool:
+        """Tell whether no effect stands for it, so that it can be handed to none."""
+        return self.of == "side" or self.name in ("baro", "lapse")
+
+    @property
+    def weather(self) -> bool:
+        """Tell whether this is weather, of which any amount may be nominal."""
+        return self.effect.name in ("wind_steady", "wind_shear")
+
+
+@dataclass(frozen=True)
+class Wander:
+    """One nuisance's slow course: so many half waves of a cosine over the flight.
+
+    Attributes:
+        name: for the spreads
+        of: index of the nuisance that wanders
+        wave: number of half waves
+        floor: least spread
+    """
+
+    name: str
+    of: int
+    wave: int
+    floor: float
+
+
+def wanders(known: Sequence[Nuisance], vane: bool) -> tuple[Wander, ...]:
+    """List the slow courses of those that wander; without the vane noise covers them."""
+    return tuple(
+        Wander(f"{n.name}~{wave}", k, wave, _WANDERS[n.effect.name] * n.floor)
+        for k, n in enumerate(known)
+        if n.effect.name in _WANDERS
+        for wave in range(1, WAVES + 1)
+        if vane
+    )
+
+
+def wandering(columns: np.ndarray, several: Sequence[Wander], t: np.ndarray) -> np.ndarray:
+    """Give the slopes of slow courses, (n, c, wanders), by those of what wanders, (n, c, nuisances), at t (n,)."""
+    share = (t - t[0]) / max(t[-1] - t[0], 1e-9)
+    waves = np.sqrt(2.0) * np.cos(np.pi * np.outer(share, [one.wave for one in several]))
+    return columns[:, :, [one.of for one in several]] * waves[:, None, :]
+
+
+def nuisances(vane: bool) -> tuple[Nuisance, ...]:
+    """List them all; without the vane derivatives scatter too, for they are known less well."""
+    known = catalogue()
+    out = []
+
+    def add(name: str, floor: float, of: tuple[str, ...] = ("",)) -> None:
+        effect = known[name]
+        for one in of:
+            for k, parameter in enumerate(effect.parameters):
+                label = ":".join(filter(None, (name, one, parameter.name)))
+                out.append(Nuisance(label, effect, one, k, floor, 0.3 * parameter.step))
+
+    add("accel_bias", 0.04, known["accel_bias"].of)
+    add("gyro_bias", 0.0015, known["gyro_bias"].of)
+    add("heading_bias", 0.012)
+    add("wind_steady", 0.35)
+    add("wind_shear", 0.2)
+    add("imu_misalignment", 0.004)
+    add("airspeed_scale", 0.003)
+    floors = {
+        "C_L": 0.004,
+        "C_D": 0.0005,
+        "C_l": 0.0001,
+        "C_m": 0.0003,
+        "C_n": 0.0001,
+        "thrust": 0.005,
+        "rho": 0.003,
+        "side": 0.05,
+    }
+    out += [Nuisance(of, DENSITY if of == "rho" else SCATTER, of, 0, floors[of], floors[of]) for of in _OFFSETS]
+    out.append(Nuisance("baro", known["baro_bias"], "", 0, _QNH_M, 1.0))
+    out.append(Nuisance("lapse", LAPSE, "", 0, _LAPSE, 0.5))
+    if not vane:
+        out += [Nuisance(of, SCATTER, of, 0, _SHARE, _SHARE) for of in _SHARES]
+    return tuple(out)

@@ -1,0 +1,1 @@
+"""Validation of a fault hypothesis on data it was not fitted to."""

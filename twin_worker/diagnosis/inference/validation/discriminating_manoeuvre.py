@@ -1,0 +1,65 @@
+"""Which manoeuvre would tell two explanations apart: where on this flight they differ most for each second flown."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from twin_worker.diagnosis.data.fault_hypothesis import Guess
+from twin_worker.diagnosis.data.flight import Flight
+from twin_worker.diagnosis.data.smooth import DT, STEP_S, thinned
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+
+_BANK, _SLOPE = np.radians(20.0), np.radians(3.0)
+_FAST, _SLOW = 1.06, 0.94  # of the usual airspeed
+_RATE_S = 1.0  # over which commands change
+_BUSY = 85  # percentile of those changes
+_LEAST_S = 6.0  # flown of a manoeuvre, to be judged by
+_TELLING = 1.3  # times as dense as on the whole flight, from which a manoeuvre is worth a word
+_ENOUGH = 150.0  # gain that settles it
+_LONGEST_S = 600.0
+
+
+def manoeuvre(sight: Sight, one: Guess, other: Guess) -> str:
+    """Say what to fly so that the next diagnosis tells `one` from `other`."""
+    power = _power(sight, one, other)
+    density = {name: float(power[rows].mean()) / STEP_S for name, rows in _flown(sight)}
+    usual = float(power[sight.ok].mean()) / STEP_S
+    best = max(density, key=lambda name: density[name], default="")
+    if not best or _ENOUGH / max(density[best], 1e-9) > _LONGEST_S:
+        return "nothing flown here tells them apart: fly what this flight did not, at other speeds, throttles and banks"
+    seconds = _ENOUGH / density[best]
+    if density[best] < _TELLING * usual:
+        return f"no manoeuvre of this flight tells them apart better than another: fly on, {seconds:.0f} s more"
+    return f"{best}: {density[best] / usual:.1f} times as telling as this flight was; {seconds:.0f} s of it should do"
+
+
+def _power(sight: Sight, one: Guess, other: Guess) -> np.ndarray:
+    """Give the squared whitened difference of two explanations, what nuisances can hide taken off, (n,)."""
+    d = sight.whitened((one,)) - sight.whitened((other,))
+    hidden = np.linalg.solve(sight.Ann, np.einsum("tci,tc->i", sight.Jn, d))
+    return ((d - sight.Jn @ hidden) ** 2).sum(axis=1)
+
+
+def _flown(sight: Sight) -> Iterator[tuple[str, np.ndarray]]:
+    """Give each manoeuvre flown long enough, and its rows, (n,) bool."""
+    for name, rows in _manoeuvres(sight.case.flight):
+        rows = thinned(rows) & sight.ok
+        if rows.sum() * STEP_S >= _LEAST_S:
+            yield name, rows
+
+
+def _manoeuvres(flight: Flight) -> Iterator[tuple[str, np.ndarray]]:
+    """Give rows of each manoeuvre on the flight's own grid."""
+    r = flight.readings
+    speed = np.hypot(np.hypot(r["v_n"], r["v_e"]), r["v_d"])
+    air = r.get("Va", speed)
+    usual = float(np.median(air[flight.ok]))
+    yield "turns", np.abs(r["phi"]) > _BANK
+    yield "climbs", -r["v_d"] > np.sin(_SLOPE) * speed
+    yield "descents", r["v_d"] > np.sin(_SLOPE) * speed
+    yield "fast flight", air > _FAST * usual
+    yield "slow flight", air < _SLOW * usual
+    steps = round(_RATE_S / DT)
+    for k, name in enumerate(("aileron doublets", "elevator doublets", "rudder doublets", "throttle steps")):
+        change = np.abs(flight.commands - np.roll(flight.commands, steps, axis=0))[:, k]
+        yield name, (change > np.percentile(change[flight.ok], _BUSY)) & (change > 0.0)

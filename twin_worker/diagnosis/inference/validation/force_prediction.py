@@ -1,0 +1,102 @@
+"""What the accelerometer should read, told from the other instruments: the simulation's word on held-out data.
+
+Lift can be told from velocity and attitude, or from the balance of pitch; side force from sideslip over the ground, or
+from the balance of roll or of yaw; dynamic pressure from velocity, or from the airspeed sensor. An effect shows where
+it acts, so the way is chosen on the blocks the effect was fitted on, and judged on the others.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from twin_worker.diagnosis.data.fault_hypothesis import Guess
+from twin_worker.diagnosis.model import equations as eq
+from twin_worker.diagnosis.model.residual import RHO_0, Case, Terms, valued
+from twin_worker.diagnosis.model.simulate import lift_of
+
+LIFT = ("velocity", "pitch")
+SIDE = ("velocity", "roll", "yaw")
+PRESSURE = ("velocity", "airspeed")
+BLOCK_S = 10.0
+_ROUNDS = 4  # of the pitch balance, whose drag depends on its lift
+_STEEP = 0.35  # sideslip told is kept within [rad]
+
+
+def blocks(t: np.ndarray, odd: bool) -> np.ndarray:
+    """Tell which times lie in odd, or in even, blocks of 10 s."""
+    return (np.floor(t / BLOCK_S) % 2 == 1) == odd
+
+
+@dataclass(frozen=True)
+class Forces:
+    """Specific force on the thinned grid, (n, 3) each [m/s2]: recorded, and told without and with the effects."""
+
+    measured: np.ndarray
+    base: np.ndarray
+    model: np.ndarray
+
+
+def forces(case: Case, weather: tuple[Guess, ...], fitted: tuple[Guess, ...]) -> Forces:
+    """Tell forces without and with effects, in the way that shows them most on even blocks."""
+    before, after = case.terms(weather), case.terms((*weather, *fitted))
+    measured = before.aside["f"].T
+    ways = [w for w in product(LIFT, SIDE, PRESSURE) if w[2] == "velocity" or "Va" in case.flight.readings]
+    if not fitted:
+        told = tell(case, before, ways[0])
+        return Forces(measured, told, told)
+    even = case.ok & blocks(case.t, odd=False)
+
+    def gained(way: tuple[str, str, str]) -> float:
+        errors = [((tell(case, made, way) - measured)[even] ** 2).mean() for made in (before, after)]
+        return float(1.0 - np.sqrt(errors[1] / max(errors[0], 1e-12)))
+
+    best = max(ways, key=gained)
+    return Forces(measured, tell(case, before, best), tell(case, after, best))
+
+
+def rms(case: Case, error: np.ndarray) -> float:
+    """Give the rms of an error, (n, 3), on trusted rows held out."""
+    rows = case.ok & blocks(case.t, odd=True) & np.isfinite(error).all(axis=1)
+    return float(np.sqrt((error[rows] ** 2).mean())) if rows.any() else float("nan")
+
+
+def tell(case: Case, made: Terms, way: tuple[str, str, str]) -> np.ndarray:
+    """Tell specific force, (n, 3) [m/s2]; `made` is used for everything but its accelerometer."""
+    base, body, flow, add = case.base, case.base.card.body, made.flow, made.add
+    q_bar = flow.q_bar
+    if way[2] == "airspeed":
+        q_bar = 0.5 * RHO_0 * (made.measured["airspeed"] / base.airspeed) ** 2
+    q_S = q_bar * body.S
+    hats = flow.p * body.b / (2 * flow.Va), flow.q * body.c / (2 * flow.Va), flow.r * body.b / (2 * flow.Va)
+    d_a, d_e, d_r = made.aside["delta"][:3]
+    T = (base.coef["T"] @ made.terms["T"]) * (1.0 + add.get("thrust", 0.0))
+    A, B = base.coef["alpha"], base.coef["beta"]
+    c_z = lift_of(A, flow.alpha - A[0] - A[3] * hats[1] - A[5] * d_e)
+    beta = flow.beta
+
+    def axial(c_z: np.ndarray) -> np.ndarray:
+        """Give the axial force coefficient without thrust."""
+        alpha = A[0] + A[1] * c_z + A[2] * c_z**2 + A[3] * hats[1] + A[5] * d_e
+        lift = add.get("lift", 0.0) * -c_z + add.get("C_L", 0.0)
+        clean = base.coef["X"] @ eq.force_terms(c_z, d_e, beta)
+        return clean + lift * np.sin(alpha) - add.get("C_D", 0.0) * np.cos(alpha)  # type: ignore[no-any-return]
+
+    if way[0] == "pitch":
+        M = base.coef["M"]
+        rest = (made.measured["M"] - T * M[-1] - add.get("M", 0.0)) / (q_S * body.c) - add.get("C_m", 0.0)
+        rest = rest - M[0] - M[2] * hats[1] - M[3] * d_e
+        shift = add.get("x_cg", 0.0) / body.c
+        for _ in range(_ROUNDS):
+            c_z = (rest - M[5] * c_z**2 - M[6] * (axial(c_z) + T / q_S)) / (M[1] + shift)
+    if way[1] != "velocity":
+        name = {"roll": "L", "yaw": "N"}[way[1]]
+        terms = eq.lateral_terms(np.zeros_like(c_z), (hats[0], hats[2]), (d_a, d_r), c_z)
+        rest = (made.measured[name] - add.get(name, 0.0)) / (q_S * body.b) - add.get(f"C_{name.lower()}", 0.0)
+        rest = rest - valued(base, {}, name, terms)
+        rest = rest + (add.get("y_cg", 0.0) / body.b * c_z if name == "L" else 0.0)
+        beta = np.clip(rest / base.coef[name][1], -_STEEP, _STEEP)
+    c_y = (beta - B[0] - B[2] * hats[0] - B[3] * hats[2] - B[4] * d_r) / B[1]
+    lift = add.get("lift", 0.0) * -c_z + add.get("C_L", 0.0)
+    force = np.stack([q_S * axial(c_z) + T, q_S * (c_y + add.get("C_Y", 0.0)), q_S * (c_z - lift)], axis=1)
+    return force / np.broadcast_to(made.aside["mass"], c_z.shape)[:, None]

@@ -1,0 +1,55 @@
+"""What no effect explains: where it lives, and a sparse free-form term that fits it but names no physics."""
+
+import numpy as np
+
+from twin_worker.diagnosis.data.fault_hypothesis import Guess
+from twin_worker.diagnosis.model.residual import Case
+
+_LOUD = 2.0  # rms over 5 s, in standard deviations, from which a stretch is listed
+_WINDOW = 25  # rows of 5 s
+_TERMS = 2  # of the free-form fit
+
+
+def stretches(t: np.ndarray, e: np.ndarray, ok: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """Give the stretches where a whitened residual, (n,), is loud [s]."""
+    power = np.where(ok, np.nan_to_num(e) ** 2, 0.0)
+    weight = np.convolve(ok.astype(float), np.ones(_WINDOW), "same")
+    level = np.sqrt(np.convolve(power, np.ones(_WINDOW), "same") / np.maximum(weight, 1.0))
+    loud = np.concatenate([[False], level > min(_LOUD, 0.9 * level.max()), [False]])
+    edges = np.flatnonzero(np.diff(loud.astype(int)))
+    return tuple((float(t[a]), float(t[min(b, len(t) - 1)])) for a, b in zip(edges[::2], edges[1::2], strict=True))
+
+
+def free_form(case: Case, weather: tuple[Guess, ...], channel: int) -> dict[str, float]:
+    """Fit a channel's residual by the few library terms that explain most, (term -> coefficient).
+
+    Source: Brunton, Proctor & Kutz 2016 (sparse regression), here by orthogonal matching pursuit.
+    """
+    flow = case.terms(weather).flow
+    y = case.residuals(weather)[case.ok, channel]
+    d_a, d_e, d_r, d_t = case.inputs(weather)
+    library = {
+        "1": np.ones_like(flow.Va),
+        "Va": flow.Va / case.base.speed,
+        "alpha": flow.alpha,
+        "beta": flow.beta,
+        "|beta|": np.abs(flow.beta),
+        "p": flow.p,
+        "q": flow.q,
+        "r": flow.r,
+        "delta_a": d_a,
+        "delta_e": d_e,
+        "delta_r": d_r,
+        "delta_t": d_t,
+        "height": flow.height / 100.0,
+    }
+    columns = {name: x[case.ok] for name, x in library.items()}
+    chosen: list[str] = []
+    left = y
+    for _ in range(_TERMS):
+        worth = {n: abs(x @ left) / (np.linalg.norm(x) + 1e-12) for n, x in columns.items() if n not in chosen}
+        chosen.append(max(worth, key=lambda name: worth[name]))
+        A = np.stack([columns[name] for name in chosen], axis=1)
+        coefficients = np.linalg.lstsq(A, y, rcond=None)[0]
+        left = y - A @ coefficients
+    return {name: float(x) for name, x in zip(chosen, coefficients, strict=True)}

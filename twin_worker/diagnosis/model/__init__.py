@@ -1,0 +1,1 @@
+"""Simulation of the recorded flight under a baseline model, and its residuals."""

@@ -1,0 +1,100 @@
+"""The calibrated simulation: coefficients of every equation, timing, noise, spread from flight to flight."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from twin_worker.diagnosis.data.card import Card
+
+CHANNELS = (
+    *("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed"),
+    *("gps_x", "gps_y", "gps_z", "gyro_roll", "gyro_pitch", "gyro_yaw", "baro"),
+)
+"""Residuals: fx [m/s2]; beta, alpha [deg]; p', q', r' [rad/s2]; airspeed [m/s]; dV/dt against the accelerometer
+[m/s2]; Euler rates against the gyros [rad/s]; barometric height [m]."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What passes between a command and its effect: lag of servos and engine, transport delay [s]."""
+
+    servo: float = 0.0
+    engine: float = 0.25
+    delay: float = 0.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Innovations of each residual: e(k) = x(k) - a1 x(k-1) - a2 x(k-2), of standard deviation sigma; (c, 2), (c,)."""
+
+    ar: np.ndarray
+    sigma: np.ndarray
+
+    def whiten(self, x: np.ndarray) -> np.ndarray:
+        """Whiten residuals, (n, c), or their slopes, (n, c, k); the first two rows are zero."""
+        a1, a2, sigma = (one.reshape(-1, *(1,) * (x.ndim - 2)) for one in (*self.ar.T, self.sigma))
+        e = np.zeros_like(x)
+        e[2:] = (x[2:] - a1 * x[1:-1] - a2 * x[:-2]) / sigma
+        return e
+
+
+def no_noise() -> Noise:
+    """Give the whitener that does nothing."""
+    n = len(CHANNELS)
+    return Noise(np.zeros((n, 2)), np.ones(n))
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """The simulation as calibrated on nominal flights.
+
+    Attributes:
+        card: the aircraft
+        coef: equation -> coefficients, in the order of `equations.TERMS`
+        speed: usual airspeed [m/s]
+        airspeed: reported over indicated airspeed, of the healthy sensor [-]
+        timing: of servos and engine
+        vane: the accelerometer served as the vane
+        r2: equation -> share of variance explained on the nominal flights
+        noise: of the residuals
+        spread: nuisance -> how much it varies from flight to flight, in its own unit
+        chance: guess and kind of onset -> gain that nominal flights left out reach
+        others: coefficients with each nominal flight left out, less those of all: how far they may be trusted
+        usual: mean square of each whitened residual on nominal flights, (c,)
+        flights: names of the nominal flights
+    """
+
+    card: Card
+    coef: dict[str, np.ndarray]
+    speed: float
+    airspeed: float = 1.0
+    timing: Timing = field(default_factory=Timing)
+    vane: bool = True
+    r2: dict[str, float] = field(default_factory=dict)
+    noise: Noise = field(default_factory=no_noise)
+    spread: dict[str, float] = field(default_factory=dict)
+    chance: dict[str, float] = field(default_factory=dict)
+    others: tuple[dict[str, np.ndarray], ...] = ()
+    usual: np.ndarray = field(default_factory=lambda: np.ones(len(CHANNELS)))
+    flights: tuple[str, ...] = ()
+
+    def varied(self, k: int) -> "Baseline":
+        """Give the baseline with its coefficients moved towards those of the k-th left out."""
+        coef = {name: x + self.others[k][name] for name, x in self.coef.items()}
+        return replace(self, coef=coef)
+
+
+SHOWN_BY = {"X": "force_x", "beta": "side", "alpha": "lift", "L": "roll", "M": "pitch", "N": "yaw"}
+"""Equation -> channel of its residual."""
+
+DEAF = 1e6  # noise of a channel that says nothing
+
+
+def silenced(base: Baseline, equations: Iterable[str]) -> Baseline:
+    """Give a baseline in which some equations are not judged, their residuals counting for nothing."""
+    sigma, r2 = base.noise.sigma.copy(), dict(base.r2)
+    for name in equations:
+        sigma[CHANNELS.index(SHOWN_BY[name])] = DEAF
+        r2[name] = min(r2.get(name, 0.0), 0.0)
+    return replace(base, noise=Noise(base.noise.ar, sigma), r2=r2)

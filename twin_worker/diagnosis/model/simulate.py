@@ -1,0 +1,261 @@
+"""Fly the calibrated simulation, with any effects at work: many runs side by side, commands recorded or from a pilot.
+
+    m a = m g + R (X, Y, Z)      J omega' = moments, inertia coupled where the card tells it      (NED, FRD)
+
+Forces are the calibration's equations turned round: c_z from alpha, c_y from beta.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet.effects import ALL_SURFACES, MEMORY, SURFACES, Flow, Onset, Stage
+from fleet.frames import G, rotation
+from twin_worker.diagnosis.data.fault_hypothesis import Guess
+from twin_worker.diagnosis.data.smooth import DT
+from twin_worker.diagnosis.model import equations as eq
+from twin_worker.diagnosis.model.baseline import Baseline
+from twin_worker.diagnosis.model.residual import RHO_0, density
+
+STATE = ("v_n", "v_e", "v_d", "p", "q", "r", "phi", "theta", "psi", "h")
+_STEEP = 1.45  # pitch is not integrated beyond [rad]
+_SLOWEST = 3.0  # airspeed the equations are used down to [m/s]
+_WILDEST = 8.0  # body rates beyond which a run counts as lost [rad/s]
+
+Pilot = Callable[[int, np.ndarray], np.ndarray]
+Memories = dict[tuple[int, int, int], np.ndarray]  # run, input, effect -> what its servo remembers
+
+
+@dataclass(frozen=True)
+class Runs:
+    """What was flown: states (n, 10, runs), force FRD (n, 3, runs), commands (n, 4, runs); Va, rho (n, runs)."""
+
+    states: np.ndarray
+    force: np.ndarray
+    commands: np.ndarray
+    Va: np.ndarray
+    rho: np.ndarray
+
+
+class Simulation:
+    """Several runs of one aircraft, each with effects of its own.
+
+    Args:
+        base: the calibrated simulation
+        guesses: effects at work, for each run
+        begins: time of each run's start, (runs,) [s]
+        ground: height of the ground [m]
+    """
+
+    def __init__(
+        self, base: Baseline, guesses: Sequence[Sequence[Guess]], begins: np.ndarray, ground: float = 0.0
+    ) -> None:
+        self.base, self.begins, self.ground = base, np.asarray(begins, float), ground
+        self.runs = len(guesses)
+        self._groups = _grouped(guesses)
+        self._servos = [(run, g) for run, all_ in enumerate(guesses) for g in all_ if g.effect.stage is Stage.DELTA]
+        self._no_wind = np.zeros((3, self.runs))
+
+    def fly(self, start: np.ndarray, pilot: Pilot, n: int) -> Runs:
+        """Fly n steps of `DT`; commands are held over a step, servos and engine follow them.
+
+        Args:
+            start: states in the order of `STATE`, (10, runs)
+            pilot: `(step, states (10, runs))` to commands delta_a delta_e delta_r delta_t, (4, runs)
+        """
+        x = np.array(start, float)
+        states, force = np.empty((n, len(STATE), self.runs)), np.empty((n, 3, self.runs))
+        commands, speed, rho = np.empty((n, 4, self.runs)), np.empty((n, self.runs)), np.empty((n, self.runs))
+        memories: Memories = {}
+        acting: np.ndarray | None = None
+        used = np.zeros(self.runs)
+        half, whole = self._share(0.5 * DT), self._share(DT)
+        for k in range(n):
+            t = self.begins + k * DT
+            states[k], commands[k] = x, pilot(k, x)
+            moved = self._moved(commands[k], t, memories)
+            acting = moved if acting is None else acting
+            used += commands[k, 3] * DT
+            self._gate(t)
+            first, middle = self._angles(acting), self._angles(acting + half * (moved - acting))
+            acting = acting + whole * (moved - acting)
+            k1, force[k], speed[k], rho[k] = self.rates(x, first, t, used)
+            k2 = self.rates(x + 0.5 * DT * k1, middle, t + 0.5 * DT, used)[0]
+            k3 = self.rates(x + 0.5 * DT * k2, middle, t + 0.5 * DT, used)[0]
+            k4 = self.rates(x + DT * k3, self._angles(acting), t + DT, used)[0]
+            x = x + DT / 6.0 * (k1 + 2 * k2 + 2 * k3 + k4)
+            lost = ~(np.abs(x[3:6]).max(axis=0) < _WILDEST)
+            x[:, lost] = np.where(np.isfinite(states[k][:, lost]), states[k][:, lost], 0.0)
+        return Runs(states, force, commands, speed, rho)
+
+    def airspeed(self, x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Give true airspeed, (runs,) [m/s], in states (10, runs) at times (runs,) [s]: what a pilot may go by."""
+        flow = Flow(t, x[9], x[9] - self.ground, self.base.card.body)
+        self._gate(t)
+        return np.sqrt(((x[:3] - self._wind(self._increments(flow, (Stage.AIR,)))) ** 2).sum(axis=0))  # type: ignore[no-any-return]
+
+    def _share(self, dt: float) -> np.ndarray:
+        """Give how far servos and engine come to what is commanded within dt, (4, runs)."""
+        timing = self.base.timing
+        tau = np.array([timing.servo + timing.delay] * 3 + [timing.engine])
+        share = np.repeat((1.0 - np.exp(-dt / np.maximum(tau, 1e-3)))[:, None], self.runs, axis=1)
+        for run, guess in self._servos:
+            for column, name in enumerate(SURFACES):
+                if guess.effect.takes_lag and guess.of in (name, ALL_SURFACES):
+                    share[column, run] = 1.0
+        return share
+
+    def _moved(self, commands: np.ndarray, t: np.ndarray, memories: Memories) -> np.ndarray:
+        """Have faulty servos do to the commands what they do."""
+        out = commands.copy()
+        for run, guess in self._servos:
+            for column, name in enumerate(SURFACES):
+                if guess.of not in (name, ALL_SURFACES):
+                    continue
+                u = out[column, run : run + 1].copy()
+                memory = memories.setdefault((run, column, id(guess)), np.full(MEMORY, u[0]))
+                par = np.asarray(guess.par)[:, None] * guess.when.gate(t[run : run + 1])
+                if guess.effect.takes_lag:
+                    par[0] += self.base.timing.servo + self.base.timing.delay
+                guess.effect.act(u, memory, DT, par)
+                out[column, run] = u[0]
+        return out
+
+    def _gate(self, t: np.ndarray) -> None:
+        """Set the parameters of every effect in the air for one step, by its course."""
+        for group in self._groups:
+            group.gate(t)
+
+    def _increments(self, flow: Flow, stages: tuple[Stage, ...]) -> dict[str, np.ndarray]:
+        total: dict[str, np.ndarray] = {}
+        for group in self._groups:
+            if group.effect.stage not in stages:
+                continue
+            for name, x in group.act(flow).items():
+                if name not in total:
+                    total[name] = np.zeros(self.runs)
+                total[name][group.rows] += x
+        return total
+
+    def _wind(self, air: dict[str, np.ndarray]) -> np.ndarray:
+        if not air:
+            return self._no_wind
+        return np.stack([air.get(name, self._no_wind[0]) for name in ("w_n", "w_e", "w_d")])
+
+    def _angles(self, u: np.ndarray) -> np.ndarray:
+        return np.stack([*(self.base.card.angles(i)(u[i]) for i in range(3)), u[3]])
+
+    def rates(
+        self, x: np.ndarray, delta: np.ndarray, t: np.ndarray, used: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Give d state / dt (10, runs), specific force FRD (3, runs) [m/s2], airspeed [m/s], density [kg/m3], (runs,).
+
+        Args:
+            x: states, (10, runs)
+            delta: surfaces as they stand [rad] and throttle, (4, runs)
+            t: time [s]; used: throttle integrated over time [s]; each (runs,)
+        """
+        base, body = self.base, self.base.card.body
+        v, (p, q, r), (phi, theta, psi), h = x[:3], x[3:6], x[6:9], x[9]
+        theta = np.clip(theta, -_STEEP, _STEEP)
+        d_a, d_e, d_r, d_t = delta
+        flow = Flow(t, h, h - self.ground, body, p=p, q=q, r=r, delta_t=d_t, used=used)
+        air = self._increments(flow, (Stage.AIR,))
+        R = rotation(phi, theta, psi)
+        moving = v - self._wind(air)
+        ua, va, wa = np.einsum("ijn,in->jn", R, moving)
+        flow.Va = np.maximum(np.sqrt(ua * ua + va * va + wa * wa), _SLOWEST)
+        flow.alpha, flow.beta = np.arctan2(wa, ua), np.arcsin(np.clip(va / flow.Va, -1, 1))
+        flow.rho = density(h) * (1.0 + air.get("rho", 0.0))
+        flow.q_bar = 0.5 * flow.rho * flow.Va**2
+        span, chord = body.b / (2 * flow.Va), body.c / (2 * flow.Va)
+        p_hat, q_hat, r_hat, q_S = p * span, q * chord, r * span, flow.q_bar * body.S
+        thrust = eq.thrust_terms(d_t, flow.Va, flow.rho / RHO_0, base.speed)
+        flow.T = base.coef["T"] @ thrust
+        flow.pitch, flow.yaw = base.coef["M"][3] * d_e, base.coef["N"][5] * d_r
+        A, B = base.coef["alpha"], base.coef["beta"]
+        c_z = lift_of(A, flow.alpha - A[0] - A[3] * q_hat - A[5] * d_e)
+        c_y = (flow.beta - B[0] - B[2] * p_hat - B[3] * r_hat - B[4] * d_r) / B[1]
+        flow.C_L = -c_z
+        add = self._increments(flow, (Stage.WRENCH, Stage.MASS))
+        coef, zero = base.coef, np.zeros(self.runs)
+        T = flow.T * (1.0 + add.get("thrust", zero))
+        lift = add.get("lift", zero) * -c_z + add.get("C_L", zero)
+        X = coef["X"] @ eq.force_terms(c_z, d_e, flow.beta) + lift * np.sin(flow.alpha)
+        X = q_S * (X - add.get("C_D", zero) * np.cos(flow.alpha)) + T
+        force = np.stack([X, q_S * (c_y + add.get("C_Y", zero)), q_S * (c_z - lift)])
+        lateral = eq.lateral_terms(flow.beta, (p_hat, r_hat), (d_a, d_r), c_z)
+        L = q_S * body.b * (coef["L"] @ lateral + add.get("C_l", zero)) + add.get("L", zero)
+        N = q_S * body.b * (coef["N"] @ lateral + add.get("C_n", zero)) + add.get("N", zero)
+        M = q_S * body.c * (coef["M"][:-1] @ eq.pitch_terms(c_z, q_hat, d_e, zero, X / q_S) + add.get("C_m", zero))
+        M = M + flow.T * base.coef["M"][-1] + add.get("M", zero)
+        x_cg, y_cg = add.get("x_cg", zero), add.get("y_cg", zero)
+        M, N, L = M + x_cg * force[2], N - x_cg * force[1] + y_cg * force[0], L - y_cg * force[2]
+        f = force / (body.mass * (1.0 + add.get("mass", zero)))
+        return np.concatenate([self._moving(R, f), self._turning(x, (L, M, N)), -v[2:3]]), f, flow.Va, flow.rho
+
+    @staticmethod
+    def _moving(R: np.ndarray, f: np.ndarray) -> np.ndarray:
+        out = np.einsum("ijn,jn->in", R, f)
+        out[2] += G
+        return out
+
+    def _turning(self, x: np.ndarray, moments: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+        (L, M, N), (p, q, r), phi = moments, x[3:6], x[6]
+        theta = np.clip(x[7], -_STEEP, _STEEP)
+        J_x, J_y, J_z, _ = self.base.card.inertia
+        known = float(self.base.card.known)
+        sf, cf = np.sin(phi), np.cos(phi)
+        turn = (q * sf + r * cf) / np.cos(theta)
+        return np.stack(
+            [
+                (L - known * (J_z - J_y) * q * r) / J_x,
+                (M - known * (J_x - J_z) * p * r) / J_y,
+                (N - known * (J_y - J_x) * p * q) / J_z,
+                p + np.sin(theta) * turn,
+                q * cf - r * sf,
+                turn,
+            ]
+        )
+
+
+def lift_of(A: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Solve A1 c_z + A2 c_z2 = rest for c_z, the root near zero."""
+    c_z = rest / A[1]
+    for _ in range(3):
+        c_z = c_z - (A[1] * c_z + A[2] * c_z**2 - rest) / (A[1] + 2 * A[2] * c_z)
+    return c_z
+
+
+class _Group:
+    """Guesses of one effect on one thing, and the runs they are at work in."""
+
+    def __init__(self, guesses: list[Guess], runs: list[int]) -> None:
+        self.effect, self._whens = guesses[0].effect, [guess.when for guess in guesses]
+        self._runs, self._of = np.array(runs), {"of": guesses[0].of} if guesses[0].of else {}
+        side_by_side = np.array_equal(self._runs, np.arange(runs[0], runs[0] + len(runs)))
+        self.rows = slice(runs[0], runs[0] + len(runs)) if side_by_side else self._runs  # a view where it can be one
+        self._full = self._par = np.array([guess.par for guess in guesses]).T
+        self._comes = any(when.kind is not Onset.ALWAYS for when in self._whens)
+
+    def gate(self, t: np.ndarray) -> None:
+        """Set the parameters at times t, (runs,) of all runs."""
+        if self._comes:
+            gates = [when.gate(t[run : run + 1])[0] for when, run in zip(self._whens, self._runs, strict=True)]
+            self._par = self._full * np.array(gates)
+
+    def act(self, flow: Flow) -> dict[str, np.ndarray]:
+        """Give the increments of the runs it is at work in."""
+        part = Flow(**{name: x[self.rows] if isinstance(x, np.ndarray) else x for name, x in flow.__dict__.items()})  # type: ignore[arg-type]
+        return self.effect.act(part, *self._par, **self._of)  # type: ignore[no-any-return]
+
+
+def _grouped(guesses: Sequence[Sequence[Guess]]) -> list[_Group]:
+    """Collect guesses of one effect on one thing over the runs."""
+    groups: dict[str, list[tuple[Guess, int]]] = {}
+    for run, all_ in enumerate(guesses):
+        for guess in all_:
+            if guess.effect.stage in (Stage.AIR, Stage.WRENCH, Stage.MASS):
+                groups.setdefault(f"{guess.effect.stage}:{guess.label}", []).append((guess, run))
+    return [_Group([g for g, _ in group], [run for _, run in group]) for group in groups.values()]

@@ -1,0 +1,103 @@
+"""Where and when, in colours and words: what the figures and the page of a diagnosis share."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fleet.effects import Onset
+from fleet.report.ink import INK, LINES, MUTED
+from twin_worker.diagnosis.inference.report import Outcome, Report, Series
+
+Segments = Sequence[tuple[float, float]]
+
+MEANING = {
+    "force_x": "force forward",
+    "side": "sideslip",
+    "lift": "angle of attack",
+    "roll": "roll acceleration",
+    "pitch": "pitch acceleration",
+    "yaw": "yaw acceleration",
+    "airspeed": "airspeed",
+    "gps_x": "velocity against IMU, forward",
+    "gps_y": "velocity against IMU, right",
+    "gps_z": "velocity against IMU, down",
+    "gyro_roll": "attitude against gyro, roll",
+    "gyro_pitch": "attitude against gyro, pitch",
+    "gyro_yaw": "attitude against gyro, yaw",
+    "baro": "barometric height",
+}
+"""What each channel of a residual is, for people."""
+
+SAID = {
+    Outcome.NONE: "no mismatch",
+    Outcome.NAMED: "named",
+    Outcome.SUSPECTED: "suspected, not proven",
+    Outcome.UNKNOWN: "unknown",
+}
+"""What is written for each outcome."""
+
+BEFORE, AFTER = LINES[1], LINES[0]  # without and with the effects, in every figure
+_COLOURS = (LINES[4], LINES[2], LINES[3], LINES[7])  # of what was located, apart from those two
+_EDGE_S = 1.0  # what begins no later than this has been there all along [s]
+_MOST = 3  # segments written out
+LEGEND: Any = {"frameon": False, "fontsize": 8, "labelcolor": INK}
+
+
+class Mark(NamedTuple):
+    """Something located: its name, colour, segments [s], and since when where it came in flight [s]."""
+
+    name: str
+    colour: str
+    segments: tuple[tuple[float, float], ...]
+    onset: float | None
+
+    def rows(self, t: np.ndarray) -> np.ndarray:
+        """Tell which times lie in its segments, (n,) bool."""
+        found = np.zeros(len(t), bool)
+        for start, stop in self.segments:
+            found |= (t >= start) & (t <= stop)
+        return found
+
+    def begins(self, span: tuple[float, float]) -> list[float]:
+        """Give when it begins within the flight [s]; not where it was there all along."""
+        if self.onset is not None:
+            return [self.onset]
+        return [start for start, _ in self.segments if start > span[0] + _EDGE_S]
+
+
+def marks(report: Report) -> list[Mark]:
+    """Give what was located: a mark for every effect, and one for what stays unknown."""
+    found = [
+        (one.guess.label, one.segments, None if one.guess.when.kind is Onset.ALWAYS else one.guess.when.t0)
+        for one in report.findings
+    ]
+    channel, segments = report.where
+    if report.outcome is Outcome.UNKNOWN and channel:
+        found.append((f"unknown, {MEANING.get(channel, channel)}", segments, None))
+    return [Mark(name, _COLOURS[k % len(_COLOURS)], tuple(s), onset) for k, (name, s, onset) in enumerate(found)]
+
+
+def times(segments: Segments) -> str:
+    """Write segments in words: `83–95, 102–110 s`."""
+    if not segments:
+        return "at no certain time"
+    words = ", ".join(f"{start:.0f}–{stop:.0f}" for start, stop in segments[:_MOST]) + " s"
+    more = len(segments) - _MOST
+    return f"{words} and {more} more" if more > 0 else words
+
+
+def runs(t: np.ndarray, held: np.ndarray) -> list[tuple[float, float]]:
+    """Give first and last time of every stretch of true rows, (n,) bool."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(int)))
+    return [(float(t[i]), float(t[j - 1])) for i, j in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def span(series: Series) -> tuple[float, float]:
+    """Give the limits of the axis of time [s]."""
+    return (float(series.t[0]), max(float(series.t[-1]), float(series.t[0]) + 1.0)) if len(series.t) else (0.0, 1.0)
+
+
+def empty(ax: Any, words: str) -> None:
+    """Say in a panel why there is nothing in it."""
+    ax.text(0.5, 0.5, words, ha="center", va="center", transform=ax.transAxes, fontsize=9, color=MUTED)

@@ -1,0 +1,1 @@
+"""Estimates of wind and of the airspeed set-point."""

@@ -1,0 +1,69 @@
+"""The airspeed that the autopilot says it aims at, where the route alone does not tell.
+
+A mission that jumps back keeps the speed that was commanded last; which one that was is not on the wire, but how far
+the flown airspeed is from the wanted one is (NAV_CONTROLLER_OUTPUT). Who does not say so, as PX4 by its attitude
+targets, still holds one of the few speeds that its mission names.
+"""
+
+import numpy as np
+
+from fleet.mission import SEQ, VA_C
+from twin_worker.telemetry.history import History
+
+_OVER_S = 3.0  # seconds whose median counts [s]
+_LEAST = 3  # reports within them
+_STEADY_S = 20.0  # seconds over which a speed is held
+_STEADY, _STRAYS = 0.04, 0.06  # of the airspeed: change within them, distance from the speed held [-]
+_APART = 0.5  # a smaller difference is rounding and noise [m/s]
+
+
+def aimed_at(history: History, t: float) -> float:
+    """Give the airspeed aimed at just before `t`, as reported; nan where it is not [m/s]."""
+    t_c, command = history.look("command", t - _OVER_S)
+    t_air, air = history.look("air", t - _OVER_S - 2.0)
+    if len(t_c) < _LEAST or len(t_air) < _LEAST or air[:, 0].max() < 3.0:
+        return float("nan")
+    wanted = command[:, 4] + np.interp(t_c, t_air, air[:, 0])
+    return _middle(wanted[t_c <= t]) if (t_c <= t).any() else float("nan")
+
+
+def held_to(history: History, t: float, speeds: np.ndarray) -> float:
+    """Give the one of `speeds` [m/s] that was held just before `t`; nan where the airspeed keeps to none of them."""
+    t_air, air = history.look("air", t - _STEADY_S)
+    Va = air[t_air <= t, 0]
+    if len(Va) < 2 * _LEAST or not len(speeds) or Va.min() < 3.0:
+        return float("nan")
+    half = len(Va) // 2
+    usual = _middle(Va)
+    off = np.sort(np.abs(speeds - usual))
+    steady = abs(_middle(Va[:half]) - _middle(Va[half:])) < _STEADY * usual
+    if not steady or off[0] > _STRAYS * usual or (len(off) > 1 and off[0] > 0.5 * off[1]):
+        return float("nan")
+    return float(speeds[np.argmin(np.abs(speeds - usual))])
+
+
+def _middle(x: np.ndarray) -> float:
+    """Give the median; nan where any is."""
+    ranked = np.sort(x)
+    n = len(ranked)
+    return 0.5 * float(ranked[(n - 1) // 2] + ranked[n // 2]) if ranked[-1] == ranked[-1] else float("nan")
+
+
+def as_told(legs: np.ndarray, seq: float, cruise: float, told: float) -> np.ndarray:
+    """Give the legs with the speed that is aimed at on the one in force, and on its neighbours of the same speed.
+
+    Args:
+        legs: route, (n, 9)
+        seq: mission item in force
+        cruise: speed of legs that name none [m/s]
+        told: airspeed aimed at; nan changes nothing [m/s]
+    """
+    found = np.flatnonzero(legs[:, SEQ] == seq)
+    speeds = np.where(legs[:, VA_C] > 0, legs[:, VA_C], cruise)
+    if not len(found) or not abs(told - speeds[found[0]]) > _APART:
+        return legs
+    other = np.flatnonzero(speeds != speeds[found[0]])
+    before, after = other[other < found[0]], other[other > found[0]]
+    changed = legs.copy()
+    changed[before[-1] + 1 if len(before) else 0 : after[0] if len(after) else len(legs), VA_C] = told
+    return changed

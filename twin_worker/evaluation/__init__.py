@@ -1,0 +1,1 @@
+"""Replay of recordings through the twins, every prediction scored against the flight."""

@@ -1,0 +1,1 @@
+"""Simpler prediction methods to compare with."""

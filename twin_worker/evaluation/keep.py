@@ -1,0 +1,78 @@
+"""Our predictions beside what was flown, as a file that anyone can score."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.special import ndtri
+
+from fleet.frames import to_geodetic
+from twin_worker.evaluation.scoring.case import OURS, Case
+from twin_worker.numerics.prediction_errors import QUANTILE, path_length, track_frame
+
+KEYS = {
+    "t0": "start, (s,) [s since 1970]",
+    "t": "instants asked for, (s, k) [s since 1970]",
+    "latitude": "(s, k) [deg]",
+    "longitude": "(s, k) [deg]",
+    "altitude": "above mean sea level, (s, k) [m]",
+    "covariance": "of a normal law as wide as the tube, NED, (s, k, 3, 3) [m2]",
+    "horizon": "confidence horizon, (s,) [s]",
+    "flight": "recording and aircraft, (s,)",
+    "uav": "id, (s,)",
+    "apart": "why a start does not count; empty: it counts, (s,)",
+    "ahead": "look-ahead, (k,) [s]",
+    "path": "predicted, NED from the aircraft's first position; nan beyond its end, (s, k, 3) [m]",
+    "tube": "half-axes along, cross, vertical, (s, k, 3) [m]",
+    "spread": "standard deviations of the ensemble along, cross, vertical; nan without one, (s, k, 3) [m]",
+    "flown": "what happened, NED; nan where not known or after an event, (s, k, 3) [m]",
+    "length": "path flown so far, at least two seconds of ground speed, (s, k) [m]",
+    "predicted_length": "the same along the prediction, (s, k) [m]",
+    "group": "method / law / vehicle / parameters, (s,)",
+    "method": "that made the prediction, (s,)",
+}
+
+
+def keep(path: Path, cases: Sequence[Case]) -> None:
+    """Write our predictions and the flights that answered them; keys and units: `KEYS`."""
+    rows = [_row(case) for case in cases]
+    arrays = {name: np.array([row[name] for row in rows]) for name in KEYS if name != "ahead"}
+    np.savez_compressed(path, ahead=cases[0].asked.ahead, **arrays)  # type: ignore[arg-type]
+
+
+def _row(case: Case) -> dict[str, object]:
+    asked, told = case.asked, case.asked.told[OURS]
+    place, far = np.full(told.path.shape, np.nan), np.isfinite(told.path).all(axis=1)
+    place[far] = to_geodetic(asked.origin, told.path[far]) * np.array([1e-7, 1e-7, 1e-3])
+    assert told.tube is not None
+    return {
+        "t0": asked.t,
+        "t": asked.t + asked.ahead,
+        "latitude": place[:, 0],
+        "longitude": place[:, 1],
+        "altitude": place[:, 2],
+        "covariance": covariance(told.path, told.tube).astype(np.float32),
+        "horizon": told.horizon_s,
+        "flight": asked.flight,
+        "uav": asked.uav,
+        "apart": case.apart,
+        "path": told.path,
+        "tube": told.tube,
+        "spread": asked.spread,
+        "flown": case.flown,
+        "length": case.length,
+        "predicted_length": path_length(told.path, asked.speed),
+        "group": asked.group,
+        "method": told.made_by,
+    }
+
+
+def covariance(path: np.ndarray, tube: np.ndarray) -> np.ndarray:
+    """Give the covariance, NED, of independent normal errors of which the tube holds its share, (k, 3, 3) [m2]."""
+    sigma = tube / ndtri(0.5 + 0.5 * QUANTILE ** (1 / 3))
+    along = track_frame(path)
+    axes = np.zeros((len(path), 3, 3))
+    axes[:, :2, 0] = along
+    axes[:, 0, 1], axes[:, 1, 1] = -along[:, 1], along[:, 0]
+    axes[:, 2, 2] = 1.0
+    return np.einsum("kij,kj,klj->kil", axes, sigma**2, axes)

@@ -1,0 +1,79 @@
+"""Ours against every other method on the same starts: paired differences with intervals that know the flights.
+
+Starts of one flight depend on each other, so flights are drawn, not starts.
+Source: Davison & Hinkley 1997, "Bootstrap methods and their application", section 3.8 (cluster bootstrap, percentile).
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from twin_worker.evaluation.scoring.case import OURS
+from twin_worker.evaluation.scoring.score import LIMITS, Scores
+from twin_worker.evaluation.scoring.truth import WHOLE_S
+
+_DRAWS = 2000
+_SEED = 5
+_SHARES = (2.5, 97.5)  # the interval [%]
+_ERRORS_S = (16, 60)  # look-aheads whose median error is compared [s]
+BEATEN, MATCHED, WORSE, ONE_FLIGHT = "beaten", "matched", "worse", "one flight, no interval"
+
+
+def compare(scores: dict[str, Scores]) -> dict[str, Any]:
+    """Give, by method, ours minus it: mean first passage up to 60 s, median errors; and the verdict on each.
+
+    Returns:
+        by method: `t10_s`, `p50_16_m`, `p50_60_m`, each with difference, low, high, verdict; `skill_16`, `skill_60`:
+        1 - median error of ours over its
+    """
+    ours = scores.get(OURS)
+    return {name: _against(ours, other) for name, other in scores.items() if ours is not None and name != OURS}
+
+
+def _against(ours: Scores, other: Scores) -> dict[str, Any]:
+    pairs = np.column_stack([np.minimum(one.passages[LIMITS[0]][:, 0], WHOLE_S) for one in (ours, other)])
+    out: dict[str, Any] = {"t10_s": _difference(pairs, ours.flight, np.mean, better=1.0)}
+    for seconds in _ERRORS_S:
+        column = ours.at(seconds)
+        if column is None:
+            continue
+        pairs = np.column_stack([one.distance[:, column] for one in (ours, other)])
+        known = np.isfinite(pairs).all(axis=1)
+        out[f"p50_{seconds}_m"] = _difference(pairs[known], ours.flight[known], np.median, better=-1.0)
+        middle = np.median(pairs[known], axis=0) if known.any() else np.array([np.nan, np.nan])
+        out[f"skill_{seconds}"] = round(float(1 - middle[0] / middle[1]), 3) if middle[1] > 0 else None
+    return out
+
+
+def _difference(
+    pairs: np.ndarray, flight: np.ndarray, middle: Callable[..., Any], *, better: float
+) -> dict[str, float | str | None]:
+    """Give the difference of two middles, ours first, its 95 % interval over flights, and the verdict.
+
+    Args:
+        pairs: ours and the other at each start, (s, 2)
+        flight: whose start, (s,)
+        middle: mean or median
+        better: sign of a difference in our favour
+    """
+    names = np.unique(flight)
+    if not len(names):
+        return {"difference": None, "low": None, "high": None, "verdict": ONE_FLIGHT}
+    value = float(np.subtract(*middle(pairs, axis=0)))
+    if len(names) < 2:
+        return {"difference": round(value, 2), "low": None, "high": None, "verdict": ONE_FLIGHT}
+    its = [pairs[flight == name] for name in names]
+    rng = np.random.default_rng(_SEED)
+    drawn = [
+        float(np.subtract(*middle(np.concatenate([its[i] for i in rng.integers(len(its), size=len(its))]), axis=0)))
+        for _ in range(_DRAWS)
+    ]
+    low, high = np.percentile(drawn, _SHARES)
+    verdict = MATCHED if low <= 0 <= high else BEATEN if value * better > 0 else WORSE
+    return {
+        "difference": round(value, 2),
+        "low": round(float(low), 2),
+        "high": round(float(high), 2),
+        "verdict": verdict,
+    }

@@ -1,0 +1,1 @@
+"""Identification of dynamics models from flight data."""

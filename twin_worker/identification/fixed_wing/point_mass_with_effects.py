@@ -1,0 +1,73 @@
+"""The hybrid with effects put in: lags behind a faulty servo anew, power with what the effects add to it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleet.physics import point_mass as H
+from fleet.window import Window
+from twin_worker.identification.fixed_wing import attitude_lag
+from twin_worker.identification.fixed_wing.energy_balance import Flight, load, missed
+from twin_worker.identification.fixed_wing.point_mass_model import Hybrid, flight_of
+from twin_worker.numerics.ridge_regression import ridge
+from twin_worker.telemetry.history import History
+
+_LEAST_S = 10.0  # flight that anything is corrected on [s]
+_RIDGE = 0.05  # pull of an increment towards zero, as a share of its term's length
+_DOUBT = 0.3  # of an increment
+
+
+@dataclass(frozen=True)
+class Added:
+    """What effects do, row by row of what was flown.
+
+    Attributes:
+        force: X Y Z added, (n, 3) [m/s2]
+        air: u v w, (n, 3) [m/s]
+        phi: bank, (n,) [rad]
+        throttle: (n,) [-]
+        faulty: whether servos of aileron and elevator are
+    """
+
+    force: np.ndarray
+    air: np.ndarray
+    phi: np.ndarray
+    throttle: np.ndarray
+    faulty: tuple[bool, bool]
+
+
+def extended(known: Hybrid, since: Window, history: History, scale: float, added: Added) -> Hybrid:
+    """Put effects in.
+
+    Args:
+        known: what was identified before the onset
+        since: flight since then
+        history: telemetry as it came
+        scale: true over reported airspeed, as it is now [-]
+        added: what the effects do
+    """
+    body = known.body.copy()
+    power = _power(body, added)
+    body[H.C_0 : H.C_N + 1] += power
+    if since.seconds >= _LEAST_S:
+        flown = flight_of(since, history, scale)
+        for column, faulty in zip((H.WN_PHI, H.WN_THETA), added.faulty, strict=True):
+            if faulty:
+                body[column : column + 3] = _lag(flown, column, body[column : column + 3])
+        body[H.C_0] += float(missed(flown, body[H.C_0 : H.C_N + 1], body[H.T_0], body[H.V_0]).mean())
+    cov = known.power.cov + np.diag((_DOUBT * power) ** 2)
+    return Hybrid(body, replace(known.power, cov=cov), float(since.t[-1]))
+
+
+def _lag(flown: Flight, column: int, near: np.ndarray) -> np.ndarray:
+    command, angle = (flown.phi_c, flown.phi) if column == H.WN_PHI else (flown.theta_c, flown.theta)
+    return attitude_lag.identify(command, angle, near)
+
+
+def _power(body: np.ndarray, added: Added) -> np.ndarray:
+    """Give what is added to c_0 c_t c_v c_n: force along the flight, regressed on what they are multiplied by, (4,)."""
+    V = np.maximum(np.linalg.norm(added.air, axis=1), 1.0)
+    along = (added.force * added.air).sum(axis=1) / V
+    n = load(added.phi)
+    A = np.column_stack([np.ones(len(V)), added.throttle - body[H.T_0], V - body[H.V_0], n * n - 1.0])
+    return ridge(A, along, _RIDGE)

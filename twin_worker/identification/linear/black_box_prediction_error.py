@@ -1,0 +1,209 @@
+"""Second step without physics: refine A, B, C (K, c, x0) of any order by the prediction error, Gauss-Newton damped.
+
+Output error and innovations form are one run of x' = F x + G w, y_hat = C x: w = (u, 1) with F = A, or
+w = (u, 1, y) with F = A - K C. All entries are free; the directions that only turn the state cost nothing, and the
+damping leaves them alone. A step that would carry a pole out of the unit circle is not taken.
+
+J = sum_k e' e,  e = y - y_hat over the measured rows of one long run; D = 0.
+Source: Huang 2021, eq. 16-17; Ljung 1999, sections 7.3 and 10.2; McKelvey, Helmersson 2004 (free parametrisation).
+"""
+
+from dataclasses import dataclass, replace
+
+import numba as nb
+import numpy as np
+import scipy.linalg
+
+from twin_worker.identification.linear.state_space import StateSpace
+
+_BLOCK = 64  # samples between two products of many rows [-]
+_CAP = 1e4  # a run that leaves this has diverged [scaled units]
+
+
+@nb.njit(cache=True, nogil=True)
+def normal_equations(
+    F: np.ndarray, G: np.ndarray, C: np.ndarray, x0: np.ndarray, y: np.ndarray, w: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sum squared errors, gradient and Gauss-Newton matrix of one run; parameters in the order [F G] C x0.
+
+    F (n, n); G (n, m); C (l, n); x0 (n,); y (N, l), nan where not measured; w (N, m).
+    The squares (l,) are inf where the run diverged.
+    """
+    n, m, l = len(F), G.shape[1], len(C)
+    q = n + m
+    dynamic = n * q  # sensitivities of the state: entries of [F G], then of x0
+    total = dynamic + l * n + n
+    g, H, squares = np.zeros(total), np.zeros((total, total)), np.zeros(l)
+    S, S_next = np.zeros((n, dynamic + n)), np.zeros((n, dynamic + n))
+    x, z = x0.copy(), np.zeros(q)
+    rows, errors, filled = np.zeros((_BLOCK * l, total)), np.zeros(_BLOCK * l), 0
+    for i in range(n):
+        S[i, dynamic + i] = 1.0
+    for k in range(len(y)):
+        if np.isfinite(y[k]).all():
+            T = C @ S
+            for i in range(l):
+                e = y[k, i]
+                for j in range(n):
+                    e -= C[i, j] * x[j]
+                squares[i] += e * e
+                row, errors[filled] = rows[filled], e
+                row[:dynamic] = T[i, :dynamic]
+                row[dynamic : dynamic + l * n] = 0.0
+                row[dynamic + i * n : dynamic + (i + 1) * n] = x
+                row[dynamic + l * n :] = T[i, dynamic:]
+                filled += 1
+            if filled == len(rows):
+                H += rows.T @ rows
+                g += rows.T @ errors
+                filled = 0
+        z[:n] = x
+        z[n:] = w[k]
+        np.dot(F, S, S_next)
+        for i in range(n):
+            S_next[i, i * q : (i + 1) * q] += z
+        x = F @ x + G @ w[k]
+        S, S_next = S_next, S
+        if not np.abs(x).max() < _CAP:
+            squares[:] = np.inf
+            break
+    H += rows[:filled].T @ rows[:filled]
+    g += rows[:filled].T @ errors[:filled]
+    return squares, g, H
+
+
+@nb.njit(cache=True, nogil=True)
+def squared_errors(
+    F: np.ndarray, G: np.ndarray, C: np.ndarray, x0: np.ndarray, y: np.ndarray, w: np.ndarray
+) -> np.ndarray:
+    """Give only the squared errors of the same run, (l,)."""
+    squares, x = np.zeros(len(C)), x0.copy()
+    for k in range(len(y)):
+        if np.isfinite(y[k]).all():
+            squares += (y[k] - C @ x) ** 2
+        x = F @ x + G @ w[k]
+        if not np.abs(x).max() < _CAP:
+            squares[:] = np.inf
+            break
+    return squares
+
+
+@dataclass(frozen=True)
+class _Task:
+    """The data, and where each matrix lies in the parameter vector."""
+
+    y: np.ndarray  # nan where not measured
+    w: np.ndarray
+    n: int
+    m: int  # inputs
+    pushed: bool
+    watches: bool
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Where C and x0 begin."""
+        dynamic = self.n * (self.n + self.w.shape[1])
+        return np.array([dynamic, dynamic + self.y.shape[1] * self.n])
+
+    def pack(self, model: StateSpace) -> np.ndarray:
+        F, G = model.A, model.B
+        if self.pushed:
+            G = np.hstack([G, model.c[:, None]])
+        if self.watches:
+            F, G = F - model.K @ model.C, np.hstack([G, model.K])
+        return np.concatenate([np.hstack([F, G]).ravel(), model.C.ravel(), model.x0])
+
+    def matrices(self, par: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        dynamic, C, x0 = np.split(par, self.sizes)
+        FG = dynamic.reshape(self.n, -1)
+        return FG[:, : self.n].copy(), FG[:, self.n :].copy(), C.reshape(-1, self.n).copy(), x0.copy()
+
+    def unpack(self, par: np.ndarray) -> StateSpace:
+        F, G, C, x0 = self.matrices(par)
+        K = G[:, self.m + self.pushed :] if self.watches else np.zeros((self.n, len(C)))
+        c = G[:, self.m] if self.pushed else np.zeros(self.n)
+        return StateSpace.of(F + K @ C, G[:, : self.m], C, K=K, c=c, x0=x0)
+
+
+def _task(
+    model: StateSpace, y: np.ndarray, u: np.ndarray, ok: np.ndarray | None, *, watches: bool, pushed: bool
+) -> _Task:
+    y = np.array(y, float)
+    if ok is not None:
+        y[~ok] = np.nan
+    columns = [u]
+    if pushed:
+        columns.append(np.ones((len(u), 1)))
+    if watches:
+        columns.append(np.nan_to_num(y))
+    return _Task(y, np.ascontiguousarray(np.hstack(columns)), model.order, u.shape[1], pushed, watches)
+
+
+def refine_black_box(
+    model: StateSpace,
+    y: np.ndarray,
+    u: np.ndarray,
+    *,
+    ok: np.ndarray | None = None,
+    innovations: bool = False,
+    pushed: bool = False,
+    steps: int = 30,
+) -> StateSpace:
+    """Refine every matrix of a model by damped Gauss-Newton; never worse than its start on these data.
+
+    Args:
+        model: start, any order
+        y, u: scaled outputs (N, l) and inputs (N, m)
+        ok: rows that count, (N,) bool; the others are run through but not fitted (output error only)
+        innovations: refine the one-step prediction (with K) instead of the free run
+        pushed: with a constant push c on the state
+        steps: most Gauss-Newton steps
+    """
+    task = _task(model, y, u, ok, watches=innovations, pushed=pushed)
+    par = task.pack(model)
+    squares = squared_errors(*task.matrices(par), task.y, task.w)
+    if not np.isfinite(squares).all():
+        return model
+    mu, best = 1e-2, float(squares.sum())
+    edge = max(model.radius, 1.0)
+    for _ in range(steps):
+        _, g, H = normal_equations(*task.matrices(par), task.y, task.w)
+        before = best
+        while mu < 1e8:
+            trial = par + _step(g, H, mu)
+            total = float(squared_errors(*task.matrices(trial), task.y, task.w).sum())
+            if total < best and task.unpack(trial).radius <= edge:
+                par, best, mu = trial, total, max(mu / 8, 1e-9)
+                break
+            mu *= 6
+        if before - best < 1e-5 * before:
+            break
+    return task.unpack(par)
+
+
+def _step(g: np.ndarray, H: np.ndarray, mu: float) -> np.ndarray:
+    """Solve the damped normal equations, evenly scaled."""
+    even = 1 / np.sqrt(np.diag(H) + 1e-9 * np.trace(H) / len(H) + 1e-30)
+    scaled = even[:, None] * H * even
+    scaled[np.diag_indices_from(scaled)] += mu
+    return even * scipy.linalg.solve(scaled, even * g, assume_a="pos")
+
+
+def fit_inputs(
+    model: StateSpace, y: np.ndarray, u: np.ndarray, ok: np.ndarray | None = None, pushed: bool = False
+) -> StateSpace:
+    """Solve B, c and x0 for given A and C by least squares on the free run.
+
+    Source: Huang 2021, eq. 15 with D = 0.
+    """
+    task = _task(model, y, u, ok, watches=False, pushed=pushed)
+    rest = replace(model, B=np.zeros((model.order, u.shape[1])), c=np.zeros(model.order), x0=np.zeros(model.order))
+    par = task.pack(rest)
+    squares, g, H = normal_equations(*task.matrices(par), task.y, task.w)
+    free = np.ones(len(par), bool)
+    free[: task.sizes[0]] = np.tile(np.arange(model.order + task.w.shape[1]) >= model.order, model.order)
+    free[task.sizes[0] : task.sizes[1]] = False
+    if not np.isfinite(squares).all():
+        return model
+    par[free] = _step(g[free], H[np.ix_(free, free)], 1e-10)
+    return task.unpack(par)

@@ -1,0 +1,145 @@
+"""First step: a state-space model straight from the data, by predictor-based subspace identification.
+
+The paper projects future outputs orthogonally to the inputs (Huang 2021, eq. 5-15; `projection.py`), which is
+biased when an autopilot closes the loop. This is the closed-loop consistent form of the same idea: the past enters
+through a vector autoregression, so that the innovations stay uncorrelated with it.
+
+Source: Chiuso 2007, "The role of vector autoregressive modeling in predictor-based subspace identification",
+Automatica 43, 1034-1048 (PBSIDopt); D = 0.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin_worker.identification.linear.state_space import StateSpace
+
+PAST = 12  # samples of the past in the regression [-]
+FUTURE = 8  # block rows of the observability matrix [-]
+_ALIKE = 1e-8  # least share of a column that the others do not explain [-]
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """States of every order at once: the model of order n is made of the first n.
+
+    Attributes:
+        x: sqrt(S) V', most important first, (most, N')
+        singular: what each of them carries, (most,)
+        y, u: outputs and inputs of the same samples, (N', l), (N', m)
+        rows: which samples these are, (N',)
+    """
+
+    x: np.ndarray
+    singular: np.ndarray
+    y: np.ndarray
+    u: np.ndarray
+    rows: np.ndarray
+
+    def model(self, order: int) -> StateSpace:
+        """Solve x' = A x + B u + K e, y = C x + e for the first `order` states.
+
+        Raises:
+            ValueError: when there are not so many.
+        """
+        if not 1 <= order <= len(self.x):
+            raise ValueError(f"subspace: found order {order}, expected 1..{len(self.x)}; lower it or widen the past")
+        x, m = self.x[:order], self.u.shape[1]
+        C = np.linalg.lstsq(x.T, self.y, rcond=None)[0].T
+        e = self.y - (C @ x).T
+        follows = np.flatnonzero(np.diff(self.rows) == 1)
+        regressor = np.hstack([x.T, self.u, e])[follows]
+        solved = np.linalg.lstsq(regressor, x.T[follows + 1], rcond=None)[0].T
+        return StateSpace.of(solved[:, :order], solved[:, order : order + m], C, K=solved[:, order + m :])
+
+
+def candidates(
+    y: np.ndarray, u: np.ndarray, ok: np.ndarray, *, past: int = PAST, future: int = FUTURE, ridge: float = 1e-3
+) -> Candidates:
+    """Estimate the states of all orders up to outputs times `future`.
+
+    Args:
+        y: outputs, zero mean and unit scale, (N, l)
+        u: inputs, likewise, (N, m)
+        ok: rows that were measured, (N,) bool
+        past: samples in the vector autoregression, at least `future`
+        future: block rows of the observability matrix
+        ridge: regularisation per sample [-]
+    Raises:
+        ValueError: when too few unbroken rows are left; wait for a longer window.
+    """
+    n = y.shape[1]
+    k = n + u.shape[1]
+    before = np.hstack([np.hstack([y[past - i : -i], u[past - i : -i]]) for i in range(1, past + 1)])
+    whole = np.lib.stride_tricks.sliding_window_view(ok, past + 1).all(axis=1) if len(ok) > past else np.zeros(0, bool)
+    if whole.sum() < 3 * past * k:
+        raise ValueError(f"subspace: found {whole.sum()} unbroken rows, needs {3 * past * k}; wait for more")
+    z, target = before[whole], y[past:][whole]
+    moment = z.T @ z
+    markov = np.linalg.solve(moment + ridge * len(z) * np.eye(z.shape[1]), z.T @ target).T  # [C B~, C A~ B~, ...]
+    # block row i of the observability matrix times the reachability matrix: the same coefficients, i steps later
+    shifted = [np.hstack([markov[:, i * k :], np.zeros((n, i * k))]) for i in range(future)]
+    product = np.vstack(shifted)
+    squared, left = np.linalg.eigh(product @ moment @ product.T)  # of (product z')(product z')', a small matrix
+    squared, left = np.maximum(squared[::-1], 1e-12), left[:, ::-1]
+    x = squared[:, None] ** -0.25 * (left.T @ product @ z.T)  # sqrt(S) V'
+    return Candidates(x, np.sqrt(squared), target, u[past:][whole], np.flatnonzero(whole))
+
+
+def pbsid(
+    y: np.ndarray, u: np.ndarray, order: int, *, ok: np.ndarray | None = None, past: int = PAST, future: int = FUTURE
+) -> StateSpace:
+    """Identify a model of any order from data that may come from a closed loop.
+
+    Args:
+        y: outputs, zero mean and unit scale, (N, l)
+        u: inputs, likewise, (N, m)
+        order: number of states, at most outputs times `future`
+        ok: rows that were measured, (N,) bool; all where not given
+        past, future: horizons [samples]
+    Raises:
+        ValueError: when the data are too short or too poor for that; the sentence says what to change.
+    """
+    ok = np.ones(len(y), bool) if ok is None else ok
+    instructive(y, u, ok)
+    return candidates(y, u, ok, past=past, future=future).model(order)
+
+
+def instructive(y: np.ndarray, u: np.ndarray, ok: np.ndarray) -> None:
+    """Insist on data from which something can be learnt.
+
+    Raises:
+        ValueError: when columns are not finite, constant or copies, or rows are missing.
+    """
+    if not len(y) == len(u) == len(ok):
+        raise ValueError(f"subspace: found {len(y)} outputs, {len(u)} inputs, {len(ok)} marks; give as many of each")
+    for name, data in (("output", y[ok]), ("input", u[ok])):
+        if not np.isfinite(data).all():
+            column = int(np.argmin(np.isfinite(data).all(axis=0)))
+            raise ValueError(f"subspace: {name} {column} is not finite in rows marked as measured; mark them not ok")
+        away = data - data.mean(axis=0) if len(data) else data
+        size = np.linalg.norm(away, axis=0)
+        if not len(data) or (size <= 1e-12 * (1 + np.linalg.norm(data, axis=0))).any():
+            column = int(np.argmin(size))
+            raise ValueError(f"subspace: {name} {column} is constant, expected some motion; excite it or leave it out")
+        left_over = np.abs(np.diag(np.linalg.qr(away / size, mode="r")))
+        if len(away) < away.shape[1] or left_over.min() < _ALIKE:
+            column = int(np.argmin(left_over))
+            raise ValueError(f"subspace: {name} {column} repeats the columns before it; leave it out")
+
+
+def subspace(y: np.ndarray, u: np.ndarray, ok: np.ndarray, ridge: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+    """Identify x' = A x + B u + K e, y = x + e of order n = number of outputs, from flights as they come.
+
+    Args:
+        y: outputs, zero mean and unit scale, (N, n)
+        u: inputs, likewise; one that never moves gets next to no effect, (N, m)
+        ok: rows that were measured, (N,) bool
+        ridge: regularisation per sample [-]
+    Returns:
+        A (n, n), B (n, m)
+    Raises:
+        ValueError: when too few unbroken rows are left; wait for a longer window.
+    """
+    model = candidates(y, u, ok, ridge=ridge).model(y.shape[1]).outputs_as_states()
+    return model.A, model.B

@@ -1,0 +1,53 @@
+"""The paper's first step: future outputs projected orthogonally to the inputs, for open loop data.
+
+In a closed loop the inputs carry the noise of past outputs and A is biased: `subspace.py` is not. Kept so that the
+paper can be reproduced and the bias be shown.
+
+Source: Huang 2021, eq. 5-15; Verhaegen 1994 (ordinary MOESP); D = 0.
+"""
+
+import numpy as np
+
+from twin_worker.identification.linear.black_box_prediction_error import fit_inputs
+from twin_worker.identification.linear.state_space import StateSpace
+from twin_worker.identification.linear.subspace import instructive
+
+DEPTH = 12  # q: block rows of the Hankel matrices [-]
+
+
+def projection(
+    y: np.ndarray, u: np.ndarray, order: int, *, ok: np.ndarray | None = None, depth: int = DEPTH
+) -> StateSpace:
+    """Identify a model by the paper's orthogonal projection.
+
+    Args:
+        y: outputs, zero mean and unit scale, (N, l)
+        u: inputs, likewise, (N, m)
+        order: number of states, at most outputs times (`depth` - 1)
+        ok: rows that were measured, (N,) bool; all where not given
+        depth: q of the paper [samples]
+    Raises:
+        ValueError: when the data are too short or too poor for that; the sentence says what to change.
+    """
+    ok = np.ones(len(y), bool) if ok is None else ok
+    instructive(y, u, ok)
+    l, m = y.shape[1], u.shape[1]
+    if not 1 <= order <= l * (depth - 1):
+        raise ValueError(f"projection: found order {order}, expected 1..{l * (depth - 1)}; lower it or raise the depth")
+    whole = np.lib.stride_tricks.sliding_window_view(ok, depth).all(axis=1) if len(ok) >= depth else np.zeros(0, bool)
+    if whole.sum() < 2 * depth * (l + m):
+        raise ValueError(f"projection: found {whole.sum()} unbroken rows, needs {2 * depth * (l + m)}; wait for more")
+    Y, U = (_hankel(data, depth)[:, whole] for data in (y, u))  # eq. 9
+    # eq. 11-13: what is left of Y beside U; from the triangular factor, the projector itself would be N x N
+    R = np.asarray(np.linalg.qr(np.vstack([U, Y]).T, mode="r")).T
+    left, singular, _ = np.linalg.svd(R[depth * m :, depth * m :])
+    O = left[:, :order] * np.sqrt(singular[:order])  # eq. 14
+    C, A = O[:l], np.linalg.lstsq(O[:-l], O[l:], rcond=None)[0]  # eq. 7
+    start = StateSpace.of(A, np.zeros((order, m)), C)
+    return fit_inputs(start.stabilised(), y, u, ok=ok)  # eq. 15
+
+
+def _hankel(data: np.ndarray, depth: int) -> np.ndarray:
+    """Stack every row with those that follow it: (N, k) to (depth k, N - depth + 1)."""
+    windows = np.lib.stride_tricks.sliding_window_view(data, depth, axis=0)  # (N', k, depth)
+    return windows.transpose(2, 1, 0).reshape(depth * data.shape[1], -1)

@@ -1,0 +1,1 @@
+"""Ownership of UAV ids among workers: claims with epochs, handover, takeover."""

@@ -1,0 +1,1 @@
+"""Experiments of Huang et al. 2021, repeated."""

@@ -1,0 +1,142 @@
+"""One experiment of the paper: two linear models identified on a stretch, run free over the seconds after it.
+
+The first step (the paper's projection, or PBSID) and its refinement by the prediction error, without any prior; the
+models have 4 states along and 5 across.  Source: Huang 2021, sections 3.1 and 4.2.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleet.contract import Outcome
+from fleet.window import STATES as ALL
+from fleet.window import Window
+from twin_worker.identification.linear.linear_model import AXES, Axis
+from twin_worker.identification.linear.linear_prior import INPUTS, STATES
+from twin_worker.identification.linear.prediction_error_method import refine
+from twin_worker.identification.linear.state_space import StateSpace
+from twin_worker.identification.linear.subspace import pbsid
+from twin_worker.identification.linear.subspace_open_loop import projection
+from twin_worker.paper_experiments.recorded_flights import Flown, mode_of
+from twin_worker.validation.held_out import Unseen
+from twin_worker.validation.verify import fit_percent, verify
+
+FIRST: dict[str, Callable[..., StateSpace]] = {"projection": projection, "pbsid": pbsid}
+NAMES = tuple(name for axis in AXES for name in STATES[axis])
+_LOOSE = 1e-3  # precision that only keeps the normal equations regular [-]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What one experiment is.
+
+    Attributes:
+        seen_s: stretch identified on [s]
+        unseen_s: stretch run free over [s]
+        every_s: between the starts of two experiments [s]
+        segment_s: free-run length of the refinement [s]
+    """
+
+    seen_s: float = 40.0
+    unseen_s: float = 8.0
+    every_s: float = 5.0
+    segment_s: float = 8.0
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One pair of models, and how it fared over what it had not seen.
+
+    Attributes:
+        uav, t: whose, and when the unseen stretch begins [s since 1970]
+        mode, mode_seen: of the unseen stretch, of the one before it
+        seconds: since the start of the unseen stretch, (n,) [s]
+        actual, first, refined: states in the order of `NAMES`, (n, 9) [m/s, rad/s, rad]
+        fit: both steps over the unseen stretch, (2, 9) [%]
+        fit_seen: both steps over that stretch before, the last they were identified on, (2, 9) [%]
+        outcome, sentence: verdict on the refined model
+    """
+
+    uav: int
+    t: float
+    mode: str
+    mode_seen: str
+    seconds: np.ndarray
+    actual: np.ndarray
+    first: np.ndarray
+    refined: np.ndarray
+    fit: np.ndarray
+    fit_seen: np.ndarray
+    outcome: Outcome
+    sentence: str
+
+
+def both_steps(axis: str, seen: Window, first: str, segment_s: float) -> tuple[Axis, Axis]:
+    """Identify one axis: the first step, and that refined by the prediction error of free runs, without a prior.
+
+    Args:
+        axis: `longitudinal` or `lateral`
+        seen: data
+        first: name of the first step, `projection` or `pbsid`
+        segment_s: free-run length of the refinement [s]
+    Raises:
+        ValueError: when the data are too short or too poor; the sentence says what is missing.
+    """
+    states, inputs = STATES[axis], INPUTS[axis]
+    y, u, ok = seen.columns(states), seen.columns(inputs), seen.ok
+    scale = [np.maximum(data[ok].std(axis=0), least) for data, least in ((y, 1e-3), (u, 1e-6))]
+    frame = Axis(states, inputs, np.empty((0, 0)), y[ok].mean(axis=0), scale[0], u[ok].mean(axis=0), scale[1], seen.dt)
+    y, u = frame.scaled(seen)
+    model = FIRST[first](y, u, len(states), ok=ok).outputs_as_states().stabilised()
+    start = np.hstack([model.A, model.B, np.zeros((len(states), 1))])
+    loose = np.full(start.shape, _LOOSE)
+    better = refine(
+        start, y, u, ok, prior=start, precision=loose, length=int(segment_s / seen.dt), discount=1.0, steps=20
+    )
+    return replace(frame, D=start), replace(frame, D=better)
+
+
+def experiment(flight: Flown, start: int, first: str, plan: Plan) -> Experiment:
+    """Identify before row `start` and run free from it.
+
+    Raises:
+        ValueError: when the data are too short or too poor; the sentence says what is missing.
+    """
+    window = flight.window(start, plan.seen_s, plan.unseen_s)
+    known, length = round(plan.seen_s / window.dt), round(plan.unseen_s / window.dt)
+    axes = [both_steps(axis, window.part(0, known), first, plan.segment_s) for axis in AXES]
+    steps = [(axes[0][k], axes[1][k]) for k in (0, 1)]
+    runs, seen = ([_runs(pair, window, at, length) for pair in steps] for at in (known, known - length))
+    actual, before = (window.columns(NAMES)[at : at + length] for at in (known, known - length))
+    verdict = verify(steps[1], window, known)
+    return Experiment(
+        uav=flight.uav,
+        t=float(window.t[known]),
+        mode=mode_of(window.part(known, known + length)),
+        mode_seen=mode_of(window.part(known - length, known)),
+        seconds=window.t[known : known + length] - window.t[known],
+        actual=actual,
+        first=runs[0],
+        refined=runs[1],
+        fit=np.array([fit_percent(actual, run) for run in runs]),
+        fit_seen=np.array([fit_percent(before, run) for run in seen]),
+        outcome=verdict.outcome,
+        sentence=verdict.sentence,
+    )
+
+
+def _runs(pair: tuple[Axis, Axis], window: Window, start: int, length: int) -> np.ndarray:
+    """Run both axes freely from the measured states of a row, (length, 9)."""
+    order = [ALL.index(name) for name in NAMES]
+    return Unseen(pair, window.part(start, start + length), 0).runs(length)[:, order]
+
+
+def experiments(flights: Iterable[Flown], first: str, plan: Plan) -> Iterator[Experiment | str]:
+    """Carry out every experiment the flights allow; a sentence where one could not be."""
+    for flight in flights:
+        for start in flight.starts(plan.seen_s, plan.unseen_s, plan.every_s):
+            try:
+                yield experiment(flight, start, first, plan)
+            except ValueError as error:
+                yield f"uav-{flight.uav}: {error}"

@@ -1,0 +1,1 @@
+"""Predictions with the autopilot in the loop, and the choice between methods."""

@@ -1,0 +1,374 @@
+"""Fly the twin ahead of the aircraft: synchronise the controller twin on telemetry, then simulate the route.
+
+Source: Huang 2021, section 3.4 (identical controller, same route, identified model in the loop).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numba as nb
+import numpy as np
+
+from fleet.autopilots import arduplane, laws
+from fleet.autopilots.shadow import shadow
+from fleet.contract import Item
+from fleet.frames import Origin, wrap
+from fleet.mission import FIRST, KIND, LAND, P_D, P_N, READ, SPEED, TAKEOFF, Route, route
+from fleet.physics.simulate import N_STATE, simulate
+from fleet.process.sanitise import below
+from fleet.window import Window
+from twin_worker.estimation.airspeed_setpoint import aimed_at, as_told, held_to
+from twin_worker.estimation.wind_filter import WindFilter
+from twin_worker.identification.fixed_wing.plant import Plant, acting, settled
+from twin_worker.numerics.interpolation import straight
+from twin_worker.prediction.autopilot_parameters import CRUISE_OF, Control, on_wings
+from twin_worker.prediction.route_override import Instead, gone_over
+from twin_worker.telemetry.history import History
+
+LEAST_AHEAD_S = 60.0  # a flight ahead that ends before is none [s]
+SHADOW_S = 60.0  # telemetry the controller twin is synchronised on [s]
+_WIND_S = 10.0  # the autopilot's own wind is believed for as long [s]
+_SHADOW_STEP = 2  # window rows per shadow step
+_ROUTES = 1024  # routes that are kept unrolled: missions stay, and each costs as much as a flight
+_REFUSED = {TAKEOFF: "take-off", LAND: "landing"}
+
+
+@dataclass(frozen=True)
+class Flown:
+    """One simulated flight ahead, or why there is none.
+
+    Attributes:
+        path: position at each wanted look-ahead time, NED, (k, 3) [m]; None where the twin cannot fly this
+        seq: mission item it starts on
+        sentence: what limits it, or empty
+        diverged: the twin left its flight envelope
+        law: the controller twin it was flown by
+    """
+
+    path: np.ndarray | None
+    seq: int
+    sentence: str
+    diverged: bool = False
+    law: Control | None = None
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where flights ahead start, whatever model flies them.
+
+    Attributes:
+        good: what was flown on the present route
+        control: synchronised state, parameters and legs of the controller twin
+        state: state, commands and inputs in force, and air, as `fleet.physics.simulate` takes them
+        seq: mission item in force
+        sentence: what limits the flights, or empty
+        law: the controller twin
+    """
+
+    good: Window
+    control: tuple[np.ndarray, np.ndarray, np.ndarray]
+    state: tuple[np.ndarray, np.ndarray, np.ndarray]
+    seq: int
+    sentence: str
+    law: Control
+
+
+@dataclass(frozen=True)
+class Onboard:
+    """What is known of the autopilot: its route and its parameters."""
+
+    items: tuple[Item, ...]
+    params: Mapping[str, float]  # received
+    since: float  # when route, mode and parameters last changed [s since 1970]
+    identified: Mapping[str, float] = field(default_factory=dict)  # learnt from flight; counts where none was received
+    instead: Instead | None = None  # what a what-if flies from the start on
+    autopilot: str = "ardupilot"  # what it calls itself
+    law: str = "arduplane"  # name in `laws.LAWS`; empty: none is believed
+    why: str = ""  # how the law was chosen, or why there is none
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What was flown on the present route, as a law is replayed on it.
+
+    Attributes:
+        good: telemetry, unbroken
+        legs, start: route from the item in force at its beginning, and the point before
+        rows: t p v euler rates Va phi_c theta_c delta, as `shadow` takes them
+        seq: mission item in force at each
+        altitude_m: above mean sea level, at the end [m]
+        sentence: what is wrong with the route, or empty
+    """
+
+    good: Window
+    legs: np.ndarray
+    start: np.ndarray
+    rows: tuple[np.ndarray, ...]
+    seq: np.ndarray
+    altitude_m: float
+    sentence: str
+
+    @property
+    def t(self) -> np.ndarray:
+        """Give times from the first, (n,) [s]."""
+        return self.rows[0]
+
+    @property
+    def p(self) -> np.ndarray:
+        """Give positions, NED, (n, 3) [m]."""
+        return self.rows[1]
+
+    @property
+    def Va(self) -> np.ndarray:
+        """Give reported airspeeds, (n,) [m/s]."""
+        return self.rows[5]
+
+    @property
+    def phi_c(self) -> np.ndarray:
+        """Give the banks asked for, (n,) [rad]."""
+        return self.rows[6]
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Everything a prediction starts from.
+
+    Attributes:
+        window: newest telemetry on the grid, at least `SHADOW_S` where there is as much
+        history: telemetry as it came
+        onboard: route and parameters in force
+        wind: wind filter, up to date
+        origin: origin of the twin's NED frame
+    """
+
+    window: Window
+    history: History
+    onboard: Onboard
+    wind: WindFilter
+    origin: Origin
+
+
+def held(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float) -> np.ndarray:
+    """Hold each row until the next, nan before the first and after `longest` seconds, (len(at), k)."""
+    if not len(t):
+        return np.full((len(at), x.shape[1]), np.nan)
+    out = np.empty((len(at), x.shape[1]))
+    _hold(t, x, np.ascontiguousarray(at), longest, out)
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _hold(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float, out: np.ndarray) -> None:
+    """Fill in the last row before each of some rising times, nan where it is none or old, (k, m)."""
+    k = -1
+    for i in range(len(at)):
+        while k + 1 < len(t) and t[k + 1] <= at[i]:
+            k += 1
+        known = k >= 0 and not at[i] - t[k] > longest
+        for j in range(x.shape[1]):
+            out[i, j] = x[k, j] if known else np.nan
+
+
+def _reported(history: History, name: str, at: np.ndarray, longest: float) -> np.ndarray:
+    """Give what was reported last at each time, nan after `longest` seconds, (len(at), k)."""
+    return held(*history.look(name, at[0] - longest - 1.0), at, longest)
+
+
+def fly_ahead(now: Situation, plant: Plant, ahead: np.ndarray) -> Flown:
+    """Predict with the identified model and the controller twin in closed loop.
+
+    Args:
+        now: where the prediction starts, the end of its window
+        plant: coupled model, or longitudinal and lateral one
+        ahead: wanted look-ahead times from there, rising, (k,) [s]
+    """
+    start = set_out(now)
+    return start if isinstance(start, Flown) else fly_from(start, plant, ahead)
+
+
+def heard(now: Situation) -> Heard | Flown:
+    """Lay what was flown on the present route for a replay, or say why it cannot be."""
+    good = _on_this_route(now.window, now.onboard.since)
+    if len(good) < 5.0 / good.dt:
+        return Flown(None, -1, f"{below(good.seconds, 5.0)} s on this route, 5 s are needed; wait")
+    every = slice((len(good) - 1) % _SHADOW_STEP, None, _SHADOW_STEP)
+    at = good.t[every]
+    seq = _reported(now.history, "leg", at, 15.0)[:, 0]
+    if not np.isfinite(seq[-1]):
+        return Flown(None, -1, "the mission item in force is not reported (MISSION_CURRENT)")
+    seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
+    board = now.onboard
+    first = FIRST.get(board.autopilot, 1)
+    way = unrolled(board.items, int(seq[0]), now.origin, board.params, first)
+    said = way.said
+    if not len(way.legs):
+        return Flown(None, int(seq[-1]), said or "the mission has no legs to fly")
+    start = way.start if np.isfinite(way.start).all() else good.p[0]
+    altitude = now.origin.alt_mm * 1e-3 - float(good.p[-1, 2])
+    return Heard(good, way.legs, start, _telemetry(good, every, now.history), seq, altitude, said)
+
+
+def unrolled(items: tuple[Item, ...], seq: int, origin: Origin, params: Mapping[str, float], first: int) -> Route:
+    """Give the legs from item `seq` on, that nobody changes; as `route`."""
+    return _unrolled(items, seq, origin, tuple((name, params[name]) for name in READ if name in params), first)
+
+
+@lru_cache(maxsize=_ROUTES)
+def _unrolled(
+    items: tuple[Item, ...], seq: int, origin: Origin, params: tuple[tuple[str, float], ...], first: int
+) -> Route:
+    return route(items, seq=seq, origin=origin, params=dict(params), first=first)
+
+
+def known_wind(now: Situation, good: Window) -> tuple[float, float]:
+    """Give the wind the autopilot believes in: its own where it tells it, else the twin's, NED [m/s]."""
+    reported = _reported(now.history, "wind", good.t[-1:], _WIND_S)[0]
+    w_n, w_e = reported if np.isfinite(reported).all() else now.wind.wind[:2]
+    return float(w_n), float(w_e)
+
+
+def set_out(now: Situation) -> Start | Flown:
+    """Synchronise the controller twin on what was flown; give where any model starts, or why none can."""
+    seen, board = heard(now), now.onboard
+    if isinstance(seen, Flown):
+        return seen
+    seq = int(seen.seq[-1])
+    if not board.law:
+        return Flown(None, seq, board.why or "the control law is not known yet")
+    law = on_wings(board.params, board.identified, law=board.law)
+    par = laws.blown(law.par(seen.altitude_m), *known_wind(now, seen.good))
+    told = _aimed(now, float(seen.good.t[-1]), float(law.values[CRUISE_OF[board.law]]))
+    legs = as_told(seen.legs, float(seq), float(law.values[CRUISE_OF[board.law]]), told)
+    ctl, _ = shadow(par, legs, seen.start, *seen.rows, seen.seq)  # type: ignore[call-arg]
+    said = " ".join(filter(None, (board.why, seen.sentence)))
+    begun = Start(seen.good, (ctl, par, legs), _start(now, seen.good), seq, said, law)
+    if board.instead is not None:
+        begun = _otherwise(now, begun, board.instead, told)
+    return _refused(begun) or replace(begun, sentence=" ".join(filter(None, (begun.sentence, _assumed(begun.law)))))
+
+
+def _aimed(now: Situation, t: float, cruise: float) -> float:
+    """Give the airspeed aimed at: as told, else the one of the mission's that is held; nan unknown [m/s]."""
+    told = aimed_at(now.history, t)
+    if np.isfinite(told):
+        return told
+    named = {item.param2 for item in now.onboard.items if item.command == SPEED and 0 < item.param2 < np.inf}
+    return held_to(now.history, t, np.array(sorted(named | {cruise}))) if named else told
+
+
+def _altitude(now: Situation, good: Window) -> float:
+    return now.origin.alt_mm * 1e-3 - float(good.p[-1, 2])
+
+
+def _otherwise(now: Situation, begun: Start, instead: Instead, told: float) -> Start:
+    """Let the synchronised controller go over to what a what-if flies; `told`: airspeed aimed at so far [m/s]."""
+    name = now.onboard.law
+    law, cruise = on_wings(now.onboard.params, now.onboard.identified, instead.asked, name), CRUISE_OF[name]
+    way = instead.way(now.origin, now.onboard.params)
+    par = laws.blown(law.par(_altitude(now, begun.good)), *known_wind(now, begun.good))
+    legs, (ctl, _, before) = way.legs, begun.control
+    if len(legs):
+        aimed = np.nan if cruise in instead.asked else told
+        legs = as_told(legs, float(instead.seq), float(law.values[cruise]), aimed)
+        ctl = gone_over(ctl, before, par, legs, (instead.anew, begun.good.p[-1]))
+    state = begun.state[0].copy()
+    state[3:6] = instead.at_speed(state[3:6])
+    said = way.said
+    begun = replace(begun, state=(state, *begun.state[1:]), control=(ctl, par, legs))
+    return replace(begun, seq=instead.seq, sentence=said, law=law)
+
+
+def _refused(begun: Start) -> Flown | None:
+    """Say why this is not flown; None where it is."""
+    ctl, _, legs = begun.control
+    if not len(legs):
+        return Flown(None, begun.seq, begun.sentence or "the mission has no legs to fly")
+    kind = int(legs[int(ctl[arduplane.LEG]), KIND])
+    if kind not in _REFUSED:
+        return None
+    return Flown(None, begun.seq, f"{_REFUSED[kind]} is not modelled: no route-aware prediction")
+
+
+def _assumed(law: Control) -> str:
+    """Say which parameters are the autopilot's defaults because nothing better is known; empty where none is."""
+    absent = law.absent
+    few = f"({', '.join(absent[:3])} …)"
+    return f"{len(absent)} autopilot parameters not received, defaults assumed {few}" if absent else ""
+
+
+def fly_from(start: Start, plant: Plant, ahead: np.ndarray) -> Flown:
+    """Fly one model from there; arguments as for `fly_ahead`. Beyond its envelope, if that is far, the path is nan."""
+    ctl, par, legs = start.control
+    dt = start.good.dt
+    out = np.empty((int(ahead[-1] / dt) + 2, N_STATE))
+    ctl = ctl.copy()
+    done = simulate(ctl, par, legs, settled(plant, start.good), *start.state, dt, out)
+    return at_times(out[:done, :3], dt, start, ctl, ahead)
+
+
+def at_times(p: np.ndarray, step: float, start: Start, ctl: np.ndarray, ahead: np.ndarray) -> Flown:
+    """Give a flight at the look-aheads wanted: nan beyond its end, held in place beyond its touch-down.
+
+    Args:
+        p: positions every `step` [s] until the twin left its envelope, NED, (n, 3) [m], changed
+        start: where it started
+        ctl: the controller at its end
+        ahead: wanted look-ahead times, rising, (k,) [s]
+    """
+    landed = _stay_down(p, ctl, start.control[2])
+    if not landed and len(p) <= min(ahead[-1], ahead[0] + LEAST_AHEAD_S) / step:
+        return Flown(None, start.seq, f"the twin leaves its envelope {len(p) * step:.0f} s ahead", True)
+    t, beyond = step * np.arange(len(p)), None if landed else np.nan
+    path = straight(ahead, t, p, beyond)
+    return Flown(path, start.seq, start.sentence, law=start.law)
+
+
+def _stay_down(p: np.ndarray, ctl: np.ndarray, legs: np.ndarray) -> bool:
+    """Hold a flight, NED (n, 3) [m], where its route ends on the ground; tell whether it came so far."""
+    at = int(ctl[arduplane.LEG])
+    if not len(p) or int(legs[at, KIND]) != LAND:
+        return False
+    begin = ctl[arduplane.FROM][:2]
+    line = legs[at, P_N:P_D] - begin
+    short = np.flatnonzero((p[:, :2] - begin) @ line < line @ line)
+    down = int(short[-1]) + 1 if len(short) else 0
+    p[down:] = p[min(down, len(p) - 1)]
+    return down < len(p)
+
+
+def _on_this_route(window: Window, since: float) -> Window:
+    """Cut what was flown on the present route, unbroken, at most `SHADOW_S`."""
+    start = max(int(np.searchsorted(window.t, since)), len(window) - int(SHADOW_S / window.dt))
+    bad = np.flatnonzero(~window.ok)
+    start = max(start, int(bad[-1]) + 1 if len(bad) else 0)
+    return window.part(min(start, len(window) - 2), len(window))
+
+
+def _telemetry(good: Window, every: slice, history: History) -> tuple[np.ndarray, ...]:
+    """Give what the controller twin is synchronised on at some rows: t p v euler rates Va phi_c theta_c delta."""
+    at = good.t[every]
+    command, Va = _reported(history, "command", at, 1.0), _reported(history, "air", at, 1.0)[:, 0]
+    euler, rates = good.x[every, 6:9].copy(), good.x[every, 3:6]
+    euler[:, 2] = wrap(euler[:, 2])
+    rows = (at - at[0], good.p[every], good.v[every], euler, rates, Va, command[:, 0], command[:, 1], good.u[every])
+    return tuple(np.ascontiguousarray(row) for row in rows)
+
+
+def _start(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Give state (12,), commands and inputs in force (6,) and air (4,) at the end of the window."""
+    state = np.concatenate([good.p[-1], good.x[-3:, :6].mean(axis=0), good.x[-1, 6:]])
+    command = _reported(now.history, "command", good.t[-1:], 1.0)[0, :2]
+    command = np.where(np.isfinite(command), command, good.x[-1, 6:8])
+    command = np.concatenate([command, acting(good)])
+    return state, command, np.array([*now.wind.wind[:2], now.wind.scale, _gust(now, good)])
+
+
+def _gust(now: Situation, good: Window) -> float:
+    """Give the airspeed beyond what the mean wind explains [m/s]; 0 without an airspeed sensor."""
+    t, air = now.history.look("air", good.t[-1] - 1.0)
+    recent = air[t <= good.t[-1], 0]
+    if not len(recent) or recent.min() < 3.0:
+        return 0.0
+    n = int(1.0 / good.dt)
+    return float(recent.mean() * now.wind.scale - np.linalg.norm(good.x[-n:, :3], axis=1).mean())

@@ -1,0 +1,1 @@
+"""Prediction of fixed-wing aircraft with the point-mass model, and its ensemble."""

@@ -1,0 +1,1 @@
+"""Prediction of multirotors along their route."""

@@ -1,0 +1,1 @@
+"""The worker process: threads, queries, metrics, warm-up."""

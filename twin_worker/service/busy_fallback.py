@@ -1,0 +1,72 @@
+"""What is published of an aircraft whose twin is late or locked: its last path, from the position received last."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from fleet.contract import Message, Prediction
+from twin_worker.ownership.twin_store import Held
+from twin_worker.twin.state.schedule import SOON
+from twin_worker.twin.steps.extrapolate import OVERDUE_S, renewed
+
+LOOK_S = 0.4  # between looks for aircraft without a prediction [s]
+OLD_S = 1.0  # since an aircraft's last prediction was published, from which on another is due: least [s]
+_LATE = 1.2  # the same in the wanted periods of predictions [-]
+_LACKING = 2.0  # that in these from which on no renewal will come, either [-]
+_BACK_S = 1.0  # telemetry that lies so far before what was published: the clock was set back [s]
+_FARTHEST = 2e9  # positions beyond are noise [1e-7 deg, mm]
+
+
+def stand_in(held: Held) -> Prediction | None:
+    """Renew a prediction for a twin that is locked, which may be for seconds on a busy machine; it stays as it is."""
+    twin, rows = held.twin, held.placed
+    if rows is None or not held.ready:
+        return None
+    try:
+        t, x = rows.t.numpy(), rows.x.numpy().astype(float)
+    except ValueError:
+        return None
+    if not len(t) or x.shape != (len(t), 3) or not (np.abs(x[-1]) < _FARTHEST).all():
+        return None
+    said = max(held.stood, twin.prediction.t if twin.prediction else -np.inf)
+    if not t[-1] >= said + SOON * min(twin.pace.renew, twin.pace.predict):
+        return None
+    made = renewed(twin, float(t[-1]), x[-1])
+    if made is not None:
+        held.stood = made.t
+    return made
+
+
+def stand_in_for(holding: list[Held], publish: Callable[[Message, Held], None]) -> None:
+    """Renew the predictions of all whose twins were not reached in time: for want of CPU time, or locked."""
+    for held in holding:
+        late = time.monotonic() - held.published > _due_s(held)
+        if late and (made := stand_in(held)) is not None:
+            publish(made, held)
+
+
+def lacks_prediction(held: Held, now: float) -> bool:
+    """Tell whether an aircraft has been without a prediction, even a renewed one, up to `now`, monotonic [s]."""
+    return now - held.published > _LACKING * _due_s(held)
+
+
+def _due_s(held: Held) -> float:
+    pace = held.twin.pace
+    return max(OLD_S, _LATE * min(pace.predict, pace.renew))
+
+
+def said_already(result: Message, held: Held) -> bool:
+    """Tell whether a prediction, come late, is older than what was said meanwhile."""
+    if not isinstance(result, Prediction) or not held.stood - OVERDUE_S < result.t <= held.stood:
+        return False
+    return held.placed is None or _newest(held) > held.stood - _BACK_S
+
+
+def _newest(held: Held) -> float:
+    """Give the time of the newest position received [s since 1970]."""
+    try:
+        t = held.placed.t.numpy() if held.placed is not None else np.empty(0)
+    except ValueError:
+        return np.inf
+    return float(t[-1]) if len(t) else np.inf

@@ -1,0 +1,153 @@
+"""Compile the twin's physics before the first aircraft needs it, on a made-up straight flight."""
+
+import numpy as np
+
+from fleet.airframes import GENERIC, load
+from fleet.airframes.airframe import servo_map
+from fleet.autopilots import arduplane, copter, greybox
+from fleet.autopilots.shadow import shadow
+from fleet.bus.codec import encode
+from fleet.contract import Array, History, Item, Prediction, Rows, Sample, State
+from fleet.frames import Origin, to_geodetic, wrap
+from fleet.mission import route
+from fleet.physics import point_mass
+from fleet.physics.simulate import N_STATE, coupled_plant, linear_plant, simulate
+from fleet.window import Window
+from twin_worker.alerts.traffic import Traffic
+from twin_worker.confidence.adaptive_conformal import Levels
+from twin_worker.confidence.prediction_log import Ledger
+from twin_worker.estimation.wind_filter import WindFilter
+from twin_worker.identification.fixed_wing import attitude_lag
+from twin_worker.identification.fixed_wing.derivatives_model import identify
+from twin_worker.identification.fixed_wing.linearise import linearise
+from twin_worker.identification.fixed_wing.plant import settled
+from twin_worker.identification.linear.linear_model import AXES, identify_axis
+from twin_worker.numerics.prediction_errors import AHEAD
+from twin_worker.ownership.history_decoder import read
+from twin_worker.prediction.closed_loop import held
+from twin_worker.telemetry.history import History as Telemetry
+from twin_worker.telemetry.resample import Grid
+from twin_worker.twin.state.flight_phase import moves
+from twin_worker.twin.steps.extrapolate import shifted, widened
+from twin_worker.validation.held_out import Unseen
+from twin_worker.validation.verify import verify
+
+_SPEED = 22.0  # [m/s]
+_HOME = Origin(470_000_000, 80_000_000, 100_000)
+_ITEMS = tuple(
+    Item(seq=k, command=16, lat_e7=470_000_000 + 90_000 * k, lon_e7=80_000_000, alt_m=100.0) for k in range(3)
+)
+
+
+def warm_up() -> None:
+    """Run every compiled function of the worker once; from the disk cache this takes about a second."""
+    window = _flight()
+    axes = [identify_axis(axis, window, 2.0)[1] for axis in AXES]
+    par, _ = arduplane.parameters({})
+    legs = route(_ITEMS, seq=1, origin=_HOME, params={}).legs
+    n = len(window)
+    euler, rates = np.ascontiguousarray(window.x[:, 6:]), np.ascontiguousarray(window.x[:, 3:6])
+    heard = [np.full(n, _SPEED), np.zeros(n), np.zeros(n), window.u, np.ones(n, np.int64)]
+    rows = [window.t - window.t[0], window.p, window.v, euler, rates, *heard]
+    ctl, _ = shadow(par, legs, window.p[0], *rows)  # type: ignore
+    state = np.concatenate([window.p[-1], window.x[-1]])
+    paper = linear_plant(*(part for axis in axes for part in (axis.physical(), axis.means)))
+    coupled = coupled_plant(identify(window, np.zeros(2), load(GENERIC)).par, np.array([_SPEED, 0.0]))
+    air = np.array([0.0, 0.0, 1.0, 0.0])
+    grey_ctl = ctl.copy()
+    for plant in (paper, coupled):
+        simulate(ctl.copy(), par, legs, plant, state, np.zeros(6), air, window.dt, np.empty((50, N_STATE)))
+
+    _in_the_large((ctl.copy(), par, legs), window)
+    ahead, grey = np.empty((5, 3)), np.ones(greybox.N_PAR)
+    greybox.follow(grey_ctl, par, legs, grey, np.array([*window.p[-1], _SPEED, 0.0, 0.0, 0.0]), np.zeros(2), 0.1, ahead)  # type: ignore
+    segments, told = np.ones((2, copter.N_SEGMENT)), np.ones(copter.N_PAR)
+    _meet()
+    _go_on()
+    _recall()
+    _remember(window)
+    _learn()
+    copter.follow(np.zeros(copter.N_FOLLOW), segments, np.zeros(3), np.zeros(3), told, 0.1, ahead)  # type: ignore
+
+
+def _in_the_large(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: Window) -> None:
+    """Fly the hybrid, alone and in a bundle of two."""
+    body, air, start = np.ones(point_mass.N_BODY), np.ones(point_mass.N_AIR), np.zeros(point_mass.N_START)
+    body[point_mass.V_0] = start[point_mass.V] = _SPEED
+    start[:3], chance = window.p[-1], np.zeros((2, 5, 4))
+    point_mass.fly(control[0].copy(), *control[1:], body, air, start, chance[0], point_mass.STEP, np.empty((5, 3)))
+    twice = [np.tile(row, (2, 1)) for row in (body, air, start)]
+    point_mass.bundle(control, *twice, chance, np.arange(0, 17, 4), np.empty((2, 5, 3)))  # type: ignore
+    attitude_lag.identify(window.x[:, 6], window.x[:, 6])
+
+
+def _meet() -> None:
+    """Let two aircraft fly at each other."""
+    traffic, ahead = Traffic(), np.arange(0.0, 20.0)
+    for uav, way in ((0, 1.0), (1, -1.0)):
+        path = np.column_stack([way * _SPEED * (ahead - 10.0), 0.0 * ahead, -100.0 + 0.0 * ahead])
+        made = Prediction(
+            uav=uav,
+            t=1e9,
+            state=State.PREDICTING,
+            method="",
+            origin=(_HOME.lat_e7, _HOME.lon_e7, _HOME.alt_mm),
+            ahead=Array.of(ahead),
+            path=Array.of(path),
+            tube=Array.of(np.ones((20, 3))),
+        )
+        traffic.hear(made)
+    traffic.judge(0, 1e9)
+
+
+def _go_on() -> None:
+    """Renew a prediction, feed the wind filter, and see whether it flies."""
+    ahead, path = (Array.of(values).numpy() for values in (np.arange(5.0), np.zeros((5, 3))))
+    shifted(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
+    widened(ahead, path, 1.0, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
+    moves(np.zeros((3, 3)))  # type: ignore[call-arg]
+    WindFilter().update(1e9, np.array([_SPEED, 0.0, 0.0]), _SPEED, 0.0)
+
+
+def _recall() -> None:
+    """Read what a gateway tells of the past."""
+    rows = Rows(t=Array.of([1e9], "<f8"), x=Array.of(np.zeros((1, 3))))
+    read(encode(History(uav=0, t=1e9, samples=(Sample(uav=0, t=1e9, velocity=rows),))))
+
+
+def _remember(window: Window) -> None:
+    """Lay telemetry on the grid, hold what was reported, and answer a prediction."""
+    place = to_geodetic(_HOME, window.p).astype(float)
+    history = Telemetry()
+    for name, rows in (("attitude", window.x[:, 3:]), ("velocity", window.v), ("position", place)):
+        history.put(name, window.t, rows)
+    history.put("servo", window.t, np.full((len(window), 8), 1500.0))
+    Grid().window(history, _HOME, servo_map({}), np.zeros(3), until=float(window.t[-1]), seconds=10.0)
+    held(window.t, window.v, window.t, 1.0)
+    book = Ledger()
+    book.add(0.0, "", "", np.outer(AHEAD, [_SPEED, 0.0, 0.0]), _SPEED)
+    Levels().learn(book, *book.answer(window.t, window.p), book.live)
+
+
+def _learn() -> None:
+    """Identify, verify, and tell what a model is worth: whoever first does holds the lock of an aircraft meanwhile."""
+    window = _flight(60.0)
+    plant, known = identify(window, np.zeros(2), load(GENERIC)), len(window) // 2
+    verify(plant, window, known, 0.0, None)
+    settled(plant, window)
+    Unseen(plant, window, known).lesson(20.0, 5.0)
+    linearise(plant, window)
+    wrap(np.zeros((2, 3))[:, 2])
+
+
+def _flight(seconds: float = 20.0, dt: float = 0.04) -> Window:
+    """Make up a flight due north with a little of everything in every channel."""
+    n = int(seconds / dt)
+    rng = np.random.default_rng(0)
+    t = dt * np.arange(n)
+    x = 0.05 * rng.standard_normal((n, 9))
+    x[:, 0] += _SPEED
+    u = 0.05 * rng.standard_normal((n, 4))
+    u[:, 3] += 0.5
+    v = np.tile([_SPEED, 0.0, 0.0], (n, 1))
+    return Window(t, x, u, v * t[:, None], v, np.ones(n, bool), np.zeros(n, bool))

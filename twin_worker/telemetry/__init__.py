@@ -1,0 +1,1 @@
+"""Telemetry of one aircraft: buffered, resampled, checked for what is missing."""

@@ -1,0 +1,113 @@
+"""The last minutes of one aircraft's telemetry, as it came."""
+
+from struct import Struct
+
+import numpy as np
+
+from fleet.contract import COLUMNS, DTYPES, UNTOLD, Array, Rows, Sample
+from twin_worker.telemetry.row_buffer import Kept
+
+_AHEAD_S = 1.0  # rows newer than their message by more are refused [s]
+_MOST = 1e5  # values beyond are noise [m/s, rad, us, ...]
+_MOST_OF = {"position": 2e9, "target": 2e9, "gnss": 2e9, "pressure": 1e6}  # the same [1e-7 deg, mm, Pa]
+_WIDTHS = tuple((name, len(columns)) for name, columns in COLUMNS.items())
+_SIZES = {name: np.dtype(name).itemsize for name in DTYPES}
+_TIMES = tuple(Struct(f"<{n}d").unpack for n in range(17))  # of so many rows: few numbers need no array
+
+
+class History:
+    """Rows of every kind over the last `keep_s` seconds; out-of-order and repeated rows are sorted out on reading."""
+
+    def __init__(self, keep_s: float = 160.0) -> None:
+        self.keep_s = keep_s
+        self.newest = -np.inf
+        self._kept: dict[str, Kept] = {}
+
+    def add(self, sample: Sample) -> int:
+        """Take one message; give how many of its kinds did not fit the contract."""
+        bad, latest = 0, sample.t + _AHEAD_S
+        for name, width in _WIDTHS:
+            rows: Rows | None = getattr(sample, name)
+            if rows is None:
+                continue
+            newest = _newest(rows.t, rows.x, width, latest)
+            if newest:
+                self._of(name, newest).hear(rows.t.data, rows.x.data, rows.x.dtype, self.newest - self.keep_s)
+            else:
+                bad += self._doubt(name, rows, latest)
+        return bad
+
+    def _doubt(self, name: str, rows: Rows, latest: float) -> bool:
+        """Take of many rows, or of odd ones, those that fit; tell whether some do not."""
+        try:
+            t, x = rows.t.numpy(), rows.x.numpy()
+        except ValueError:
+            return True
+        if x.ndim != 2 or t.shape != x.shape[:1] or x.shape[1] != len(COLUMNS[name]) or not len(t):
+            return True
+        timed = (t <= latest) & (t > 0)  # false for nan; a message that dates its rows later contradicts itself
+        if timed.any():
+            t, x = t[timed], x[timed]
+            self._of(name, float(t.max())).add(t, x, self.newest - self.keep_s)
+        return not timed.all()
+
+    def _of(self, name: str, newest: float) -> Kept:
+        """Give what is kept of a kind of which rows up to `newest` came."""
+        if newest > self.newest:
+            self.newest = newest
+        kept = self._kept.get(name)
+        if kept is None:
+            kept = self._kept[name] = Kept(np.empty(0), np.empty((0, len(COLUMNS[name]))))
+        return kept
+
+    def rows(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
+        """Give times (n,) and values (n, k) of one kind from `since` on, rising in time, believable, once each."""
+        t, x = self.look(name, since)
+        return t.copy(), x.copy()
+
+    def look(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
+        """Give the same where it lies: only to read, and not beyond the next message."""
+        kept = self._kept.get(name)
+        if kept is None:
+            return np.empty(0), np.empty((0, len(COLUMNS[name])))
+        kept.lay(self.newest - self.keep_s)
+        if kept.settled < kept.n:
+            kept.settle(_MOST_OF.get(name, _MOST), UNTOLD.get(name))
+        t = kept.t[: kept.n]
+        first = 0 if since == -np.inf else int(t.searchsorted(since))
+        return t[first:], kept.x[first : kept.n]
+
+    def put(self, name: str, t: np.ndarray, x: np.ndarray) -> None:
+        """Have these rows, (n,) and (n, k), instead of all of their kind."""
+        self._kept[name] = Kept(np.array(t, float), np.array(x, float))
+
+    def advance(self, before: float, by: float) -> None:
+        """Date rows from before a time later by `by` [s since 1970, s]: their clock was found to be so far behind."""
+        for kept in self._kept.values():
+            kept.advance(before, by)
+        self.newest = max((float(kept.t[: kept.n].max()) for kept in self._kept.values() if kept.n), default=-np.inf)
+
+    def sound(self) -> bool:
+        """Tell whether every kind has its columns: compiled code does not look."""
+        widths = dict(_WIDTHS)
+        kinds = self._kept.items() if isinstance(self._kept, dict) else [("", None)]
+        return all(isinstance(kept, Kept) and kept.x.shape[1] == widths.get(name) for name, kept in kinds)
+
+    def clear(self) -> None:
+        """Forget everything, as after a jump of the clock."""
+        self._kept.clear()
+        self.newest = -np.inf
+
+
+def _newest(t: Array, x: Array, width: int, latest: float) -> float:
+    """Give the newest time of rows as they mostly are: few, sound, none later than `latest`; 0 where they are not."""
+    n = len(t.data) >> 3
+    if not 0 < n < len(_TIMES) or t.dtype != "<f8" or t.shape != (n,) or x.shape != (n, width):
+        return 0.0
+    if len(t.data) != 8 * n or len(x.data) != n * width * _SIZES.get(x.dtype, 0):
+        return 0.0
+    times: tuple[float, ...] = _TIMES[n](t.data)
+    for at in times:
+        if not 0 < at <= latest:  # true for nan
+            return 0.0
+    return max(times)

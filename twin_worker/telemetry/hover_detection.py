@@ -1,0 +1,47 @@
+"""When a quadplane hangs on its rotors: the lift motors turn, or its mode says so, or it is too slow for wings."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from twin_worker.telemetry.history import History
+
+SETTLE_S = 3.0  # after a transition its air flow is not yet that of a wing [s]
+_MOTORS = (*range(33, 41), *range(82, 86))  # SERVOn_FUNCTION of motors 1 to 12
+_SPINS = 0.08  # of the throw, above which a lift motor turns [-]
+_SERVOS = 8
+
+
+def lift_channels(params: Mapping[str, float]) -> list[tuple[int, float]]:
+    """Give the servo outputs of the lift motors: (column, pulse above which it turns [us])."""
+    found = []
+    for n in range(1, _SERVOS + 1):
+        if params.get(f"SERVO{n}_FUNCTION") in _MOTORS:
+            low, high = params.get("Q_M_PWM_MIN", 0.0), params.get("Q_M_PWM_MAX", 0.0)
+            low, high = (low, high) if 500 < low < high else (1000.0, 2000.0)
+            found.append((n - 1, low + _SPINS * (high - low)))
+    return found
+
+
+def lifted(
+    t: np.ndarray, history: History, params: Mapping[str, float], modes: Sequence[tuple[float, str]]
+) -> np.ndarray:
+    """Tell when it hung on its rotors, (n,) bool.
+
+    Args:
+        t: wanted times, rising, (n,) [s since 1970]
+        history: telemetry as it came
+        params: autopilot parameters, for the outputs of the lift motors
+        modes: changes of mode, (when, name), in order
+    """
+    out = np.zeros(len(t), bool)
+    ends = [since for since, _ in list(modes)[1:]] + [np.inf]
+    for (since, mode), until in zip(modes, ends, strict=False):
+        if mode.startswith("Q"):
+            out |= (t >= since) & (t < until)
+    channels = lift_channels(params)
+    t_s, pulses = history.look("servo", t[0] - 5.0)
+    if channels and len(t_s):
+        turning = np.any([pulses[:, column] > above for column, above in channels], axis=0)
+        out |= turning[np.clip(np.searchsorted(t_s, t, side="right") - 1, 0, None)]
+    return out

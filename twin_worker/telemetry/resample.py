@@ -1,0 +1,243 @@
+"""Samples to `Window`: one time grid, lost samples filled by Lagrange interpolation, long gaps marked.
+
+Source: Huang 2021, section 3.2 (time-stamp calibration, eq. 18; Lagrange interpolation, eq. 19).
+"""
+
+from math import ceil, cos, floor, sin
+
+import numba as nb
+import numpy as np
+
+from fleet.airframes.airframe import ServoMap
+from fleet.frames import Origin, to_ned
+from fleet.window import INPUTS, STATES, Window
+from twin_worker.telemetry.history import History
+
+DT = 0.04  # grid of every window [s]
+LONGEST_GAP = {"attitude": 0.5, "velocity": 1.0, "servo": 0.5, "position": 1.0}  # wider gaps are never filled [s]
+_SETTLED_S = 1.5  # rows older than the newest grid time by more come no longer [s]
+_BEFORE_S = 4.0  # rows before a piece that its interpolation looks at [s]
+_LEAST_ROWS = 4, 8  # of every kind, to go on and to begin
+_FEWEST = 50  # grid times of a window
+_BENT = 8.0  # usual gaps that the four points of a cubic may span [-]
+_LOST = 1.6  # usual gaps from which a gap means lost samples [-]
+_LAID, _TURN, _WIDTH = 12, 16, 22  # where inputs begin in what is kept, cosines and sines of the angles, and its end
+_SPARE_S = 20.0  # place for so much more is made at once [s]
+
+
+def lagrange(t: np.ndarray, y: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Interpolate by the cubic Lagrange polynomial through the four samples around each grid time.
+
+    Args:
+        t: sample times, rising, (m,) [s]
+        y: samples, (m, k)
+        grid: wanted times within the samples, rising, (n,) [s]
+    Returns:
+        values on the grid, (n, k)
+    """
+    return _laid(t, y, grid, (0.0, np.inf, np.inf))[0]
+
+
+def fill(
+    t: np.ndarray, y: np.ndarray, grid: np.ndarray, longest: float, bent: float = _BENT
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lay samples on the grid: cubic where they are dense, linear across a short gap, not at all across a long one.
+
+    Args:
+        t, y, grid: as for `lagrange`
+        longest: wider gaps are not filled [s]
+        bent: usual gaps that the four points of a cubic may span; next to a wide gap noise would swing it [-]
+    Returns:
+        values (n, k), measured or filled (n,) bool, filled across lost samples (n,) bool
+    """
+    if len(t) < 4:
+        return np.zeros((len(grid), y.shape[1])), np.zeros(len(grid), bool), np.zeros(len(grid), bool)
+    gaps = np.sort(np.diff(t))
+    usual = 0.5 * float(gaps[(len(gaps) - 1) // 2] + gaps[len(gaps) // 2])
+    return _laid(t, y, grid, (usual, longest, bent * usual))
+
+
+def _laid(
+    t: np.ndarray, y: np.ndarray, grid: np.ndarray, limits: tuple[float, float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    out, ok, lost = np.empty((len(grid), y.shape[1])), np.empty(len(grid), bool), np.empty(len(grid), bool)
+    _lay_each(t, np.ascontiguousarray(y, float), np.ascontiguousarray(grid), limits, out, ok, lost)
+    return out, ok, lost
+
+
+@nb.njit(cache=True, nogil=True)  # no fastmath: a gap just as long as the longest is filled
+def _lay_each(
+    t: np.ndarray,
+    y: np.ndarray,
+    grid: np.ndarray,
+    limits: tuple[float, float, float],
+    out: np.ndarray,
+    ok: np.ndarray,
+    lost: np.ndarray,
+) -> None:
+    """Fill in what `fill` gives; limits: usual gap, longest gap, longest span of a cubic [s].
+
+    L(a) = sum_i b_i prod_(j != i) (a - a_j) / (a_i - a_j).  Source: Huang 2021 eq. 19.
+    """
+    (usual, longest, reach), n, right = limits, len(t), 1
+    weight = np.empty(4)
+    for g in range(len(grid)):
+        while right < n - 1 and t[right] < grid[g]:
+            right += 1
+        gap, at = t[right] - t[right - 1], min(max(grid[g], t[0]), t[n - 1])
+        ok[g] = t[0] - usual <= grid[g] <= t[n - 1] + usual and gap <= longest
+        lost[g] = ok[g] and gap > _LOST * usual
+        first, count = max(min(right - 2, n - 4), 0), 4
+        if n < 4 or t[min(right + 1, n - 1)] - t[max(right - 2, 0)] > reach:
+            first, count = right - 1, 2
+        for i in range(count):
+            weight[i] = 1.0
+            for j in range(count):
+                if j != i:
+                    weight[i] *= (at - t[first + j]) / (t[first + i] - t[first + j])
+        for k in range(y.shape[1]):
+            out[g, k] = 0.0
+            for i in range(count):
+                out[g, k] += weight[i] * y[first + i, k]
+
+
+class Grid:
+    """One aircraft's telemetry on one grid, multiples of `DT`; what is settled is laid once, the tail every time."""
+
+    def __init__(self, keep_s: float = 160.0) -> None:
+        self.keep_s = keep_s
+        self._origin: Origin | None = None
+        self._servos: ServoMap | None = None
+        self._first, self._stop = 0, 0  # rows in use of the three below
+        self._k = np.empty(0, np.int64)  # grid times in steps of DT
+        self._laid = np.empty((0, _WIDTH))  # attitude, velocity, position, inputs, and what turns it to the body
+        self._ok = np.empty((0, 2), bool)  # measured or filled; filled
+
+    def clear(self) -> None:
+        """Forget everything, as after a jump of the clock."""
+        self._first, self._stop = 0, 0
+
+    def window(
+        self, history: History, origin: Origin, servos: ServoMap, wind: np.ndarray, *, until: float, seconds: float
+    ) -> Window | None:
+        """Lay what is new, and give the newest `seconds` before `until`.
+
+        Args:
+            history: telemetry as it came
+            origin: where the twin's NED frame touches the earth
+            servos: pulse widths to inputs
+            wind: wind, NED, the direction it blows to, (3,) [m/s]
+            until: newest grid time [s since 1970]
+            seconds: wanted length [s]
+        Returns:
+            the window, or None while any needed kind of row is missing
+        """
+        if self._origin != origin or self._servos is None or not servos.same(self._servos):
+            self.clear()
+        self._origin, self._servos = origin, servos
+        if not self._extend(history, until):
+            return None
+        used = slice(self._first, self._stop)
+        k, laid, known = self._k[used], self._laid[used], self._ok[used]
+        first = k.searchsorted(ceil((until - seconds) / DT - 1e-3))
+        last = k.searchsorted(floor(until / DT + 1e-3), side="right")
+        rows = slice(first, last)
+        if last - first < _FEWEST:
+            return None
+        x, u, p, v = (np.empty((last - first, width)) for width in (len(STATES), len(INPUTS), 3, 3))
+        _seen(laid[rows], np.asarray(wind, float), x, u, p, v)
+        ok, filled = known[rows].T.copy()
+        return Window(k[rows] * DT, x, u, p, v, ok, filled)
+
+    def _extend(self, history: History, until: float) -> bool:
+        """Lay the tail anew from where rows may still have come; tell whether every kind is there."""
+        begun = self._stop > self._first
+        settled = self._k[self._stop - 1] * DT - _SETTLED_S if begun else max(until - self.keep_s, 0.0)
+        rows = {name: history.look(name, settled - _BEFORE_S) for name in LONGEST_GAP}
+        if any(len(t) < _LEAST_ROWS[not begun] for t, _ in rows.values()):
+            return begun
+        start = settled if begun else max(settled, *(float(t[0]) for t, _ in rows.values()))
+        stop = min(until, *(float(t[-1]) for t, _ in rows.values()))
+        k = np.arange(ceil(start / DT), floor(stop / DT) + 1)
+        if not len(k):
+            return begun
+        assert self._origin is not None
+        laid, ok, filled = _lay(rows, k * DT, self._origin)
+        self._join(k, laid, np.column_stack([ok, filled]))
+        return True
+
+    def _join(self, k: np.ndarray, laid: np.ndarray, ok: np.ndarray) -> None:
+        """Have these rows, (n,), (n, 20), (n, 2), instead of all from the first of them on."""
+        at = [k[0] - int(self.keep_s / DT), k[0]]
+        first, stop = (self._first + int(row) for row in self._k[self._first : self._stop].searchsorted(at))
+        if self._stop > self._first:  # angles go on from the turn they were on
+            before = self._laid[stop - 1, :3] if stop > first else np.zeros(3)
+            laid[:, :3] += 2 * np.pi * np.round((before - laid[0, :3]) / (2 * np.pi))
+        if stop + len(k) > len(self._k):
+            self._make_place(first, stop, len(k))
+            first, stop = 0, stop - first
+        new = slice(stop, stop + len(k))
+        assert self._servos is not None
+        self._k[new], self._laid[new, :_LAID], self._ok[new] = k, laid[:, :_LAID], ok
+        self._laid[new, _LAID:_TURN] = self._servos.inputs(laid[:, _LAID:])
+        _turn(self._laid[new])
+        self._first, self._stop = first, new.stop
+
+    def _make_place(self, first: int, stop: int, more: int) -> None:
+        """Keep rows `first` to `stop` in arrays that have place for `more`, and for some time to come."""
+        size = stop - first + more + int(_SPARE_S / DT)
+        for name in ("_k", "_laid", "_ok"):
+            old = getattr(self, name)
+            new = np.empty((size, *old.shape[1:]), old.dtype)
+            new[: stop - first] = old[first:stop]
+            setattr(self, name, new)
+
+
+@nb.njit(cache=True, nogil=True)  # no fastmath: as `fleet.frames.ned_to_body` has it
+def _turn(laid: np.ndarray) -> None:
+    """Fill in the cosines and sines of every row's angles: a window is turned anew with every new wind."""
+    for k in range(len(laid)):
+        for i in range(3):
+            laid[k, _TURN + 2 * i], laid[k, _TURN + 2 * i + 1] = cos(laid[k, i]), sin(laid[k, i])
+
+
+@nb.njit(cache=True, nogil=True)  # no fastmath: as `fleet.frames.ned_to_body` has it
+def _seen(laid: np.ndarray, wind: np.ndarray, x: np.ndarray, u: np.ndarray, p: np.ndarray, v: np.ndarray) -> None:
+    """Fill in states, (n, 9), inputs, (n, 4), positions and velocities, (n, 3), of rows as `Grid` keeps them."""
+    for k in range(len(laid)):
+        row = laid[k]
+        cf, sf, ct, st, cp, sp = row[16], row[17], row[18], row[19], row[20], row[21]
+        for i in range(4):
+            u[k, i] = row[_LAID + i]
+        for i in range(3):
+            v[k, i], p[k, i] = row[6 + i], row[9 + i]
+            x[k, 6 + i], x[k, 3 + i] = row[i], row[3 + i]
+        n, e, d = row[6] - wind[0], row[7] - wind[1], row[8] - wind[2]
+        ahead, right = cp * n + sp * e, cp * e - sp * n
+        x[k, 0] = ct * ahead - st * d
+        x[k, 1] = sf * st * ahead + cf * right + sf * ct * d
+        x[k, 2] = cf * st * ahead - sf * right + cf * ct * d
+
+
+def _lay(
+    rows: dict[str, tuple[np.ndarray, np.ndarray]], grid: np.ndarray, origin: Origin
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lay every kind on grid times; give columns as in `Grid`, what is measured or filled, and what is filled."""
+    t, attitude = rows["attitude"]
+    unwrapped = np.hstack([np.unwrap(attitude[:, :3], axis=0), attitude[:, 3:]])
+    t_p, place = rows["position"]
+    laid = [
+        fill(t, unwrapped, grid, LONGEST_GAP["attitude"]),
+        fill(*rows["velocity"], grid, LONGEST_GAP["velocity"]),
+        fill(t_p, to_ned(origin, *place.T), grid, LONGEST_GAP["position"]),
+        fill(*rows["servo"], grid, LONGEST_GAP["servo"], 0.0),  # a servo does not overshoot as a cubic would
+    ]
+    values, ok, filled = zip(*laid, strict=True)
+    return np.hstack(values), np.logical_and.reduce(ok), np.logical_or.reduce(filled)
+
+
+def preprocess(
+    history: History, origin: Origin, servos: ServoMap, wind: np.ndarray, *, until: float, seconds: float
+) -> Window | None:
+    """Lay the newest `seconds` before `until` on one grid; arguments as for `Grid.window`."""
+    return Grid(seconds).window(history, origin, servos, wind, until=until, seconds=seconds)

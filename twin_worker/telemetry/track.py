@@ -1,0 +1,109 @@
+"""Where an aircraft was and how it moved, from positions and velocities alone: all that every vehicle sends."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fleet.frames import Origin, to_ned, wrap
+from twin_worker.numerics.interpolation import straight
+from twin_worker.telemetry.history import History
+from twin_worker.telemetry.resample import fill
+
+STEP = 0.1  # grid of every track [s]
+_LONGEST = 2.5  # wider gaps are never filled: 1 Hz with a lost row [s]
+_SLOPE_S = 1.0  # velocity is the slope of the position over as much to either side [s]
+_OLD_S = 3.0  # attitude or velocity older than the newest position by more is no longer sent [s]
+
+
+@dataclass(frozen=True)
+class Track:
+    """A stretch of one flight on an equal grid of `STEP`.
+
+    Attributes:
+        t: fleet time, (n,) [s since 1970]
+        p: position, NED from the twin's origin, (n, 3) [m]
+        v: velocity over ground, NED, (n, 3) [m/s]
+        euler: phi theta psi, nan where attitude is not sent, (n, 3) [rad]
+        ok: measured or interpolated across a short gap, (n,) bool
+        sentence: what is missing, or empty
+    """
+
+    t: np.ndarray
+    p: np.ndarray
+    v: np.ndarray
+    euler: np.ndarray
+    ok: np.ndarray
+    sentence: str
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def part(self, start: int, stop: int) -> "Track":
+        """Cut rows `start` to `stop`."""
+        s = slice(start, stop)
+        return Track(self.t[s], self.p[s], self.v[s], self.euler[s], self.ok[s], self.sentence)
+
+    def whole(self, since: float = -np.inf) -> "Track":
+        """Cut what is unbroken up to the end, from `since` on."""
+        bad = np.flatnonzero(~self.ok)
+        return self.part(max(int(bad[-1]) + 1 if len(bad) else 0, int(np.searchsorted(self.t, since))), len(self))
+
+    def turned(self, history: History) -> "Track":
+        """Give the same with its attitude."""
+        return replace(self, euler=_attitude(history, self.t))
+
+
+def track(history: History, origin: Origin, *, until: float, seconds: float, turned: bool = True) -> Track | None:
+    """Lay the newest `seconds` before `until` on one grid; velocity is differentiated where none is sent.
+
+    Not `turned` its attitude is nan as yet: to lay it takes longer than all else, and not all need it.
+
+    Returns:
+        the track, or None before a second and a half of positions
+    """
+    t_p, position = history.look("position", until - seconds - 2.0)
+    if len(t_p) < 3:
+        return None
+    t_v, velocity = history.look("velocity", until - seconds - 2.0)
+    moving = len(t_v) >= 4 and t_v[-1] > t_p[-1] - _OLD_S
+    stop = min(until, float(t_p[-1]), float(t_v[-1]) if moving else np.inf)
+    start = max(until - seconds, float(t_p[0]), float(t_v[0]) if moving else -np.inf)
+    n = int((stop - start) / STEP) + 1
+    if n < 1.5 / STEP:
+        return None
+    grid = stop - STEP * np.arange(n)[::-1]
+    p, ok = _laid(t_p, to_ned(origin, *position.T), grid)
+    if moving:
+        v, also = _laid(t_v, velocity, grid)
+        ok &= also
+    else:
+        v = _slope(grid, p)
+    said = "" if moving else "no velocity rows: it is differentiated from positions, which costs precision"
+    found = Track(grid, p, v, np.full((n, 3), np.nan), ok, said)
+    return found.turned(history) if turned else found
+
+
+def _laid(t: np.ndarray, x: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lay rows on the grid, straight where there are too few for more."""
+    if len(t) < 4:
+        return straight(grid, t, x), np.ones(len(grid), bool)
+    values, ok, _ = fill(t, x, grid, _LONGEST)
+    return values, ok
+
+
+def _slope(t: np.ndarray, p: np.ndarray) -> np.ndarray:
+    before, after = np.maximum(t - _SLOPE_S, t[0]), np.minimum(t + _SLOPE_S, t[-1])
+    ends = [straight(at, t, p) for at in (before, after)]
+    return (ends[1] - ends[0]) / (after - before)[:, None]
+
+
+def _attitude(history: History, grid: np.ndarray) -> np.ndarray:
+    """Give phi theta psi on the grid; nan where the nearest row is too far."""
+    t, x = history.look("attitude", grid[0] - 2.0)
+    if len(t) < 2 or t[-1] < grid[-1] - _OLD_S:
+        return np.full((len(grid), 3), np.nan)
+    euler = np.column_stack([np.interp(grid, t, np.unwrap(x[:, i])) for i in range(3)])
+    euler[:, 2] = wrap(euler[:, 2])
+    right = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
+    euler[(t[right] - t[right - 1] > _LONGEST) | (grid < t[0] - 1.0)] = np.nan
+    return euler

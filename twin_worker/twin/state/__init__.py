@@ -1,0 +1,1 @@
+"""The state of one twin, its events and its schedule."""

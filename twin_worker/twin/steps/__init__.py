@@ -1,0 +1,1 @@
+"""Steps of the twin's loop: identify, verify, predict, extrapolate, raise alerts."""

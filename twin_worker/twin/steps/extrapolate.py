@@ -1,0 +1,130 @@
+"""A prediction between two flights ahead: the path of the last one, begun at the newest position."""
+
+from math import exp, sqrt
+
+import msgspec
+import numpy as np
+
+from fleet.contract import Array, Message, Prediction
+from fleet.frames import to_ned
+from fleet.physics.kernel import kernel
+from twin_worker.twin.state.state import Twin
+
+LATEST_S = 10.0  # after a flight ahead it is renewed no longer [s]
+OVERDUE_S = 60.0  # the same where the next is due and has to wait for CPU time: better than nothing [s]
+_BACK_S = 10.0  # in which an aircraft is back on the path that was foreseen [s]
+
+
+@kernel
+def shifted(ahead: np.ndarray, path: np.ndarray, passed: float, at: np.ndarray, out: np.ndarray) -> None:
+    """Fill in the rest of a path from where the aircraft is now.
+
+    Args:
+        ahead, path: look-aheads, rising, and positions, (n,) and (n, 3) [s, m]
+        passed: time since it began [s]
+        at: where the aircraft is, (3,) [m]
+        out: positions `ahead` from now, (k, 3) [m]; the last at most `passed` before the path's end
+    """
+    off, k = np.zeros(3), 0
+    for i in range(len(out)):
+        t = passed + ahead[i]
+        while k < len(ahead) - 2 and ahead[k + 1] < t:
+            k += 1
+        share = min(max((t - ahead[k]) / (ahead[k + 1] - ahead[k]), 0.0), 1.0)
+        fade = exp(-ahead[i] / _BACK_S)
+        for j in range(3):
+            there = path[k, j] + share * (path[k + 1, j] - path[k, j])
+            if i == 0:
+                off[j] = at[j] - there
+            out[i, j] = there + fade * off[j]
+
+
+@kernel
+def widened(ahead: np.ndarray, tube: np.ndarray, passed: float, out: np.ndarray) -> None:
+    """Fill in half-axes by the age of the rollout, never below those of a new one.
+
+    With e(tau) the rollout's error, of independent increments, and phi = exp(-tau / 10 s), the error from now on is
+    e(age + tau) - phi e(age):
+
+        h(tau)^2 = h_0(age + tau)^2 - h_0(age)^2 phi (2 - phi)
+
+    Args:
+        ahead, tube: look-aheads, rising, and half-axes, (n,) and (n, 3) [s, m]
+        passed: age of the rollout [s]
+        out: half-axes `ahead` from now, (k, 3) [m]; the last at most `passed` before the tube's end
+    Source: Bar-Shalom 2001, section 4.3 (covariance propagation of a process with independent increments).
+    """
+    before, later, k = np.zeros(3), np.zeros(3), 0
+    for i in range(-1, len(out)):
+        t = passed + (ahead[i] if i >= 0 else 0.0)
+        while k < len(ahead) - 2 and ahead[k + 1] < t:
+            k += 1
+        share = min(max((t - ahead[k]) / (ahead[k + 1] - ahead[k]), 0.0), 1.0)
+        for j in range(3):
+            later[j] = tube[k, j] + share * (tube[k + 1, j] - tube[k, j])
+        if i < 0:
+            before[:] = later
+            continue
+        fade = exp(-ahead[i] / _BACK_S)
+        for j in range(3):
+            square = later[j] ** 2 - before[j] ** 2 * fade * (2.0 - fade)
+            out[i, j] = max(sqrt(max(square, 0.0)), tube[i, j])
+
+
+def renew(twin: Twin) -> list[Message]:
+    """Give the last path that was flown ahead, from the newest position on; nothing where there is neither."""
+    if twin.base is None:
+        return []
+    t, rows = twin.history.look("position", max(twin.base.t, twin.history.newest - 1.0))
+    made = renewed(twin, float(t[-1]), rows[-1]) if len(t) else None
+    if made is None:
+        return []
+    if made.origin == twin.origin:
+        twin.record.keep_renewed(made.t, made.method, made.path.numpy(), made.tube.numpy())
+    twin.prediction = made
+    return [made]
+
+
+def renewable(twin: Twin, t: float) -> bool:
+    """Tell whether there is a path to renew at `t`: flown while telemetry came, and not long before."""
+    base = twin.base
+    if base is None or twin.lost or twin.broken or base.coast_s:
+        return False
+    return t < base.t + (OVERDUE_S if overdue(twin, t) else LATEST_S)
+
+
+def overdue(twin: Twin, t: float) -> bool:
+    """Tell whether at `t` the next flight ahead is due, but was not made: it waits for CPU time."""
+    return t >= twin.predict_t + twin.pace.predict
+
+
+def renewed(twin: Twin, t: float, position: np.ndarray) -> Prediction | None:
+    """Give the last path that was flown ahead from a position on, (3,) [1e-7 deg, mm] at `t`; the twin stays as it is.
+
+    The departure so far, d, fades:  p(tau) = path(t - t0 + tau) + d exp(-tau / 10 s). All is in the local frame of the
+    path: that of the twin may have moved since. The horizon ends when that of the path does.
+    """
+    base = twin.base
+    if base is None or twin.origin is None or not renewable(twin, t) or not (passed := t - base.t) > 0.0:
+        return None
+    ahead = base.ahead.numpy()
+    n = int(ahead.searchsorted(float(ahead[-1]) - passed, side="right"))
+    if n < 2:
+        return None
+    out, tube = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+    shifted(ahead, base.path.numpy(), passed, to_ned(base.ned_origin(), *position), out)  # type: ignore[call-arg]
+    widened(ahead, base.tube.numpy(), passed, tube)  # type: ignore[call-arg]
+    coverage, coverage_n = twin.record.coverage_renewed
+    return msgspec.structs.replace(
+        base,
+        t=t,
+        state=twin.state,
+        ahead=Array(base.ahead.dtype, (n,), base.ahead.data[: ahead.itemsize * n]),
+        path=Array("<f4", (n, 3), out.tobytes()),
+        tube=Array("<f4", (n, 3), tube.tobytes()),
+        horizon_s=max(base.horizon_s - passed, 0.0),
+        rollout_age_s=base.rollout_age_s + passed,
+        coverage_renewed=coverage,
+        coverage_renewed_n=coverage_n,
+        controller=None,
+    )

@@ -1,0 +1,128 @@
+"""The route flown ahead by every way the aircraft has, and the one that is used."""
+
+import numpy as np
+
+from fleet.window import Window
+from twin_worker.confidence.calibration_table import law_of_growth
+from twin_worker.confidence.tube_and_horizon import AHEAD
+from twin_worker.identification.fixed_wing.plant import DYNAMICS, method
+from twin_worker.numerics.interpolation import straight
+from twin_worker.prediction.closed_loop import Flown, Situation, Start, fly_from, set_out
+from twin_worker.prediction.fixed_wing import ensemble
+from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_hybrid
+from twin_worker.twin.state.schedule import SOON, Work
+from twin_worker.twin.state.state import Twin
+from twin_worker.twin.state.vehicle_class import Flight, nothing
+
+HYBRID, BOTH = "hybrid", "both"
+_NEAR_S = 60.0  # the identified dynamics are flown as far; beyond, the hybrid goes on from there [s]
+
+
+def fly_route(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
+    """Fly the route ahead, or say why not.
+
+    Args:
+        twin: whose contest, hybrid, plant and spread are used; contest and spread are renewed
+        window: newest telemetry
+        ahead: wanted look-ahead times from its end, rising, (k,) [s]
+    """
+    now = twin.situation(window)
+    start = set_out(now)
+    if isinstance(start, Flown):
+        return nothing(start.sentence, start.seq)
+    t = float(window.t[-1])
+    due = twin.contest.due(t)
+    flown, why = paths(twin, (now, start), ahead, due)
+    if not flown:
+        return nothing(why or "no model was believed yet", start.seq)
+    if due and len(flown) > 1 and not twin.lost:
+        twin.contest.keep(t, float(np.linalg.norm(start.good.v[-1])), ahead, flown)
+    _spread(twin, (now, start))
+    chosen = twin.contest.best(tuple(flown))
+    sentence = " ".join(filter(None, (twin.contest.said(chosen), start.sentence)))
+    return Flight(flown[chosen], chosen, start.law.law, start.seq, sentence, start.law)
+
+
+def paths(
+    twin: Twin, begin: tuple[Situation, Start], ahead: np.ndarray, due: bool
+) -> tuple[dict[str, np.ndarray], str]:
+    """Give the path of each method that flies, NED (k, 3) [m], and why another does not; `due`: all must fly."""
+    found: dict[str, np.ndarray] = {}
+    why = ""
+    if twin.hybrid is not None and twin.method in (HYBRID, "auto"):
+        flown = fly_hybrid(*begin, twin.hybrid, ahead)
+        found, why = _kept(found, HYBRID, flown), flown.sentence
+    wanted = not found or due or twin.contest.best((BOTH, HYBRID, DYNAMICS)) != HYBRID
+    if twin.plant is not None and twin.method != HYBRID and wanted:
+        near = ahead[: np.searchsorted(ahead, max(_NEAR_S, ahead[0]), side="right")] if found else ahead
+        flown = fly_from(begin[1], twin.plant, near)
+        why = why if found else flown.sentence
+        if flown.path is not None:
+            path = _lengthened(flown.path, found[HYBRID]) if found else flown.path
+            found = {**found, method(twin.plant): path}
+    if len(found) > 1:
+        found[BOTH] = 0.5 * (found[HYBRID] + found[method(twin.plant)])  # type: ignore[arg-type]
+    return found, why
+
+
+def _kept(paths: dict[str, np.ndarray], name: str, flown: Flown) -> dict[str, np.ndarray]:
+    return paths if flown.path is None else {**paths, name: flown.path}
+
+
+def _lengthened(path: np.ndarray, further: np.ndarray) -> np.ndarray:
+    """Go on from the end of `path`, (m, 3), as `further`, (k, 3), does."""
+    end = len(path)
+    return np.vstack([path, further[end:] + (path[-1] - further[end - 1])])
+
+
+def _spread(twin: Twin, begin: tuple[Situation, Start]) -> None:
+    """Fly the ensemble where it is due."""
+    t = float(begin[1].good.t[-1])
+    known = twin.spread_t <= t < twin.spread_t + SOON * twin.pace.ensemble and twin.instead is None
+    twin.put_off = None
+    if twin.hybrid is None or known:
+        return
+    if not twin.may(Work.ENSEMBLE):
+        twin.put_off = t
+        return
+    _fly_ensemble(twin, begin, t)
+
+
+def fly_put_off(twin: Twin, seconds: float) -> None:
+    """Fly the ensemble that was due with the last flight, from now, looking so far back; the next one keeps the beat.
+
+    It had to wait for others: the doubt it tells of counts for the next flight.
+    """
+    due, twin.put_off = twin.put_off, None
+    window = twin.window(seconds)
+    if due is None or twin.hybrid is None or window is None or not window.ok[-1] or twin.why_no_route():
+        return
+    now = twin.situation(window)
+    start = set_out(now)
+    if not isinstance(start, Flown):
+        _fly_ensemble(twin, (now, start), due)
+
+
+def _fly_ensemble(twin: Twin, begin: tuple[Situation, Start], t: float) -> None:
+    """Fly the ensemble of `t`; beyond its span the spread goes on as the law of growth does."""
+    assert twin.hybrid is not None
+    ahead = AHEAD[: AHEAD.searchsorted(twin.pace.span, side="right")]
+    rng = np.random.default_rng((twin.uav, int(t)))
+    found = ensemble.spread(*begin, twin.hybrid, ahead, rng, members=twin.pace.members)
+    if found is not None and len(ahead) < len(AHEAD):
+        law = law_of_growth(HYBRID, AHEAD[len(ahead) - 1 :])
+        found = np.vstack([found, found[-1] * law[1:] / law[0]])
+    twin.spread, twin.spread_t = found, t
+
+
+def in_force(twin: Twin, method: str, ahead: np.ndarray) -> np.ndarray | None:
+    """Give the spread of the newest ensemble at some look-aheads, (k, 3) [m]; None where it does not belong to these.
+
+    Args:
+        twin: whose ensemble
+        method: of the prediction
+        ahead: rising; beyond the ensemble's end the spread stays (k,) [s]
+    """
+    if twin.spread is None or method not in (HYBRID, BOTH, DYNAMICS):
+        return None
+    return straight(ahead, AHEAD, twin.spread)

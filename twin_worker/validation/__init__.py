@@ -1,0 +1,1 @@
+"""Validation of identified models on held-out data."""

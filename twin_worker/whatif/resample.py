@@ -1,0 +1,38 @@
+"""The look-ahead times a query asks for, and a prediction on them."""
+
+import msgspec
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from fleet.contract import Array, Prediction
+from twin_worker.confidence.tube_and_horizon import AHEAD
+
+
+def wanted(asked: dict[str, str]) -> np.ndarray | None:
+    """Read `?horizon=30;step=0.5` into look-ahead times [s]; None where nothing was asked.
+
+    Raises:
+        ValueError: when they are no numbers or ask for more than 1,000 points.
+    """
+    if not asked.keys() & {"horizon", "step"}:
+        return None
+    try:
+        horizon, step = float(asked.get("horizon", AHEAD[-1])), float(asked.get("step", 1.0))
+    except ValueError:
+        raise ValueError(f"query: found {asked}, expected numbers, e.g. ?horizon=30;step=0.5; correct them") from None
+    if not (0 < horizon <= AHEAD[-1] and 0 < step <= 60 and horizon / step <= 1000):
+        raise ValueError(
+            f"query: found horizon {horizon}, step {step}; ask for at most {AHEAD[-1]:.0f} s and 1,000 points"
+        )
+    return np.arange(0.0, horizon + 1e-9, step)
+
+
+def resample(prediction: Prediction, grid: np.ndarray | None) -> Prediction:
+    """Give the prediction on other look-ahead times, (n,) [s], as far as it reaches; the whole of it for None."""
+    if grid is None:
+        return prediction
+    ahead = prediction.ahead.numpy().astype(float)
+    grid = grid[grid <= ahead[-1] + 1e-6]
+    path = CubicSpline(ahead, prediction.path.numpy())(grid)  # a chord over 4 s of a turn would cut it by metres
+    tube = np.column_stack([np.interp(grid, ahead, column) for column in prediction.tube.numpy().T])
+    return msgspec.structs.replace(prediction, ahead=Array.of(grid), path=Array.of(path), tube=Array.of(tube))

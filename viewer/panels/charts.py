@@ -1,0 +1,154 @@
+"""The charts of the selected UAV: what was told of the last minute, and what is predicted, over data time."""
+
+from typing import Any
+
+import numpy as np
+from viser import uplot
+
+from viewer.store.errors import AHEADS_S, by_ahead, errors
+from viewer.store.place import UNIT_M
+from viewer.store.store import Feed
+from viewer.store.vehicle import Vehicle
+from viewer.text.mismatch_text import within
+from viewer.theme.palette import Palette
+
+AHEAD_S = 5.0  # look-ahead whose error is shown over time [s]
+PAST_S = 60.0  # how far the histories reach back [s]
+
+
+class Charts:
+    """Four charts of the selected UAV; built once, their data replaced."""
+
+    def __init__(self, gui: Any, palette: Palette) -> None:
+        self._gui, p = gui, palette
+        two = np.array([0.0, 1.0])
+        self._band = self._chart(
+            "Error by look-ahead, m",
+            (("measured", p.flown), ("band", p.tube), ("horizon", p.horizon)),
+            (two,) * 4,
+        )
+        self._error = self._chart(
+            f"Error {AHEAD_S:.0f} s ahead, m", (("measured", p.muted), ("located mismatch", p.mismatch)), (two,) * 3
+        )
+        self._fit = self._chart("Mean fit of each verdict, %", (("fit", p.verified),), (two, two))
+        self._alt = self._chart("Altitude, m", (("flown", p.flown), ("predicted", p.predicting)), (two,) * 3)
+
+    def _chart(self, title: str, lines: tuple, data: tuple) -> tuple[Any, Any]:
+        legend = " ".join(f'<span style="color:{colour};white-space:nowrap">━ {name}</span>' for name, colour in lines)
+        head = self._gui.add_html(f'<div class="uav" style="padding-bottom:0"><b>{title}</b> {legend}</div>')
+        series = tuple(
+            uplot.Series(label=name, stroke=colour, width=2, points={"show": False}) for name, colour in lines
+        )
+        plot = self._gui.add_uplot(
+            data,
+            (uplot.Series(label="s"), *series),
+            scales={"x": {"time": False}},
+            axes=({"size": 32}, {"size": 54}),
+            legend={"show": False},
+            padding=(10, 16, 0, 0),
+            height=108,
+        )
+        return head, plot
+
+    def draw(self, vehicle: Vehicle | None, feed: Feed, now: float) -> None:
+        """Replace the data; a chart without any is hidden."""
+        if vehicle is None:
+            for chart in (self._band, self._error, self._fit, self._alt):
+                _put(chart, None)
+            return
+        trail = feed.trail(vehicle)
+        made, off = errors(feed.past(vehicle), trail)
+        _put(self._band, band(vehicle, off), from_zero=True)
+        _put(self._error, over_time(made, off, vehicle), from_zero=True)
+        _put(self._fit, _history(feed.fits(vehicle), 1))
+        _put(self._alt, _altitude(vehicle, trail, now))
+
+
+def _put(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None, *, from_zero: bool = False) -> None:
+    """Show data, x first. The y scale is given: a gap (not a number) would spoil the chart's own."""
+    for part in chart:
+        part.visible = data is not None
+    if data is None:
+        return
+    zero = [np.zeros(1)] if from_zero else []
+    x0, x1 = np.floor(data[0][0] / 10) * 10, np.ceil(data[0][-1] / 10) * 10
+    scales = {
+        "x": {"time": False, "range": (float(x0), float(x1))},
+        "y": {"range": scale(np.concatenate([*data[1:], *zero]))},
+    }
+    if chart[1].scales != scales:  # a new scale builds the chart anew: rarely, please
+        chart[1].scales = scales
+    chart[1].data = data
+
+
+def scale(y: np.ndarray) -> tuple[float, float]:
+    """Choose a range for y that holds its finite values and seldom changes: whole multiples of 1, 2 or 5 times 10^k."""
+    y = y[np.isfinite(y)]
+    low, high = (float(y.min()), float(y.max())) if len(y) else (0.0, 1.0)
+    rough = max(high - low, 0.02 * abs(high), 1e-3) / 2
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = float(power * next(m for m in (1, 2, 5, 10) if m * power >= rough * 0.999))
+    return float(np.floor(low / step) * step), float((np.floor(high / step) + 1) * step)
+
+
+def band(vehicle: Vehicle | None, off: np.ndarray) -> tuple[np.ndarray, ...] | None:
+    """Give the measured error and the band's widest half-axis against look-ahead, and an upright line at the horizon.
+
+    Args:
+        vehicle: whose
+        off: as `errors` gives it, (k, 30) [m]
+    Returns:
+        x [s], measured, band, horizon [m]
+    """
+    if vehicle is None or (told := vehicle.forecast) is None:
+        return None
+    last = min(float(told.ahead[-1]), max(1.4 * told.until, 10.0))
+    horizon = [told.until, told.until + 1e-3]
+    x = np.unique(np.concatenate([AHEADS_S[last >= AHEADS_S], np.linspace(0, last, 40), horizon]))
+    wide = told.width(x).max(axis=1) * UNIT_M
+    measured = by_ahead(off)
+    known = np.isfinite(measured)
+    line = np.full(len(x), np.nan)
+    if known.any():
+        ends = AHEADS_S[known][[0, -1]]
+        inside = (x >= ends[0]) & (x <= ends[1])
+        line[inside] = np.interp(x[inside], AHEADS_S[known], measured[known])
+    upright = np.full(len(x), np.nan)
+    upright[np.searchsorted(x, horizon)] = [0.0, wide.max()]
+    return x, line, wide, upright
+
+
+def over_time(made: np.ndarray, off: np.ndarray, vehicle: Vehicle) -> tuple[np.ndarray, ...] | None:
+    """Give the error at one look-ahead against seconds ago, and once more where a mismatch was located."""
+    at = int(AHEAD_S - AHEADS_S[0])
+    known = np.isfinite(off[:, at])
+    if known.sum() < 2:
+        return None
+    due, error = made[known] + AHEAD_S, off[known, at]
+    strange = np.where(within(due, vehicle.mismatch), error, np.nan)
+    return due - due[-1], error, strange
+
+
+def _history(rows: np.ndarray, column: int) -> tuple[np.ndarray, ...] | None:
+    """Give the last minute of one column against seconds ago: (x, y); None where there are fewer than two points."""
+    if len(rows) < 2:
+        return None
+    x = rows[:, 0] - rows[-1, 0]
+    keep = (x >= -PAST_S) & np.concatenate([np.diff(x) > 0, [True]])
+    return (x[keep], rows[keep, column]) if keep.sum() > 1 else None
+
+
+def _altitude(vehicle: Vehicle | None, trail: np.ndarray, now: float) -> tuple[np.ndarray, ...] | None:
+    """Join flown and predicted altitude: (x, flown, predicted) [s from now, m above mean sea level]."""
+    flown = _history(trail, 3)
+    if vehicle is None or flown is None:
+        return None
+    base = vehicle.alt_m - trail[-1, 3] * UNIT_M
+    x, up = flown[0], flown[1] * UNIT_M + base
+    if vehicle.forecast is None:
+        return x, up, np.full(len(x), np.nan)
+    told = vehicle.forecast
+    ahead = np.linspace(0.1, max(told.until, 0.2), 40)
+    predicted = told.at(ahead + max(float(trail[-1, 0]) - told.t, 0.0))[:, 2] * UNIT_M + base
+    blank = np.full(len(ahead), np.nan), np.full(len(x), np.nan)
+    return np.concatenate([x, ahead]), np.concatenate([up, blank[0]]), np.concatenate([blank[1], predicted])

@@ -1,0 +1,36 @@
+"""The command palette (Ctrl+K) of one page: what one can do, and whom one can select."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import viser
+
+from viewer.store.vehicle import Vehicle
+
+MOST = 200  # UAVs offered; the search field finds the others
+
+
+class Commands:
+    """What the palette offers."""
+
+    def __init__(self, gui: Any, choose: Callable[[int], None], actions: dict[str, Callable[[], None]]) -> None:
+        self._gui, self._choose = gui, choose
+        self._offered: set[int] = set()
+        for label, act in actions.items():
+            gui.add_command(label).on_trigger(partial(self._act, act))
+
+    def offer(self, fleet: list[Vehicle]) -> None:
+        """Offer to select the first UAVs."""
+        for vehicle in fleet[:MOST]:
+            if vehicle.uav not in self._offered and len(self._offered) < MOST:
+                command = self._gui.add_command(f"Select {vehicle.name}", icon=viser.Icon.DRONE)
+                command.on_trigger(partial(self._pick, vehicle.uav))
+                self._offered.add(vehicle.uav)
+
+    def _pick(self, uav: int, _: Any) -> None:
+        self._choose(uav)
+
+    @staticmethod
+    def _act(act: Callable[[], None], _: Any) -> None:
+        act()

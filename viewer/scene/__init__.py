@@ -1,0 +1,1 @@
+"""The 3D scene: aircraft, routes, predictions, prediction regions."""

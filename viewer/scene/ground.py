@@ -1,0 +1,69 @@
+"""What everything stands on: grid, range rings with their distances, sky."""
+
+from typing import Any
+
+import numpy as np
+
+from viewer.scene.routes import circle
+from viewer.scene.strokes import Strokes, chain
+from viewer.store.place import UNIT_M
+from viewer.theme.numerals import written
+from viewer.theme.palette import Palette, rgb
+
+RINGS_M = (500, 1000, 2000, 5000, 10_000)
+NETS = ((100, 1_200, 0.5), (500, 6_000, 1.0), (5_000, 30_000, 1.0))  # lines so far apart, so far out [m], how strong
+PARTS = 6  # a line of the grid fades in so many steps
+
+
+class Ground:
+    """The ground of one page: its height follows what is known of it."""
+
+    def __init__(self, scene: Any, palette: Palette) -> None:
+        self.height = 0.0  # scene [10 m]
+        scene.set_background_image(_sky(palette), format="png")
+        scene.configure_default_lights(True, cast_shadow=False)
+        # No fog: with it the client fails to draw the outline of an aircraft under the mouse, and then the whole frame.
+        self._node = scene.add_frame("/env", show_axes=False)
+        lines, colours = zip(*[_grid(palette, *net) for net in NETS], strict=True)
+        self.grid = Strokes(scene, "/env/grid", 1.0)
+        self.grid.draw(np.concatenate(lines), np.concatenate(colours))
+        rings = [circle(np.array([0, 0, 0.02]), m / UNIT_M, 80) for m in RINGS_M]
+        Strokes(scene, "/env/rings", 1.2).draw(np.concatenate([*rings, *map(_distance, RINGS_M)]), rgb(palette.ring))
+
+    def raise_to(self, height: float) -> None:
+        """Move the ground to a height [10 m]."""
+        if abs(height - self.height) > 0.05:
+            self.height = height
+            self._node.position = (0.0, 0.0, height)
+
+
+def _sky(palette: Palette) -> np.ndarray:
+    """Paint the background: sky above, the colour of the ground from the upper third down, (256, 2, 3)."""
+    share = np.clip(np.linspace(0, 3, 256), 0, 1)[:, None, None] ** 0.7
+    return np.repeat(rgb(palette.sky[0]) * (1 - share) + rgb(palette.ground) * share, 2, axis=1).astype(np.uint8)
+
+
+def _grid(palette: Palette, apart: float, reach: float, strong: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lay a net of lines that fade outwards, as the renderer's own grid would take most of a software renderer's time.
+
+    Args:
+        palette: colours
+        apart, reach: of the lines, [m]
+        strong: share of the full colour in the middle [-]
+    Returns:
+        segments (n, 2, 3) [10 m] and the colours of their ends (n, 2, 3)
+    """
+    offsets = np.arange(-reach, reach + 1, apart) / UNIT_M
+    along = np.linspace(-reach, reach, PARTS + 1) / UNIT_M
+    x, y = np.meshgrid(along, offsets)
+    lines = chain(np.stack([x, y, np.zeros_like(x)], axis=-1)).reshape(-1, 2, 3)
+    lines = np.concatenate([lines, lines[..., [1, 0, 2]]])
+    away = np.clip(np.linalg.norm(lines, axis=-1) * UNIT_M / reach, 0, 1)[..., None]
+    share = strong * (1 - away) ** 0.8
+    return lines, share * rgb(palette.section) + (1 - share) * rgb(palette.ground)
+
+
+def _distance(metres: int) -> np.ndarray:
+    """Write how far a ring is, flat on the ground inside its southern edge: (n, 2, 3)."""
+    tall = 0.035 * metres / UNIT_M + 0.8
+    return written(f"{metres / 1000:g} km", tall) + np.array([0.4 * tall, -metres / UNIT_M + 0.4 * tall, 0.02])

@@ -1,0 +1,150 @@
+"""A mission as lines: navigation items in order, loiters as circles; all else an aircraft may upload is survived."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet.contract import Item, Mission
+from viewer.store.place import UNIT_M, Place
+
+# MAV_CMD. Source: MAVLink common.xml.
+WAYPOINT, LOITER_UNLIM, LOITER_TURNS, LOITER_TIME, RTL, LAND, TAKEOFF, LOITER_TO_ALT = 16, 17, 18, 19, 20, 21, 22, 31
+SPLINE, VTOL_TAKEOFF, VTOL_LAND, DO_JUMP = 82, 84, 85, 177
+AT_A_PLACE = {
+    WAYPOINT,
+    LOITER_UNLIM,
+    LOITER_TURNS,
+    LOITER_TIME,
+    LAND,
+    TAKEOFF,
+    LOITER_TO_ALT,
+    SPLINE,
+    VTOL_TAKEOFF,
+    VTOL_LAND,
+}
+ITEM_NAMES = {
+    WAYPOINT: "waypoint",
+    LOITER_UNLIM: "loiter",
+    LOITER_TURNS: "loiter turns",
+    LOITER_TIME: "loiter for a time",
+    RTL: "return",
+    LAND: "land",
+    TAKEOFF: "take-off",
+    LOITER_TO_ALT: "loiter to altitude",
+    SPLINE: "spline waypoint",
+    VTOL_TAKEOFF: "VTOL take-off",
+    VTOL_LAND: "VTOL landing",
+    DO_JUMP: "jump",
+}
+RADIUS_IN = {LOITER_UNLIM: "param3", LOITER_TURNS: "param3", LOITER_TIME: "", LOITER_TO_ALT: "param2"}
+ABSOLUTE = {0, 5}  # MAV_FRAME: GLOBAL, GLOBAL_INT; every other altitude counts from home
+RADIUS_M = 60.0  # where an item names no loiter radius: the default of ArduPlane's WP_LOITER_RAD [m]
+MAX_M = 50_000.0  # altitudes and radii beyond are not drawn [m]
+
+
+class Route(NamedTuple):
+    """What to draw of a mission, scene ENU [10 m]."""
+
+    legs: np.ndarray  # straight legs, (n, 2, 3)
+    back: np.ndarray  # jumps and returns, drawn dashed, (m, 2, 3)
+    circles: np.ndarray  # loiter circles as segments, (k, 2, 3)
+    points: np.ndarray  # where items sit, (p, 3)
+    items: np.ndarray  # the number of each, (p,)
+    ends: np.ndarray  # the number of the item each leg ends at, (n,)
+
+
+_NO_LINES, _NO_ITEMS = np.zeros((0, 2, 3)), np.zeros(0, int)
+NOTHING = Route(_NO_LINES, _NO_LINES, _NO_LINES, np.zeros((0, 3)), _NO_ITEMS, _NO_ITEMS)
+
+
+def home_alt_m(mission: Mission | None) -> float | None:
+    """Give home's altitude [m above mean sea level]: item 0 of an ArduPilot mission; None where there is none."""
+    if mission is None or len(mission.items) < 2:
+        return None
+    first, rest = mission.items[0], mission.items[1:]
+    is_home = first.seq == 0 and first.command == WAYPOINT and first.frame in ABSOLUTE and _usable(first)
+    return float(first.alt_m) if is_home and any(item.frame not in ABSOLUTE for item in rest) else None
+
+
+def route(mission: Mission | None, place: Place, ground: float) -> Route:
+    """Unroll a mission into lines.
+
+    Args:
+        mission: as it came over the bus; nothing in it is trusted
+        place: the scene's frame
+        ground: height of the ground where the mission has no home, scene [10 m]
+    """
+    if mission is None:
+        return NOTHING
+    home = home_alt_m(mission)
+    base = (home - place.origin.alt_mm * 1e-3) / UNIT_M if home is not None else ground
+    spots: dict[int, np.ndarray] = {}
+    legs: list[np.ndarray] = []
+    back: list[np.ndarray] = []
+    circles: list[np.ndarray] = []
+    ends: list[int] = []
+    last = None
+    for index, item in enumerate(mission.items):
+        if home is not None and index == 0:
+            spots[item.seq] = _spot(item, place, base, None)[:1].reshape(-1) if _usable(item) else np.zeros(0)
+            continue
+        if item.command == DO_JUMP:
+            back += _jump(item, spots, last)
+        if item.command == RTL and last is not None and (first := spots.get(0)) is not None and first.size:
+            back.append(np.stack([last, first]))
+        if item.command not in AT_A_PLACE or not _usable(item):
+            continue
+        found = _spot(item, place, base, last)
+        if not len(found):
+            continue
+        spot = spots[item.seq] = found[0]
+        if last is not None and np.linalg.norm(spot - last) > 1e-6:
+            legs.append(np.stack([last, spot]))
+            ends.append(item.seq)
+        if item.command in RADIUS_IN:
+            circles.append(circle(spot, _radius_m(item) / UNIT_M))
+        last = spot
+    points = [spot for spot in spots.values() if spot.size]
+    items = [seq for seq, spot in spots.items() if spot.size]
+    return Route(
+        np.array(legs).reshape(-1, 2, 3),
+        np.array(back).reshape(-1, 2, 3),
+        np.concatenate(circles) if circles else NOTHING.circles,
+        np.array(points).reshape(-1, 3),
+        np.clip(np.array(items, dtype=object), -1, 10**6).astype(int),
+        np.clip(np.array(ends, dtype=object), -1, 10**6).astype(int),
+    )
+
+
+def circle(centre: np.ndarray, radius: float, sides: int = 48) -> np.ndarray:
+    """Draw a level circle as segments: (sides, 2, 3)."""
+    turn = np.linspace(0, 2 * np.pi, sides + 1)
+    ring = centre + radius * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
+    return np.stack([ring[:-1], ring[1:]], axis=1)
+
+
+def _usable(item: Item) -> bool:
+    return bool(np.isfinite(item.alt_m)) and abs(item.alt_m) < MAX_M
+
+
+def _spot(item: Item, place: Place, base: float, last: np.ndarray | None) -> np.ndarray:
+    """Place an item in the scene: (1, 3), or (0, 3) where it names no place. Latitude and longitude 0 mean "here"."""
+    up = (item.alt_m - place.origin.alt_mm * 1e-3) / UNIT_M if item.frame in ABSOLUTE else base + item.alt_m / UNIT_M
+    if item.lat_e7 == 0 and item.lon_e7 == 0:
+        return np.zeros((0, 3)) if last is None else np.array([[last[0], last[1], up]])
+    try:
+        spot = place.geodetic(np.array([item.lat_e7]), np.array([item.lon_e7]), np.array([place.origin.alt_mm]))
+    except (ValueError, OverflowError):
+        return np.zeros((0, 3))
+    spot[0, 2] = up
+    return spot
+
+
+def _radius_m(item: Item) -> float:
+    radius = abs(getattr(item, RADIUS_IN[item.command])) if RADIUS_IN[item.command] else 0.0
+    return radius if np.isfinite(radius) and 0 < radius < MAX_M else RADIUS_M
+
+
+def _jump(item: Item, spots: dict[int, np.ndarray], last: np.ndarray | None) -> list[np.ndarray]:
+    target = spots.get(int(item.param1)) if np.isfinite(item.param1) else None
+    return [np.stack([last, target])] if last is not None and target is not None and target.size else []

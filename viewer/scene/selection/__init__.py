@@ -1,0 +1,1 @@
+"""What the scene draws of the selected aircraft only."""

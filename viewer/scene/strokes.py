@@ -1,0 +1,105 @@
+"""Lines: one node of many segments, coloured per vertex, redrawn in place."""
+
+from typing import Any
+
+import numpy as np
+
+from viewer.theme.palette import line_colour
+
+_NONE = np.zeros((1, 2, 3), np.float32)  # the page wants at least one segment; this one has no length
+
+
+class Strokes:
+    """One node of line segments."""
+
+    def __init__(self, scene: Any, name: str, width: float) -> None:
+        self._node = scene.add_line_segments(
+            name, _NONE, np.zeros((1, 2, 3), np.uint8), thickness=width, thickness_units="screen"
+        )
+
+    def draw(self, segments: np.ndarray, colours: np.ndarray | None = None) -> None:
+        """Show segments (n, 2, 3) [10 m]; colours (3,), (n, 3) or (n, 2, 3), sRGB [0..255]; None keeps them."""
+        segments = np.asarray(segments, np.float32).reshape(-1, 2, 3)
+        if not len(segments):
+            segments, colours = _NONE, np.zeros(3)
+        if colours is not None:
+            self.colour(colours, len(segments))
+        self._node.points = segments
+
+    def colour(self, colours: np.ndarray, n: int) -> None:
+        """Colour n segments."""
+        colours = np.asarray(colours, float)
+        if colours.ndim == 2:
+            colours = colours[:, None, :]
+        self._node.colors = np.broadcast_to(line_colour(colours), (n, 2, 3))
+
+    def show(self, visible: bool) -> None:
+        """Show or hide the node."""
+        if self._node.visible != visible:
+            self._node.visible = visible
+
+
+def chain(points: np.ndarray) -> np.ndarray:
+    """Join neighbours: (..., n, 3) -> (..., n - 1, 2, 3)."""
+    return np.stack([points[..., :-1, :], points[..., 1:, :]], axis=-2)
+
+
+def rounded(points: np.ndarray, parts: int) -> np.ndarray:
+    """Lay a smooth curve through points (..., n, 3), each stretch in so many parts: (..., (n - 1) parts + 1, 3)."""
+    if parts < 2 or points.shape[-2] < 2:
+        return points
+    slope = np.gradient(points, axis=-2)
+    s = (np.arange(parts) / parts)[:, None]
+    a, b, da, db = (
+        x[..., None, :] for x in (points[..., :-1, :], points[..., 1:, :], slope[..., :-1, :], slope[..., 1:, :])
+    )
+    curve = a + (b - a) * s * s * (3 - 2 * s) + s * (1 - s) * ((1 - s) * da - s * db)
+    return np.concatenate([curve.reshape(*points.shape[:-2], -1, 3), points[..., -1:, :]], axis=-2)
+
+
+def dashed(points: np.ndarray) -> np.ndarray:
+    """Join every second pair of neighbours: (n, 3) -> (n // 2, 2, 3)."""
+    return chain(points)[::2]
+
+
+def dash_lines(segments: np.ndarray, length: float) -> np.ndarray:
+    """Cut straight segments (n, 2, 3) into dashes of about `length`, at most 200 each: (m, 2, 3)."""
+    cut = []
+    for a, b in segments:
+        steps = int(np.clip(np.linalg.norm(b - a) / length, 2, 400))
+        cut.append(dashed(a + np.linspace(0, 1, steps + 1)[:, None] * (b - a)))
+    return np.concatenate(cut) if cut else np.zeros((0, 2, 3))
+
+
+def faded(colour: np.ndarray, ground: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Fade a line along its segments: colour (..., 3), shares (n + 1,) of it at the joints -> (..., n, 2, 3)."""
+    joints = colour[..., None, :] * shares[:, None] + ground * (1 - shares[:, None])
+    return chain(joints)
+
+
+def closed(ring: np.ndarray) -> np.ndarray:
+    """Join the corners of rings (..., sides, 3) into closed loops: (..., sides, 2, 3)."""
+    return np.stack([ring, np.roll(ring, -1, axis=-2)], axis=-2)
+
+
+def disc(centre: np.ndarray, radius: float, sides: int = 40) -> np.ndarray:
+    """Lay the corners of a level circle round a place (3,): (sides, 3)."""
+    turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+    return centre + radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(sides)], axis=-1)
+
+
+class Sheaf:
+    """Segments of several colours for one node."""
+
+    def __init__(self) -> None:
+        self._lines: list[np.ndarray] = [np.zeros((0, 2, 3))]
+        self._colours: list[np.ndarray] = [np.zeros((0, 3))]
+
+    def add(self, lines: np.ndarray, colour: np.ndarray) -> None:
+        """Add segments (n, 2, 3) of one colour (3,), or of one each (n, 3)."""
+        self._lines.append(lines.reshape(-1, 2, 3))
+        self._colours.append(np.broadcast_to(colour, (len(self._lines[-1]), 3)))
+
+    def all(self) -> tuple[np.ndarray, np.ndarray]:
+        """Give what was added, for `Strokes.draw`."""
+        return np.concatenate(self._lines), np.concatenate(self._colours)

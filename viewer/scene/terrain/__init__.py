@@ -1,0 +1,1 @@
+"""Ground elevation and imagery from local files."""

@@ -1,0 +1,145 @@
+"""A raster file with its place on earth: GeoTIFF, or PNG and JPEG with bounds or a world file."""
+
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from viewer.scene.terrain.utm import to_utm
+
+MAX_PIXELS = 80_000_000  # of one file
+SCALE, TIEPOINT, MATRIX, KEYS, NO_DATA = 33550, 33922, 34264, 34735, 42113  # TIFF tags
+MODEL, RASTER_TYPE, PROJECTED = 1024, 1025, 3072  # keys in KEYS
+WORLD = (".wld", ".pgw", ".pngw", ".jgw", ".tfw")
+CURE = "write it as EPSG:4326 (gdalwarp -t_srs EPSG:4326) or name its bounds: FILE@south,west,north,east"
+
+
+class Raster(NamedTuple):
+    """Values on a grid, and how to find a place on earth in it."""
+
+    name: str
+    values: np.ndarray  # (h, w) heights [m above mean sea level], not a number where unknown; or (h, w, 3) colours
+    affine: np.ndarray  # (2, 3): column, row, 1 -> x, y of the middle of a pixel
+    zone: tuple[int, bool] | None = None  # UTM zone and whether it is a northern one; None: x, y are degrees
+
+    def at(self, lat_deg: np.ndarray, lon_deg: np.ndarray) -> np.ndarray:
+        """Interpolate at places of any shape: values, not a number outside; colours have a last axis of 3."""
+        from scipy.ndimage import map_coordinates  # here: a viewer without ground starts without it
+
+        lat, lon = np.asarray(lat_deg, float).ravel(), np.asarray(lon_deg, float).ravel()
+        x, y = (lon, lat) if self.zone is None else to_utm(lat, lon, self.zone[0], north=self.zone[1])
+        column, row = np.linalg.inv(self.affine[:, :2]) @ (np.stack([x, y]) - self.affine[:, 2:])
+        outside = (column < -0.5) | (row < -0.5)
+        outside |= (column > self.values.shape[1] - 0.5) | (row > self.values.shape[0] - 0.5)
+        planes = self.values.reshape(*self.values.shape[:2], -1).astype(np.float32)
+        found = [
+            map_coordinates(planes[..., k], [row, column], order=1, mode="nearest") for k in range(planes.shape[2])
+        ]
+        values = np.where(outside[:, None], np.nan, np.stack(found, axis=-1))
+        return values.reshape((*np.shape(lat_deg), *self.values.shape[2:]))
+
+
+def read(text: str, *, colours: bool) -> Raster:
+    """Read a raster.
+
+    Args:
+        text: `FILE`, or `FILE@south,west,north,east` in degrees
+        colours: whether it is a picture; else heights in metres
+    Raises:
+        ValueError: when it is no such file or has no place on earth; the sentence says what to do.
+        OSError: when it cannot be opened.
+    """
+    path, bounds = _split(text)
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # what is wrong is said below
+            if image.width * image.height > MAX_PIXELS:
+                raise ValueError(
+                    f"{path.name}: found {image.width} x {image.height} pixels, expected at most {MAX_PIXELS:,}; cut it"
+                )
+            values = _colours(image) if colours else _heights(image)
+            affine, zone = (_bounded(bounds, image), None) if bounds else _placed(path, image)
+    except (Image.UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, EOFError) as error:
+        raise ValueError(f"{path.name}: found no readable raster ({error}), expected GeoTIFF, PNG or JPEG") from None
+    except OSError as error:
+        if error.errno is not None:
+            raise
+        raise ValueError(
+            f"{path.name}: found a damaged raster ({error}), expected a whole one; fetch it again"
+        ) from None
+    return Raster(path.name, values, affine, zone)
+
+
+def _split(text: str) -> tuple[Path, list[float]]:
+    name, found, numbers = text.rpartition("@")
+    if not found:
+        return Path(text), []
+    try:
+        south, west, north, east = (float(x) for x in numbers.split(","))
+    except ValueError:
+        return Path(text), []  # the @ belongs to the name
+    if not (-90 <= south < north <= 90 and -180 <= west < east <= 180):
+        raise ValueError(
+            f"{name}: found bounds {numbers}, expected south,west,north,east in degrees; put them in order"
+        )
+    return Path(name), [south, west, north, east]
+
+
+def _colours(image: Any) -> np.ndarray:
+    return np.asarray(image.convert("RGB"))
+
+
+def _heights(image: Any) -> np.ndarray:
+    if len(image.getbands()) != 1 or image.mode == "P":
+        raise ValueError(f"terrain: found {image.mode} with {len(image.getbands())} bands, expected one band of metres")
+    values = np.asarray(image).astype(np.float32)
+    tags = getattr(image, "tag_v2", {})
+    try:
+        missing = float(str(tags.get(NO_DATA, "nan")).strip("\0 "))
+    except ValueError:
+        missing = np.nan
+    bad = (values == missing) | ~np.isfinite(values) | (np.abs(values) > 9_500)
+    return np.where(bad, np.nan, values)
+
+
+def _bounded(bounds: list[float], image: Any) -> np.ndarray:
+    south, west, north, east = bounds
+    dx, dy = (east - west) / image.width, (south - north) / image.height
+    return np.array([[dx, 0.0, west + dx / 2], [0.0, dy, north + dy / 2]])
+
+
+def _placed(path: Path, image: Any) -> tuple[np.ndarray, tuple[int, bool] | None]:
+    """Read where it lies: from its own tags, else from a world file beside it."""
+    tags = dict(getattr(image, "tag_v2", {}))
+    if KEYS in tags and (SCALE in tags or MATRIX in tags):
+        return _tagged(path.name, tags)
+    for suffix in WORLD:
+        if (beside := path.with_suffix(suffix)).is_file():
+            a, d, b, e, c, f = (float(x) for x in beside.read_text(encoding="ascii").split()[:6])
+            return np.array([[a, b, c], [d, e, f]]), None
+    raise ValueError(f"{path.name}: found nothing that says where it lies, expected a GeoTIFF or a world file; {CURE}")
+
+
+def _tagged(name: str, tags: dict[int, Any]) -> tuple[np.ndarray, tuple[int, bool] | None]:
+    keys = np.array(tags[KEYS][4:], int)
+    told = {int(k[0]): int(k[3]) for k in keys[: len(keys) // 4 * 4].reshape(-1, 4) if k[1] == 0}
+    zone = _zone(name, told)
+    if MATRIX in tags:
+        matrix = np.array(tags[MATRIX], float).reshape(4, 4)[:2][:, [0, 1, 3]]
+    else:
+        (dx, dy), (i, j, _, x, y, _) = tags[SCALE][:2], tags[TIEPOINT][:6]
+        matrix = np.array([[dx, 0.0, x - i * dx], [0.0, -dy, y + j * dy]], float)
+    if told.get(RASTER_TYPE, 1) == 1:  # told for the corner of a pixel, wanted for its middle
+        matrix = matrix + np.outer(matrix[:, :2].sum(axis=1) / 2, [0, 0, 1])
+    return matrix, zone
+
+
+def _zone(name: str, told: dict[int, int]) -> tuple[int, bool] | None:
+    if told.get(MODEL) == 2:
+        return None
+    code = told.get(PROJECTED, 0)
+    for base, north in ((32600, True), (32700, False), (25800, True)):
+        if base < code <= base + 60:
+            return code - base, north
+    raise ValueError(f"{name}: found projection EPSG:{code}, expected degrees or UTM on WGS 84; {CURE}")

@@ -1,0 +1,1 @@
+"""The viewer process and its pages."""

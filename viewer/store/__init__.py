@@ -1,0 +1,1 @@
+"""State of every aircraft as received from the bus."""

@@ -1,0 +1,127 @@
+"""A prediction as the scene has it: checked when it is heard, laid out in the scene when somebody looks."""
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet.contract import Prediction
+from viewer.store.place import REACH_M, UNIT_M, Place
+
+MAX_STEPS, MAX_AHEAD_S = 5_000, 3_600.0  # look-ahead accepted from outside: steps, and time [s]
+_CHORD_S, _MOST_PARTS = 1.5, 4  # look-aheads farther apart get points between, at most so many
+KEPT_S = 31.0  # look-ahead kept of what was predicted once [s]
+
+
+class Forecast:
+    """A prediction, checked; its arrays are in the scene."""
+
+    def __init__(self, message: Prediction, place: Place, heard: float) -> None:
+        self.t = message.t  # fleet time it starts at [s since 1970]
+        self.heard = heard  # when it arrived, monotonic [s]
+        self.message = message
+        self.place = place
+
+    @cached_property
+    def until(self) -> float:
+        """Give the look-ahead up to which anything is claimed: the horizon, within what was sent [s]."""
+        horizon, last = self.message.horizon_s, float(self.message.ahead.numpy()[-1])
+        return float(min(max(horizon if np.isfinite(horizon) else 0.0, 0.0), last))
+
+    @property
+    def ahead(self) -> np.ndarray:
+        """Give the look-ahead of each point, rising, (n,) [s]."""
+        return self._laid[0]
+
+    @property
+    def path(self) -> np.ndarray:
+        """Give the mean positions, scene ENU, (n, 3) [10 m]."""
+        return self._laid[1]
+
+    @property
+    def tube(self) -> np.ndarray:
+        """Give the half-axes along, cross, vertical, (n, 3) [10 m]."""
+        return self._laid[2]
+
+    @cached_property
+    def _laid(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        told = self.message
+        ahead, path, tube = (a.numpy().astype(float) for a in (told.ahead, told.path, told.tube))
+        tube = np.clip(np.nan_to_num(tube / UNIT_M), 0.0, 1e4)
+        return smooth(ahead, self.place.local(told.ned_origin(), path), tube)
+
+    def at(self, ahead: np.ndarray | float) -> np.ndarray:
+        """Interpolate the mean path at look-aheads (k,) [s] -> (k, 3) [10 m]; held beyond both ends."""
+        return np.stack([np.interp(ahead, self.ahead, self.path[:, i]) for i in range(3)], axis=-1)
+
+    def width(self, ahead: np.ndarray) -> np.ndarray:
+        """Interpolate the half-axes at look-aheads (k,) [s] -> (k, 3) [10 m]."""
+        return np.stack([np.interp(ahead, self.ahead, self.tube[:, i]) for i in range(3)], axis=-1)
+
+    def kept(self, before: "Kept | None" = None) -> "Kept":
+        """Give what is kept of it when newer ones have come; `before` is what was kept before it."""
+        path, ahead = self.message.path.numpy(), self.message.ahead.numpy()
+        ahead = ahead[: int(np.searchsorted(ahead, KEPT_S, side="right"))]
+        same = before is not None and np.array_equal(before.ahead, ahead)
+        kept = before.ahead if before is not None and same else ahead.copy()
+        return Kept(self.t, self.until, kept, path[: len(ahead)].copy(), self.message.origin, self.place)
+
+
+class Kept(NamedTuple):
+    """What was predicted once, as it was sent: a few hundred bytes."""
+
+    t: float  # fleet time it starts at [s since 1970]
+    until: float  # horizon [s]
+    ahead: np.ndarray  # (n,) [s]
+    ned: np.ndarray  # from `origin`, (n, 3) [m]
+    origin: tuple[int, int, int]  # lat, lon [1e-7 deg], alt [mm]
+    place: Place
+
+    def at(self, ahead: np.ndarray | float) -> np.ndarray:
+        """Interpolate the mean path at look-aheads (k,) [s] -> (k, 3) [10 m]."""
+        path = self.place.local(self.origin, self.ned)
+        return np.stack([np.interp(ahead, self.ahead, path[:, i]) for i in range(3)], axis=-1)
+
+
+def forecast(message: Prediction, place: Place, heard: float) -> Forecast | None:
+    """Check a prediction; None where it carries no path.
+
+    Raises:
+        ValueError: when its arrays disagree, are not finite or do not rise in time; the worker must resend.
+        TooFar: when it is farther than 100 km from the fleet.
+    """
+    ahead, path, tube = (a.numpy() for a in (message.ahead, message.path, message.tube))
+    n = ahead.shape[0] if ahead.ndim == 1 else -1
+    if n == 0:
+        return None
+    if not 2 <= n <= MAX_STEPS or path.shape != (n, 3) or tube.shape != (n, 3):
+        raise ValueError(
+            f"uav-{message.uav}: prediction has shapes {ahead.shape} {path.shape} {tube.shape}, "
+            f"expected (n,) (n, 3) (n, 3) with 2 to {MAX_STEPS} steps; resend"
+        )
+    rises = (ahead[1:] > ahead[:-1]).all() and abs(ahead[0]) <= MAX_AHEAD_S and abs(ahead[-1]) <= MAX_AHEAD_S
+    if not rises or not np.isfinite(message.t):
+        raise ValueError(f"uav-{message.uav}: prediction has times that do not rise within an hour; resend")
+    if not np.abs(path).max() <= REACH_M:  # also where it is not finite
+        raise ValueError(f"uav-{message.uav}: prediction has a path that is not finite or beyond 100 km; resend")
+    place.spot(*message.origin)
+    return Forecast(message, place, heard)
+
+
+def smooth(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lay points between look-aheads that are seconds apart: a chord would cut a turn by metres."""
+    if np.diff(ahead).max() <= _CHORD_S or len(ahead) < 4:
+        return ahead, path, tube
+    parts = np.minimum(np.ceil(np.diff(ahead) / _CHORD_S), _MOST_PARTS).astype(int)
+    at = np.interp(np.arange(parts.sum() + 1), np.concatenate([[0], np.cumsum(parts)]), ahead)
+    return at, _cubic(ahead, path, at), np.stack([np.interp(at, ahead, column) for column in tube.T], axis=-1)
+
+
+def _cubic(ahead: np.ndarray, path: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Interpolate points (n, 3) at look-aheads (k,) by cubics whose slopes are those of neighbours: (k, 3)."""
+    slope = np.gradient(path, ahead, axis=0, edge_order=2)
+    i = np.clip(np.searchsorted(ahead, at, side="right") - 1, 0, len(ahead) - 2)
+    h = (ahead[i + 1] - ahead[i])[:, None]
+    s = (at - ahead[i])[:, None] / h
+    ends = (1 + 2 * s) * (1 - s) ** 2 * path[i] + s**2 * (3 - 2 * s) * path[i + 1]
+    return ends + h * s * (1 - s) * ((1 - s) * slope[i] - s * slope[i + 1])

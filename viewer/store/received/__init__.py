@@ -1,0 +1,1 @@
+"""Messages as received from the bus, their times and rows."""

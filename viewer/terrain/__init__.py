@@ -1,1 +1,0 @@
-"""The ground as files tell it: heights and pictures from the operator's own disk, no network."""

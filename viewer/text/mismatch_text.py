@@ -1,0 +1,102 @@
+"""A mismatch as the page shows it: where on the flown path, in which words. Strings of the bus are escaped here."""
+
+from html import escape
+from math import isfinite
+
+import numpy as np
+
+from fleet.contract import Found, Mismatch
+from viewer.scene.strokes import chain
+from viewer.store.track import placed
+from viewer.theme.palette import Palette
+
+MOST, MOST_POINTS = 12, 200  # segments and causes shown of one UAV, and points of a segment
+MOST_WORDS = 600  # letters of a sentence
+_WORD = {Found.NAMED: "named", Found.SUSPECTED: "suspected", Found.UNKNOWN: "unknown physics"}
+
+
+def in_force(found: Mismatch | None) -> bool:
+    """Tell whether a mismatch stands that an operator must know of: named, or unknown; a suspicion is none yet."""
+    return found is not None and found.outcome in (Found.NAMED, Found.UNKNOWN)
+
+
+def short(found: Mismatch) -> str:
+    """Say in few words what it is, not yet escaped."""
+    names = " and ".join(_where(one.name, one.surface) for one in found.causes[:3] if one.name != "unknown")
+    if found.outcome is Found.UNKNOWN:
+        return f"unknown physics in {found.causes[0].channel[:40]}" if found.causes else "unknown physics"
+    return names or _WORD.get(found.outcome, "")
+
+
+def _where(name: str, surface: str) -> str:
+    return name[:40].replace("_", " ") + (f" of the {surface[:20]}" if surface else "")
+
+
+def spans(found: Mismatch | None, newest: float) -> list[tuple[float, float]]:
+    """Give when it was located, (begin, end) on the fleet clock [s]; the last one goes on to `newest`."""
+    if found is None or found.outcome is Found.NONE:
+        return []
+    pairs = [pair for one in found.causes[:MOST] for pair in one.segments[:MOST]][:MOST]
+    sound = [(begin, end) for begin, end in pairs if isfinite(begin) and isfinite(end)]
+    return [(begin, newest if end >= found.t - 5.0 else min(end, newest)) for begin, end in sound]
+
+
+def within(t: np.ndarray, found: Mismatch | None) -> np.ndarray:
+    """Tell which of some rising times (n,) lie where it was located, (n,)."""
+    inside = np.zeros(len(t), bool)
+    for begin, end in spans(found, float(t[-1])) if len(t) else []:
+        inside |= (t >= begin) & (t <= end)
+    return inside
+
+
+def lines(found: Mismatch | None, track: np.ndarray) -> np.ndarray:
+    """Give the stretches of the flown path where it was located, as segments (n, 2, 3) [10 m].
+
+    Args:
+        found: what was said last
+        track: the flown path: fleet time [s], scene ENU [10 m], (m, 4)
+    """
+    parts = [np.zeros((0, 2, 3))]
+    if found is None or found.outcome is Found.NONE or len(track) < 2:
+        return parts[0]
+    newest, oldest = float(track[-1, 0]), float(track[0, 0])
+    for begin, last in spans(found, newest):
+        if last > (first := max(begin, oldest)):
+            points = placed(track, np.linspace(first, last, min(int(last - first) + 2, MOST_POINTS)))
+            parts.append(chain(points[np.isfinite(points).all(axis=1)]))
+    return np.concatenate(parts)
+
+
+def place(found: Mismatch | None, track: np.ndarray) -> np.ndarray | None:
+    """Give where on the flown path the first cause began, (3,) [10 m]; None where that is not known."""
+    if found is None or found.outcome is Found.NONE or found.onset is None or not isfinite(found.onset):
+        return None
+    (spot,) = placed(track, np.array([found.onset]))
+    return spot if np.isfinite(spot).all() else None
+
+
+def card(found: Mismatch | None, palette: Palette) -> str:
+    """Show the sentence with its proof; nothing where there is no mismatch."""
+    if found is None or found.outcome is Found.NONE:
+        return ""
+    colour = palette.mismatch if in_force(found) else palette.identifying
+    head = f"{'▲' if in_force(found) else '△'} mismatch {_WORD[found.outcome]}"
+    rows = "".join(f'<tr><td class="soft key">{k}</td><td class="value">{v}</td></tr>' for k, v in _proof(found))
+    model = "predicting with it" if found.adapted else "not in the model that predicts"
+    return (
+        f'<div class="say mismatch" style="border-color:{colour}"><b style="color:{colour}">{head}</b> '
+        f'<span class="soft">{model}</span><br>{escape(found.sentence[:MOST_WORDS])}<table>{rows}</table></div>'
+    )
+
+
+def _proof(found: Mismatch) -> list[tuple[str, str]]:
+    pairs = (
+        ("residual", found.fit_before, found.fit_after, "σ of usual flight, held out"),
+        ("force error", found.force_before, found.force_after, "m/s², held out"),
+        ("5 s free flight", found.stray_before, found.stray_after, "°"),
+    )
+    return [
+        (name, f"{before:.2f} → <b>{after:.2f}</b> {unit}")
+        for name, before, after, unit in pairs
+        if before is not None and after is not None and isfinite(before) and isfinite(after)
+    ]

@@ -1,0 +1,1 @@
+"""Colours, shapes and number formats of the page."""

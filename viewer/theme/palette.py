@@ -1,0 +1,197 @@
+"""The colours of the page, and the one place where the renderer's tone mapping is undone."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fleet.contract import State
+from viewer.theme.events import Kind
+
+
+@dataclass(frozen=True)
+class Palette:
+    """Colours of one theme, as sRGB hex."""
+
+    dark: bool
+    predicting: str
+    verified: str
+    identifying: str
+    lost: str
+    mismatch: str
+    horizon: str
+    ground: str
+    ink: str
+    muted: str
+    panel: str
+    grid: str
+    section: str
+    ring: str
+    tube: str
+    route: str
+    flown: str
+    sky: tuple[str, str]
+
+    def state(self, state: State) -> str:
+        """Give the colour of a state."""
+        return {
+            State.PREDICTING: self.predicting,
+            State.VERIFIED: self.verified,
+            State.IDENTIFYING: self.identifying,
+            State.LINK_LOST: self.lost,
+        }.get(state, self.muted)
+
+    def looks(self) -> tuple[str, ...]:
+        """Give the colours of `flock.LOOKS`, in their order."""
+        return self.muted, self.predicting, self.verified, self.identifying, self.lost, self.mismatch
+
+    def event(self, kind: Kind) -> str:
+        """Give the colour of an event; none but a verified model has that of "verified"."""
+        return {
+            Kind.MODE: self.predicting,
+            Kind.ITEM: self.route,
+            Kind.MISSION: self.route,
+            Kind.ARMED: self.ink,
+            Kind.DISARMED: self.ink,
+            Kind.WARNING: self.mismatch,
+            Kind.ALERT: self.mismatch,
+            Kind.MISMATCH: self.mismatch,
+            Kind.VERIFIED: self.verified,
+            Kind.SOUND: self.verified,
+            Kind.DOUBTED: self.identifying,
+            Kind.NO_MODEL: self.identifying,
+            Kind.PARAMETERS: self.route,
+            Kind.TAKE_OFF: self.ink,
+            Kind.LANDING: self.ink,
+            Kind.GROUND: self.ink,
+            Kind.FRAME: self.mismatch,
+            Kind.END: self.ink,
+        }.get(kind, self.lost)
+
+
+DARK = Palette(
+    dark=True,
+    predicting="#3E96DC",
+    verified="#2BC49A",
+    identifying="#F0B8E0",
+    lost="#7F8894",
+    mismatch="#FF6B35",
+    horizon="#F0E442",
+    ground="#0E141E",
+    ink="#E6EDF5",
+    muted="#8B98A8",
+    panel="#111925",
+    grid="#1B2533",
+    section="#2A3849",
+    ring="#3B4D63",
+    tube="#56B4E9",
+    route="#9A8FD0",
+    flown="#DCE6F0",
+    sky=("#0B0F17", "#1A2433"),
+)
+LIGHT = Palette(
+    dark=False,
+    predicting="#0072B2",
+    verified="#00795A",
+    identifying="#6A2C7A",
+    lost="#6B7280",
+    mismatch="#B93A00",
+    horizon="#A67C00",
+    ground="#F4F6F9",
+    ink="#17212E",
+    muted="#64748B",
+    panel="#FFFFFF",
+    grid="#E2E8EF",
+    section="#CBD5E0",
+    ring="#94A3B8",
+    tube="#0072B2",
+    route="#7A6BB8",
+    flown="#334155",
+    sky=("#DCE6F0", "#FFFFFF"),
+)
+
+GLYPH = {
+    State.PREDICTING: "➤",
+    State.VERIFIED: "✓",
+    State.IDENTIFYING: "◐",
+    State.LINK_LOST: "✕",
+    State.WAITING: "◌",
+    State.UNCLAIMED: "○",
+}
+MARK = {
+    Kind.MODE: "◆",
+    Kind.ITEM: "›",
+    Kind.MISSION: "≡",
+    Kind.ARMED: "●",
+    Kind.DISARMED: "○",
+    Kind.WARNING: "!",
+    Kind.ALERT: "▲",
+    Kind.MISMATCH: "≠",
+    Kind.EASED: "△",
+    Kind.LOST: "✕",
+    Kind.BACK: "↺",
+    Kind.VERIFIED: "✓",
+    Kind.SOUND: "✓",
+    Kind.DOUBTED: "◑",
+    Kind.NO_MODEL: "◌",
+    Kind.PARAMETERS: "≈",
+    Kind.TAKE_OFF: "↗",
+    Kind.LANDING: "↘",
+    Kind.GROUND: "▁",
+    Kind.BLIND: "⊘",
+    Kind.SIGHT: "⊙",
+    Kind.FRAME: "⌖",
+    Kind.END: "■",
+}
+WORD = {state: state.value.replace("_", " ") for state in State}
+
+# ACES filmic fit as the renderer applies it to every line. Source: Hill, "BakingLab" 2016, ACES.hlsl.
+_IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
+_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
+_EXPOSURE = 0.6
+
+
+def rgb(colour: str) -> np.ndarray:
+    """Read `#RRGGBB` as (3,) floats [0..255]."""
+    return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)], float)
+
+
+def triple(colour: str) -> tuple[int, int, int]:
+    """Read `#RRGGBB` as three integers, as the page library wants them."""
+    r, g, b = rgb(colour)
+    return int(r), int(g), int(b)
+
+
+def mix(colour: str, other: str, share: float) -> np.ndarray:
+    """Blend two colours, `share` of the first; lines have no alpha, so they fade to the ground: (3,) [0..255]."""
+    return rgb(colour) * share + rgb(other) * (1 - share)
+
+
+def line_colour(wanted: np.ndarray) -> np.ndarray:
+    """Give the vertex colour that the renderer shows as `wanted`: (..., 3) sRGB [0..255] -> (..., 3) uint8.
+
+    Vertex colours are taken as linear and then tone-mapped; this is the inverse of both, clipped to what is reachable.
+    """
+    y = np.clip(_linear(np.asarray(wanted, float) / 255) @ np.linalg.inv(_OUT).T, 0, 0.98)
+    a, b, c = 1 - 0.983729 * y, 0.0245786 - 0.432951 * y, -(0.000090537 + 0.238081 * y)
+    v = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)
+    return np.rint(255 * np.clip(_EXPOSURE * v @ np.linalg.inv(_IN).T, 0, 1)).astype(np.uint8)
+
+
+def shown_line(vertex: np.ndarray) -> np.ndarray:
+    """Tell what a vertex colour looks like on screen: (..., 3) [0..255] -> (..., 3) sRGB [0..255]."""
+    v = (np.asarray(vertex, float) / 255 / _EXPOSURE) @ _IN.T
+    v = (v * (v + 0.0245786) - 0.000090537) / (v * (0.983729 * v + 0.4329510) + 0.238081)
+    return 255 * _companded(np.clip(v @ _OUT.T, 0, 1))
+
+
+def mesh_colour(wanted: np.ndarray) -> np.ndarray:
+    """Give instance colours of a lit mesh, which are taken as linear too: (n, 3) sRGB [0..255] -> uint8."""
+    return np.rint(255 * _linear(np.clip(np.asarray(wanted, float), 0, 255) / 255)).astype(np.uint8)
+
+
+def _linear(s: np.ndarray) -> np.ndarray:
+    return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+
+
+def _companded(c: np.ndarray) -> np.ndarray:
+    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.clip(c, 0, None) ** (1 / 2.4) - 0.055)

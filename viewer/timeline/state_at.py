@@ -1,0 +1,39 @@
+"""How a UAV stood at a time, in few words: what its panel and its row in the table need."""
+
+from typing import NamedTuple
+
+from fleet.contract import About, Alert, Link, Mismatch, State
+from viewer.store.vehicle import Vehicle
+from viewer.text.words import fit
+
+
+class Stood(NamedTuple):
+    """How a UAV stood, from a time on until the next."""
+
+    t: float  # data time [s since 1970]
+    state: State
+    link: Link
+    mode: str
+    armed: bool
+    sentence: str  # of its status
+    verdict: str  # of its newest identification
+    fit: float | None  # mean over the states [%]
+    alerts: dict[About, Alert]
+    mismatch: Mismatch | None
+
+
+def stood(vehicle: Vehicle, at: float, now: float) -> Stood:
+    """Write down how a UAV stands at data time `at` [s since 1970]; `now` is monotonic [s]."""
+    status, mean = vehicle.status, fit(vehicle)
+    return Stood(
+        at,
+        vehicle.state(now),
+        status.link if status is not None else Link.LIVE,
+        status.mode if status is not None else "",
+        status.armed if status is not None else False,
+        status.sentence if status is not None else "",
+        vehicle.model.verdict.sentence if vehicle.model is not None else "",
+        None if mean is None else float(round(mean)),
+        vehicle.alerts,
+        vehicle.mismatch,
+    )
