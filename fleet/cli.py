@@ -89,6 +89,12 @@ def id_range(text: str) -> range:
     return range(int(low), int(high or low) + 1)
 
 
+def command_modules() -> dict[str, str]:
+    """List the verbs and the module of each."""
+    modules = pkgutil.walk_packages(commands.__path__, f"{commands.__name__}.")
+    return {module.name.rpartition(".")[2]: module.name for module in modules if not module.ispkg}
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run `fleet <verb>`."""
     parser = parser_for(
@@ -97,11 +103,11 @@ def main(argv: list[str] | None = None) -> int:
         "  fleet up --uavs 8\n  fleet status --json\n  fleet schema prediction\n",
     )
     verbs = parser.add_subparsers(title="verbs", dest="verb", metavar="VERB", required=True)
-    for found in sorted(pkgutil.iter_modules(commands.__path__), key=lambda module: module.name):
-        module = importlib.import_module(f"fleet.commands.{found.name}")
+    for name, path in sorted(command_modules().items()):
+        module = importlib.import_module(path)
         summary = (module.__doc__ or "").strip().splitlines()[0]
         verb = verbs.add_parser(
-            found.name,
+            name,
             help=summary,
             description=summary,
             epilog="examples:\n" + module.EXAMPLES.strip("\n"),

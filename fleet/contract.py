@@ -699,3 +699,9 @@ PER_UAV: tuple[type[Message], ...] = (Sample, Status, Mission, Params, History, 
 CONTROL: tuple[type, ...] = (FleetState, Predictions, Account, Claim, Handover)
 QUERIES: dict[type, type] = {Prediction: WhatIf, Handover: Wanted}  # what a query on a key may carry
 TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}  # type: ignore[attr-defined]
+
+
+def meaning(hint: Any) -> str:
+    """Read the description, with its unit, off an annotation."""
+    metas = [m for m in getattr(hint, "__metadata__", ()) if isinstance(m, msgspec.Meta)]
+    return " ".join(m.description for m in metas if m.description)

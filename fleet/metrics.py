@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, get_type_hints
 from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from fleet.commands.offline.schema import meaning
-from fleet.contract import Link
+from fleet.contract import Link, meaning
 
 Families = Callable[[], Iterable[Metric]]
 

@@ -2,7 +2,6 @@
 
 import argparse
 import importlib
-import pkgutil
 import shutil
 import ssl
 import subprocess
@@ -12,7 +11,7 @@ from pathlib import Path
 import pytest
 from conftest import ROOT, unused_port
 
-from fleet import cli, commands
+from fleet import cli
 from fleet.access.entry import ROUTER, Entry
 from fleet.access.knock import answers
 from fleet.access.papers import ending, papers_of, password_of
@@ -98,10 +97,10 @@ def test_a_file_that_makes_no_sense_is_refused_in_a_sentence(tmp_path: Path, tex
 def parsers() -> dict[str, argparse.ArgumentParser]:
     """Every verb of `fleet` that joins the bus."""
     found = {}
-    for module in pkgutil.iter_modules(commands.__path__):
-        if module.name not in OFF_THE_BUS:
-            found[module.name] = argparse.ArgumentParser()
-            importlib.import_module(f"fleet.commands.{module.name}").arguments(found[module.name])
+    for name, path in cli.command_modules().items():
+        if name not in OFF_THE_BUS:
+            found[name] = argparse.ArgumentParser()
+            importlib.import_module(path).arguments(found[name])
     return found
 
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from fleet import contract
 from fleet.bus.codec import Stamp, decode, encode, encoding, pack_stamp, unpack_stamp
-from fleet.commands.offline.schema import meaning, parts_of
-from fleet.contract import COLUMNS, DTYPES, TOPICS, Array, Params, Prediction, Sample
+from fleet.commands.offline.schema import parts_of
+from fleet.contract import COLUMNS, DTYPES, TOPICS, Array, Params, Prediction, Sample, meaning
 
 GOLDEN = Path(__file__).parent / "golden"
 KINDS = list(TOPICS.values())

@@ -19,10 +19,11 @@ from fleet.access.entry import Entry
 from fleet.access.knock import _cure
 from fleet.bus.memory_bus import MemoryBus
 from fleet.bus.session import open_router
-from fleet.commands.live.status import machines, processes, spans
+from fleet.commands.live.status import machines, processes
 from fleet.contract import Account, Claim, FleetRow, FleetState, LinkAccount, State, Status
 from fleet.health import claims, door, machine
 from fleet.health.finding import BAD, NOTE, OK
+from fleet.report.report_text import spans
 from tests.bench.security.bombs import ESCAPES
 from tests.bench.security.site import expired, make_papers, make_passwords
 

@@ -270,7 +270,7 @@ def test_a_twin_that_answers_and_one_that_does_not(tlog, monkeypatch, capsys):
 
 
 def test_the_help_does_not_load_the_plots():
-    code = "import sys; from fleet.commands import inspect; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys; from fleet.commands.offline import inspect; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

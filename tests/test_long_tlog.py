@@ -23,7 +23,7 @@ FILES = 12  # so many that a terminal that is read late on a busy machine is sti
 PEAK = """
 import resource, sys
 from pathlib import Path
-from fleet.commands.inspect import read
+from fleet.commands.offline.inspect import read
 heard = read(Path(sys.argv[1]))
 (told,) = heard.file.aircraft
 print(round(told.seconds), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)

@@ -3,7 +3,6 @@
 import ast
 import importlib
 import importlib.metadata
-import pkgutil
 import re
 import subprocess
 import sys
@@ -14,7 +13,7 @@ import pytest
 from conftest import ROOT
 from test_house import PACKAGES, imported, sources
 
-from fleet import cli, commands
+from fleet import cli
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 OFFERED = {"msgpack"}  # not imported: the wire format, for tools such as the README's
@@ -94,12 +93,12 @@ def test_the_lock_holds_every_dependency_by_version_and_hash_and_no_address(lock
 
 # --- commands --------------------------------------------------------------------------------------------------------
 
-VERBS = sorted(found.name for found in pkgutil.iter_modules(commands.__path__))
+VERBS = sorted(cli.command_modules())
 
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_is_whole_and_its_help_shows_examples(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    module = importlib.import_module(f"fleet.commands.{verb}")
+    module = importlib.import_module(cli.command_modules()[verb])
     assert f"fleet {verb}" in module.EXAMPLES
     assert callable(module.arguments) and callable(module.run)
     with pytest.raises(SystemExit) as left:

@@ -7,6 +7,7 @@ from pretend_feed import HOSTILE, STAMP, Clock, T, feed_of
 
 from fleet.contract import Cause, Found, Mismatch
 from viewer.panels.detail import about
+from viewer.scene import mismatch_lines
 from viewer.text import mismatch_text
 from viewer.text.words import alerts, severity, table
 from viewer.theme.events import Kind
@@ -74,22 +75,22 @@ def test_a_mismatch_is_an_event_once(scene):
 
 
 def test_segments_lie_on_the_flown_path():
-    drawn = mismatch_text.lines(told((T + 20.0, T + 30.0)), TRACK)
+    drawn = mismatch_lines.lines(told((T + 20.0, T + 30.0)), TRACK)
     assert drawn[0, 0, 0] == pytest.approx(20.0) and drawn[-1, 1, 0] == pytest.approx(30.0)
-    assert mismatch_text.place(told((T + 20.0, T + 30.0)), TRACK) == pytest.approx([20.0, 0.0, 9.0])
-    goes_on = mismatch_text.lines(told((T + 50.0, T + 98.0)), TRACK)
+    assert mismatch_lines.place(told((T + 20.0, T + 30.0)), TRACK) == pytest.approx([20.0, 0.0, 9.0])
+    goes_on = mismatch_lines.lines(told((T + 50.0, T + 98.0)), TRACK)
     assert goes_on[-1, 1, 0] == pytest.approx(99.0)  # up to the aircraft
-    assert len(mismatch_text.lines(told((T - 500.0, T - 400.0)), TRACK)) == 0
-    assert len(mismatch_text.lines(None, TRACK)) == len(mismatch_text.lines(told((T, T + 9.0)), TRACK[:1])) == 0
+    assert len(mismatch_lines.lines(told((T - 500.0, T - 400.0)), TRACK)) == 0
+    assert len(mismatch_lines.lines(None, TRACK)) == len(mismatch_lines.lines(told((T, T + 9.0)), TRACK[:1])) == 0
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e300])
 def test_absurd_times_draw_nothing_absurd(bad):
     for segment in ((bad, T + 9.0), (T, bad), (bad, bad)):
         found = told(*(segment,) * 50)
-        assert np.isfinite(mismatch_text.lines(found, TRACK)).all()
-        assert len(mismatch_text.lines(found, TRACK)) <= mismatch_text.MOST * mismatch_text.MOST_POINTS
-    assert mismatch_text.place(told((bad, T)), TRACK) is None
+        assert np.isfinite(mismatch_lines.lines(found, TRACK)).all()
+        assert len(mismatch_lines.lines(found, TRACK)) <= mismatch_text.MOST * mismatch_lines.MOST_POINTS
+    assert mismatch_lines.place(told((bad, T)), TRACK) is None
 
 
 def test_a_long_sentence_is_cut():

@@ -12,8 +12,8 @@ from math import cos, sin, sqrt, tan
 import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
-from fleet.autopilots.arduplane.l1 import clip, to_roll
-from fleet.autopilots.common.controller_state import making
+from fleet.autopilots.arduplane.l1 import to_roll
+from fleet.autopilots.common.kernels import clip, making
 from fleet.frames import G
 from fleet.mission import KIND, LAND, VA_C
 

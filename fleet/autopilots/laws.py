@@ -21,9 +21,10 @@ from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane.guide import fly as fly_arduplane
 from fleet.autopilots.arduplane.guide import settle
 from fleet.autopilots.arduplane.guide import shift as shift_arduplane
-from fleet.autopilots.arduplane.params import Row, find
-from fleet.autopilots.common.controller_state import LEG, kernel, making
+from fleet.autopilots.common.controller_state import LEG
+from fleet.autopilots.common.kernels import kernel, making
 from fleet.autopilots.common.parameter_vector import ARDUPLANE, LAW, PX4, TEXTBOOK, W_E, W_N, padded
+from fleet.autopilots.common.parameters import Row, find
 
 inlined = nb.njit(cache=True, error_model="numpy", inline="always")
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.controller_state import kernel, making
+from fleet.autopilots.common.kernels import kernel, making
 from fleet.autopilots.laws import begin, engage, fly, shift, stabilise
 from fleet.frames import wrap
 from fleet.mission import SEQ

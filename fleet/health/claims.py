@@ -8,9 +8,9 @@ from collections.abc import Iterable, Iterator
 from fleet import SOURCES
 from fleet.bus.bus_protocol import Bus
 from fleet.bus.presence import read
-from fleet.commands.live.status import spans
 from fleet.contract import Account, Claim, Status
 from fleet.health.finding import BAD, NOTE, OK, Finding
+from fleet.report.report_text import spans
 
 APART_S = 0.2  # clocks of machines further apart are said [s]
 FAR_S = 1.0  # clocks further apart confuse epochs and ages [s]

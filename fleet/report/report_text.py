@@ -1,6 +1,7 @@
 """What a recording says, as tables for people; the same figures as the JSON."""
 
 from collections import Counter
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import Any
 
@@ -176,3 +177,14 @@ def _within(told: dict[str, Any]) -> list[str]:
     shares = {at: x for at, x in within.items() if isinstance(x, int | float)} if isinstance(within, dict) else {}
     said = ", ".join(f"{share:.0%} at {at} s" for at, share in shares.items())
     return [f"within 10 %: {said}"] if said else []
+
+
+def spans(uavs: Iterable[int]) -> str:
+    """Write ids with their ranges: 0-3, 7."""
+    parts: list[list[int]] = []
+    for uav in sorted(uavs):
+        if parts and parts[-1][1] == uav - 1:
+            parts[-1][1] = uav
+        else:
+            parts.append([uav, uav])
+    return ", ".join(f"{low}-{high}" if high > low else str(low) for low, high in parts)

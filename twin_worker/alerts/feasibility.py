@@ -17,6 +17,7 @@ from scipy.special import ndtr
 from fleet import mission as m
 from fleet.autopilots import arduplane
 from fleet.autopilots.arduplane import params as P
+from fleet.autopilots.common import parameters
 from fleet.contract import AlertKind
 from fleet.frames import G, Origin, to_geodetic
 from twin_worker.alerts.hysteresis import Finding
@@ -63,11 +64,11 @@ def ability(params: Mapping[str, float], altitude_m: float) -> Ability:
     if "FW_AIRSPD_TRIM" in params:
         names = ("FW_AIRSPD_TRIM", "FW_T_CLMB_MAX", "FW_T_SINK_MAX", "FW_R_LIM", "NAV_LOITER_RAD")
         Va, climb, sink, bank, radius = (params.get(name, np.nan) for name in names)
-        return Ability(Va * P.eas2tas(altitude_m), climb, sink, radians(bank), abs(radius))
+        return Ability(Va * parameters.eas2tas(altitude_m), climb, sink, radians(bank), abs(radius))
     par, absent = arduplane.parameters(params, altitude_m)
     at = (P.VA_CRUISE, P.CLIMB_MAX, P.SINK_MAX, P.ROLL_LIMIT, P.LOITER_RAD)
     Va, climb, sink, bank, radius = (np.nan if P.NAMES[i] in absent else float(par[i]) for i in at)
-    return Ability(Va * P.eas2tas(altitude_m), climb, sink, bank, abs(radius))
+    return Ability(Va * parameters.eas2tas(altitude_m), climb, sink, bank, abs(radius))
 
 
 def achievable(now: Now, able: Ability) -> Finding:
@@ -81,7 +82,7 @@ def achievable(now: Now, able: Ability) -> Finding:
     worst: tuple[float, str, np.ndarray, float] | None = None
     for leg in now.way.legs[:_LEGS]:
         to = leg[m.P_N : m.P_D + 1]
-        Va = leg[m.VA_C] * P.eas2tas(now.origin.alt_mm * 1e-3 - to[2]) if leg[m.VA_C] > 0 else able.Va
+        Va = leg[m.VA_C] * parameters.eas2tas(now.origin.alt_mm * 1e-3 - to[2]) if leg[m.VA_C] > 0 else able.Va
         if not isfinite(Va):
             break
         speed, (p, why) = _worst(leg, from_p, Va, able, now.wind)

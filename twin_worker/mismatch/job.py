@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleet.contract import COLUMNS
-from twin_worker.diagnosis.baseline.calibrate import own_weather
 from twin_worker.diagnosis.baseline.own_past import later
 from twin_worker.diagnosis.baseline.past import BEFORE_S, calibrate_past, since
 from twin_worker.diagnosis.data.card import Card
@@ -17,6 +16,7 @@ from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
 from twin_worker.diagnosis.inference.report import Report
 from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.model.residual import Case
+from twin_worker.diagnosis.model.weather import own_weather
 from twin_worker.mismatch.effect_increments import Push, pushes
 from twin_worker.telemetry.history import History
 

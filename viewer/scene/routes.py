@@ -5,11 +5,22 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet.contract import Item, Mission
+from viewer.store.mission_items import (
+    DO_JUMP,
+    LAND,
+    LOITER_TIME,
+    LOITER_TO_ALT,
+    LOITER_TURNS,
+    LOITER_UNLIM,
+    RTL,
+    SPLINE,
+    TAKEOFF,
+    VTOL_LAND,
+    VTOL_TAKEOFF,
+    WAYPOINT,
+)
 from viewer.store.place import UNIT_M, Place
 
-# MAV_CMD. Source: MAVLink common.xml.
-WAYPOINT, LOITER_UNLIM, LOITER_TURNS, LOITER_TIME, RTL, LAND, TAKEOFF, LOITER_TO_ALT = 16, 17, 18, 19, 20, 21, 22, 31
-SPLINE, VTOL_TAKEOFF, VTOL_LAND, DO_JUMP = 82, 84, 85, 177
 AT_A_PLACE = {
     WAYPOINT,
     LOITER_UNLIM,
@@ -21,20 +32,6 @@ AT_A_PLACE = {
     SPLINE,
     VTOL_TAKEOFF,
     VTOL_LAND,
-}
-ITEM_NAMES = {
-    WAYPOINT: "waypoint",
-    LOITER_UNLIM: "loiter",
-    LOITER_TURNS: "loiter turns",
-    LOITER_TIME: "loiter for a time",
-    RTL: "return",
-    LAND: "land",
-    TAKEOFF: "take-off",
-    LOITER_TO_ALT: "loiter to altitude",
-    SPLINE: "spline waypoint",
-    VTOL_TAKEOFF: "VTOL take-off",
-    VTOL_LAND: "VTOL landing",
-    DO_JUMP: "jump",
 }
 RADIUS_IN = {LOITER_UNLIM: "param3", LOITER_TURNS: "param3", LOITER_TIME: "", LOITER_TO_ALT: "param2"}
 ABSOLUTE = {0, 5}  # MAV_FRAME: GLOBAL, GLOBAL_INT; every other altitude counts from home

@@ -24,7 +24,7 @@ from fleet.contract import (
     Verdict,
 )
 from fleet.contract import Event as Happened
-from viewer.scene.routes import ITEM_NAMES
+from viewer.store.mission_items import ITEM_NAMES
 from viewer.store.received.inbox import Head
 from viewer.theme.events import LATEST, MAX_RAISED, Event, Kind
 

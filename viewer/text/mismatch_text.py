@@ -6,11 +6,9 @@ from math import isfinite
 import numpy as np
 
 from fleet.contract import Found, Mismatch
-from viewer.scene.strokes import chain
-from viewer.store.track import placed
 from viewer.theme.palette import Palette
 
-MOST, MOST_POINTS = 12, 200  # segments and causes shown of one UAV, and points of a segment
+MOST = 12  # segments and causes shown of one UAV
 MOST_WORDS = 600  # letters of a sentence
 _WORD = {Found.NAMED: "named", Found.SUSPECTED: "suspected", Found.UNKNOWN: "unknown physics"}
 
@@ -47,32 +45,6 @@ def within(t: np.ndarray, found: Mismatch | None) -> np.ndarray:
     for begin, end in spans(found, float(t[-1])) if len(t) else []:
         inside |= (t >= begin) & (t <= end)
     return inside
-
-
-def lines(found: Mismatch | None, track: np.ndarray) -> np.ndarray:
-    """Give the stretches of the flown path where it was located, as segments (n, 2, 3) [10 m].
-
-    Args:
-        found: what was said last
-        track: the flown path: fleet time [s], scene ENU [10 m], (m, 4)
-    """
-    parts = [np.zeros((0, 2, 3))]
-    if found is None or found.outcome is Found.NONE or len(track) < 2:
-        return parts[0]
-    newest, oldest = float(track[-1, 0]), float(track[0, 0])
-    for begin, last in spans(found, newest):
-        if last > (first := max(begin, oldest)):
-            points = placed(track, np.linspace(first, last, min(int(last - first) + 2, MOST_POINTS)))
-            parts.append(chain(points[np.isfinite(points).all(axis=1)]))
-    return np.concatenate(parts)
-
-
-def place(found: Mismatch | None, track: np.ndarray) -> np.ndarray | None:
-    """Give where on the flown path the first cause began, (3,) [10 m]; None where that is not known."""
-    if found is None or found.outcome is Found.NONE or found.onset is None or not isfinite(found.onset):
-        return None
-    (spot,) = placed(track, np.array([found.onset]))
-    return spot if np.isfinite(spot).all() else None
 
 
 def card(found: Mismatch | None, palette: Palette) -> str:

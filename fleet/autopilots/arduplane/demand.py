@@ -9,9 +9,8 @@ from math import cos, sin, sqrt
 import numpy as np
 
 from fleet.autopilots.arduplane import params as P
-from fleet.autopilots.arduplane.l1 import clip
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.controller_state import kernel
+from fleet.autopilots.common.kernels import clip, kernel
 from fleet.frames import G
 
 _W = 2.0  # bandwidth of the airspeed filter [rad/s]

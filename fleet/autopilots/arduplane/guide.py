@@ -7,7 +7,7 @@ from fleet.autopilots.arduplane import legs as leg_rules
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.arduplane.attitude import FULL
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.controller_state import kernel, making
+from fleet.autopilots.common.kernels import kernel, making
 from fleet.frames import G
 from fleet.mission import VA_C
 

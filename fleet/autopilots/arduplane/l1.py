@@ -12,19 +12,13 @@ import numpy as np
 
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.controller_state import hypot, kernel
+from fleet.autopilots.common.kernels import angle_to, clip, hypot, kernel
 from fleet.frames import G, wrap
 from fleet.mission import P_E, P_N
 
 _SHALLOW = 0.0873  # crosstrack angle below which its integral runs: 5 deg [rad]
 _STEEP = 0.7071  # sine of the steepest approach to a line: 45 deg [-]
 _MOST = 0.1  # limit of the crosstrack integral [rad]
-
-
-@kernel
-def clip(x: float, low: float, high: float) -> float:
-    """Limit x; nan stays nan."""
-    return low if x < low else (high if x > high else x)
 
 
 @kernel
@@ -46,12 +40,6 @@ def distance(par: np.ndarray, speed: float) -> float:
 def to_roll(par: np.ndarray, a_lat: float, theta: float) -> float:
     """Turn lateral acceleration [m/s2] into the bank that gives it in a level turn, limited [rad]."""
     return clip(atan(a_lat / (G * max(cos(theta), 0.5))), -par[P.ROLL_LIMIT], par[P.ROLL_LIMIT])
-
-
-@kernel
-def angle_to(v_n: float, v_e: float, n: float, e: float) -> float:
-    """Give the angle from one horizontal vector to another, right positive [rad]."""
-    return atan2(v_n * e - v_e * n, v_n * n + v_e * e)
 
 
 @kernel

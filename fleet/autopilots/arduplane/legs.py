@@ -11,7 +11,8 @@ import numpy as np
 from fleet.autopilots.arduplane import l1
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.controller_state import hypot, kernel
+from fleet.autopilots.common import kernels
+from fleet.autopilots.common.kernels import hypot, kernel
 from fleet.frames import wrap
 from fleet.mission import (
     ACCEPT,
@@ -172,7 +173,7 @@ def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.nda
         return True
     v_n, v_e, _ = l1.ground_track(v, psi)
     extra = np.floor(max(ctl[S.ANGLE] - ctl[S.READY], 0.0) / (2 * pi))
-    return abs(l1.angle_to(v_n, v_e, out_n, out_e)) <= _EXIT * (1.0 + extra)
+    return abs(kernels.angle_to(v_n, v_e, out_n, out_e)) <= _EXIT * (1.0 + extra)
 
 
 @kernel
@@ -205,4 +206,4 @@ def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndar
     along, length = along_line(ctl, leg, p)
     if length < 0.1:
         return h
-    return h - rise * (1.0 - l1.clip(along / length, 0.0, 1.0))
+    return h - rise * (1.0 - kernels.clip(along / length, 0.0, 1.0))

@@ -4,24 +4,14 @@ Source: ArduPlane 4.x parameter list (names, defaults, units); older names from 
 """
 
 from collections.abc import Mapping
-from math import isfinite, radians
-from typing import NamedTuple
+from math import radians
 
 import numpy as np
 
+from fleet.autopilots.common.parameters import Row, eas2tas, find
+
 _DEG = radians(1.0)
 _PERCENT = 0.01
-
-
-class Row(NamedTuple):
-    """One parameter: name, default and range as ArduPilot has them, factor to SI, older names with their factor."""
-
-    name: str
-    default: float
-    factor: float
-    low: float
-    high: float
-    older: tuple[tuple[str, float], ...] = ()  # (older name, older unit in units of the new one)
 
 
 TABLE = (
@@ -133,21 +123,6 @@ def vector(found: Mapping[str, float], altitude_m: float = 0.0) -> np.ndarray:
     par[THR_MIN] = max(par[THR_MIN], 0.0)  # reverse thrust is not modelled
     par[EAS2TAS] = eas2tas(altitude_m)
     return par
-
-
-def eas2tas(altitude_m: float) -> float:
-    """Give true over equivalent airspeed at a height above sea level [m]. Source: ISA, troposphere."""
-    h = min(max(altitude_m, -500.0), 11_000.0) if isfinite(altitude_m) else 0.0
-    return float((1 - 2.25577e-5 * h) ** (-4.25588 / 2))
-
-
-def find(row: Row, given: Mapping[str, float]) -> float | None:
-    """Give the value of a row under its present or an older name; None where it is missing, not finite or absurd."""
-    for name, unit in ((row.name, 1.0), *row.older):
-        value = given.get(name)
-        if value is not None and isfinite(value) and row.low <= value * unit <= row.high:
-            return value * unit
-    return None
 
 
 def _order(found: dict[str, float]) -> list[str]:

@@ -12,9 +12,8 @@ import numpy as np
 
 from fleet.autopilots.arduplane import params as P
 from fleet.autopilots.arduplane.demand import SLOWEST, demand_height, demand_speed, slowest
-from fleet.autopilots.arduplane.l1 import clip
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.controller_state import kernel
+from fleet.autopilots.common.kernels import clip, kernel
 from fleet.frames import G
 
 

@@ -3,15 +3,6 @@
 The slots up to N_LEG belong to the leg being flown; the shadow run winds them back on their own.
 """
 
-from math import sqrt
-
-import numba as nb
-
-# no fastmath: nan means "no airspeed sensor"; nothing raises inside
-making = nb.njit(cache=True, error_model="numpy", nogil=True)
-# these make no array: counting who holds which took half their time
-kernel = nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]
-
 # the leg
 LEG = 0  # index of the current leg
 PREV_N, PREV_E, PREV_D = 1, 2, 3  # where its line begins, NED [m]
@@ -46,9 +37,3 @@ I_A, I_E = 43, 44  # integrators [rad of surface]
 E_A, E_E, D_A, D_E = 45, 46, 47, 48  # last errors [rad/s], filtered derivatives [rad/s2]
 S_A, S_E = 49, 50  # last surfaces before the limit, 1 = full throw
 N_CTL = 51
-
-
-@nb.njit(cache=True, error_model="numpy", inline="always")
-def hypot(x, y):  # type: ignore[no-untyped-def]
-    """Give the length of a horizontal vector; what `math.hypot` guards against is not met on this earth."""
-    return sqrt(x * x + y * y)

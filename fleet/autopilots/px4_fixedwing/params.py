@@ -8,8 +8,8 @@ from math import radians
 
 import numpy as np
 
-from fleet.autopilots.arduplane.params import Row, eas2tas, find
 from fleet.autopilots.common.parameter_vector import PX4, padded
+from fleet.autopilots.common.parameters import Row, eas2tas, find
 
 _DEG = radians(1.0)
 

@@ -9,9 +9,8 @@ from math import atan2, hypot, pi
 import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
-from fleet.autopilots.arduplane.l1 import angle_to, clip
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.controller_state import kernel
+from fleet.autopilots.common.kernels import angle_to, clip, kernel
 from fleet.autopilots.px4_fixedwing import npfg
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import state as X

@@ -12,9 +12,8 @@ from math import cos, sqrt
 import numpy as np
 
 from fleet.autopilots.arduplane.demand import SLOWEST
-from fleet.autopilots.arduplane.l1 import clip
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.controller_state import kernel
+from fleet.autopilots.common.kernels import clip, kernel
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import state as X
 from fleet.frames import G

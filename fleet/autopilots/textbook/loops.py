@@ -9,9 +9,8 @@ import numpy as np
 
 from fleet.autopilots.arduplane import demand
 from fleet.autopilots.arduplane import legs as leg_rules
-from fleet.autopilots.arduplane.l1 import clip
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.controller_state import kernel, making
+from fleet.autopilots.common.kernels import clip, kernel, making
 from fleet.autopilots.textbook import params as P
 from fleet.autopilots.textbook import path
 from fleet.autopilots.textbook import state as X

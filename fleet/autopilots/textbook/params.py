@@ -8,8 +8,8 @@ from math import pi
 
 import numpy as np
 
-from fleet.autopilots.arduplane.params import Row, eas2tas, find
 from fleet.autopilots.common.parameter_vector import TEXTBOOK, padded
+from fleet.autopilots.common.parameters import Row, eas2tas, find
 
 TABLE = (
     Row("chi_inf", pi / 3, 1, 0.1, pi / 2),

@@ -8,9 +8,8 @@ from math import atan, atan2, cos, hypot, pi, sin, tan
 import numpy as np
 
 from fleet.autopilots.arduplane import legs as leg_rules
-from fleet.autopilots.arduplane.l1 import clip
 from fleet.autopilots.common import controller_state as S
-from fleet.autopilots.common.controller_state import kernel
+from fleet.autopilots.common.kernels import clip, kernel
 from fleet.autopilots.textbook import params as P
 from fleet.autopilots.textbook import state as X
 from fleet.frames import G, wrap

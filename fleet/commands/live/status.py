@@ -3,7 +3,6 @@
 import argparse
 import json
 import sys
-from collections.abc import Iterable
 
 import msgspec
 from rich.console import Console
@@ -16,6 +15,7 @@ from fleet.bus.session import connect
 from fleet.config import entry, router_arguments
 from fleet.contract import Account, Claim, FleetRow, FleetState, State, Status
 from fleet.process.sanitise import plain
+from fleet.report.report_text import spans
 
 EXAMPLES = """
   fleet status
@@ -83,17 +83,6 @@ def machines(found: list[tuple[str, str, str, str]]) -> Table:
     for line in found:
         out.add_row(*(escape(plain(word)) or "-" for word in line))
     return out
-
-
-def spans(uavs: Iterable[int]) -> str:
-    """Write ids with their ranges: 0-3, 7."""
-    parts: list[list[int]] = []
-    for uav in sorted(uavs):
-        if parts and parts[-1][1] == uav - 1:
-            parts[-1][1] = uav
-        else:
-            parts.append([uav, uav])
-    return ", ".join(f"{low}-{high}" if high > low else str(low) for low, high in parts)
 
 
 def as_objects(rows: list[FleetRow]) -> list[dict[str, object]]:

@@ -13,7 +13,7 @@ import msgspec
 
 from fleet.bus.bus_protocol import key
 from fleet.bus.codec import encoding
-from fleet.contract import COLUMNS, PER_UAV, QUERIES, TOPICS, Sample
+from fleet.contract import COLUMNS, PER_UAV, QUERIES, TOPICS, Sample, meaning
 
 EXAMPLES = """
   fleet schema                        every key in one table
@@ -110,12 +110,6 @@ def default_of(field: msgspec.structs.FieldInfo) -> str:
     """Show the default as JSON would."""
     value = field.default_factory() if field.default is msgspec.NODEFAULT else field.default
     return msgspec.json.encode(value).decode() if value == value else "nan"
-
-
-def meaning(hint: Any) -> str:
-    """Read the description, with its unit, off an annotation."""
-    metas = [m for m in getattr(hint, "__metadata__", ()) if isinstance(m, msgspec.Meta)]
-    return " ".join(m.description for m in metas if m.description)
 
 
 def type_name(hint: Any) -> str:

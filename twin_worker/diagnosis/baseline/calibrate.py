@@ -12,8 +12,8 @@ from twin_worker.diagnosis.data.flight import Flight
 from twin_worker.diagnosis.inference.isolation.nuisance import WIDEST, nuisances, wandering, wanders
 from twin_worker.diagnosis.inference.isolation.select_hypotheses import best
 from twin_worker.diagnosis.inference.isolation.unmodelled import oddities
-from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight, is_weather
-from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline, Noise
+from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
+from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline, Noise, is_weather
 from twin_worker.diagnosis.model.residual import Case
 from twin_worker.diagnosis.model.weather import fit_wind, wind
 
@@ -125,11 +125,6 @@ def replaced(case: Case, base: Baseline) -> Case:
         case.base, noise=base.noise, spread=base.spread, usual=base.usual, chance=base.chance, others=base.others
     )
     return Case(case.flight, own, like=case)
-
-
-def own_weather(case: Case) -> tuple[Guess, ...]:
-    """Give the flight's own mean wind as granted, where wind is weather."""
-    return wind(fit_wind(case, np.zeros(4))) if is_weather(case.base) else ()
 
 
 def _with_noise(base: Baseline, cases: Sequence[Case], winds: Sequence[np.ndarray], level: bool) -> Baseline:

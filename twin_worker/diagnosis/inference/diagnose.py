@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from fleet.effects import Onset, Stage, catalogue
-from twin_worker.diagnosis.baseline.calibrate import own_weather
 from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, Guess
 from twin_worker.diagnosis.data.flight import Flight
 from twin_worker.diagnosis.data.smooth import thinned
@@ -27,6 +26,7 @@ from twin_worker.diagnosis.inference.validation.unexplained import free_form, st
 from twin_worker.diagnosis.inference.words import sentence, since
 from twin_worker.diagnosis.model.baseline import CHANNELS, SHOWN_BY, Baseline
 from twin_worker.diagnosis.model.residual import Case
+from twin_worker.diagnosis.model.weather import own_weather
 
 _TOLD = 0.10  # or of the error of forces told
 _KEPT = 0.15  # of an effect's gain that must show on held-out data too

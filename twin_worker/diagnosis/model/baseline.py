@@ -13,6 +13,7 @@ CHANNELS = (
 )
 """Residuals: fx [m/s2]; beta, alpha [deg]; p', q', r' [rad/s2]; airspeed [m/s]; dV/dt against the accelerometer
 [m/s2]; Euler rates against the gyros [rad/s]; barometric height [m]."""
+WEATHER_MPS = 1.0  # nominal flights that differ by more had weather: a mean wind is then never a finding
 
 
 @dataclass(frozen=True)
@@ -98,3 +99,8 @@ def silenced(base: Baseline, equations: Iterable[str]) -> Baseline:
         sigma[CHANNELS.index(SHOWN_BY[name])] = DEAF
         r2[name] = min(r2.get(name, 0.0), 0.0)
     return replace(base, noise=Noise(base.noise.ar, sigma), r2=r2)
+
+
+def is_weather(base: Baseline) -> bool:
+    """Tell whether the nominal flights had wind, so that a mean wind is nobody's finding."""
+    return max(base.spread.get(f"wind_steady:{axis}", 0.0) for axis in ("w_n", "w_e")) > WEATHER_MPS

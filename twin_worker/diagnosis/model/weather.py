@@ -6,6 +6,7 @@ from scipy.optimize import least_squares
 from fleet.effects import catalogue
 from twin_worker.diagnosis.data.fault_hypothesis import Guess
 from twin_worker.diagnosis.data.smooth import thinned
+from twin_worker.diagnosis.model.baseline import is_weather
 from twin_worker.diagnosis.model.residual import RHO_0, Case
 
 CORRELATED = 50.0  # residual rows that count as one
@@ -66,3 +67,8 @@ def fit_wind(case: Case, w: np.ndarray) -> np.ndarray:
         if np.abs(change).max() < 0.01:
             break
     return w
+
+
+def own_weather(case: Case) -> tuple[Guess, ...]:
+    """Give the flight's own mean wind as granted, where wind is weather."""
+    return wind(fit_wind(case, np.zeros(4))) if is_weather(case.base) else ()

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from fleet.contract import State
+from viewer.scene import mismatch_lines
 from viewer.scene.labels import Sight, Tag
 from viewer.scene.routes import NOTHING, Route
 from viewer.scene.selection.hindcast import hindcast
@@ -145,8 +146,8 @@ class Selection:
         sound = ~mismatch_text.within(rows[:, 0], vehicle.mismatch)[1:] & (rows[:-1, 0] < self._since)
         self._flown.draw(chain(rows[:, 1:])[sound] if len(rows) > 1 else NOTHING.legs, self._flown_colour)
         found = vehicle.mismatch
-        self._mismatch.draw(mismatch_text.lines(found, rows), rgb(self._palette.mismatch))
-        begun = mismatch_text.place(found, rows)
+        self._mismatch.draw(mismatch_lines.lines(found, rows), rgb(self._palette.mismatch))
+        begun = mismatch_lines.place(found, rows)
         self.marks = self._pins.draw(vehicle.events, rows, vehicle.where(now), unit)
         if found is not None and begun is not None:
             self.marks.insert(0, Tag("mismatch", f"▲ {mismatch_text.short(found)} from here", begun))

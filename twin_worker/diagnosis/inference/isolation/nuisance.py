@@ -16,7 +16,6 @@ _SHARE = 0.03  # least scatter of a derivative without the vane [-]
 WIDEST = 4.0  # a learnt spread over its floor
 RELEASED = 2.5  # spreads past which a difference is no nuisance any more
 SOUND = 3.3  # and of a sensor's bias, which a data sheet allows for
-WEATHER_MPS = 1.0  # nominal flights that differ by more had weather: a mean wind is then never a finding
 
 WAVES = 3  # slow courses a wandering nuisance may take
 _WANDERS = {  # what sensors and weather do not keep to during a flight: effect -> floor over that of its mean

@@ -9,13 +9,12 @@ import numpy as np
 from twin_worker.diagnosis.data.fault_hypothesis import Guess
 from twin_worker.diagnosis.inference.isolation.nuisance import (
     RELEASED,
-    WEATHER_MPS,
     Nuisance,
     nuisances,
     wandering,
     wanders,
 )
-from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline
+from twin_worker.diagnosis.model.baseline import CHANNELS, is_weather
 from twin_worker.diagnosis.model.residual import Case
 
 CLIP = 6.0  # whitened residuals beyond count as much [-];
@@ -199,8 +198,3 @@ class Sight:
         """Give the mean square of each channel's whitened residual, nuisances taken off, (c,)."""
         e = self.e + self.Jn @ self.xn
         return (e[self.ok] ** 2).mean(axis=0) if self.ok.any() else np.zeros(len(CHANNELS))
-
-
-def is_weather(base: Baseline) -> bool:
-    """Tell whether the nominal flights had wind, so that a mean wind is nobody's finding."""
-    return max(base.spread.get(f"wind_steady:{axis}", 0.0) for axis in ("w_n", "w_e")) > WEATHER_MPS
