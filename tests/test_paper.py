@@ -17,7 +17,8 @@ from fleet.simulator.flight.uav import PretendUav
 from twin_worker.identification.linear.linear_model import AXES
 from twin_worker.paper_experiments import __main__, experiment
 from twin_worker.paper_experiments.experiment import NAMES, Experiment, Plan, both_steps
-from twin_worker.paper_experiments.recorded_flights import MODES, Flown, flown, mode_of
+from twin_worker.paper_experiments.recorded_flights import Flown, flown
+from twin_worker.telemetry.flight_phase import MODES, mode_of
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from conftest import ROOT
-from test_house import PACKAGES, imported, sources
+from test_architecture import PACKAGES, imported, sources
 
 from fleet import cli
 

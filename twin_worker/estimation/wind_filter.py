@@ -1,11 +1,13 @@
 """Wind and airspeed scale from ground velocity, airspeed and heading: a Kalman filter on the wind triangle."""
 
+from bisect import bisect_left
 from collections.abc import Iterable
 from math import atan2, cos, exp, hypot, inf, isfinite, sin, sqrt
 
 import numpy as np
 
 from fleet.physics.kernel import kernel
+from twin_worker.telemetry.history import History
 
 DRIFT, DRIFT_S = 0.6, 60.0  # slow change of the wind: standard deviation, correlation time [m/s, s]
 GUST, GUST_S = 0.8, 7.0  # turbulence along the flight, likewise
@@ -175,3 +177,32 @@ class WindFilter:
         P = self.P
         both = P[2:4, 2:4] + P[2:4, 4:6] + P[4:6, 2:4] + P[4:6, 4:6]
         return sqrt(max(both[0, 0], both[1, 1]))
+
+
+_EVERY_S = 0.199  # between rows taken [s]
+_STALE_S = 0.5  # airspeed and heading older than this say nothing of a velocity [s]
+
+
+def blow(wind: WindFilter, history: History, last: float, since: float, until: float = inf) -> float:
+    """Take ground velocities, five a second; give the time of the newest taken [s since 1970].
+
+    Args:
+        wind: changed in place
+        history: telemetry
+        last: newest row taken before [s since 1970]
+        since, until: rows before and after are left out [s since 1970]
+    """
+    times, v = history.look("velocity", since)
+    air_times, air = history.look("air", since - 1.0)
+    att_times, attitude = history.look("attitude", since - 1.0)
+    t_air, t_att = air_times.tolist(), att_times.tolist()  # a few numbers are looked at faster than an array
+    if not (t_air and t_att):
+        return last
+    for t, ground in zip(times.tolist(), v.tolist(), strict=True):
+        if t - last < _EVERY_S or t >= until:
+            continue
+        i, j = bisect_left(t_air, t) - 1, bisect_left(t_att, t) - 1
+        if i >= 0 and j >= 0 and t - t_air[i] < _STALE_S and t - t_att[j] < _STALE_S:
+            last = t
+            wind.update(t, ground, float(air[i, 0]), float(attitude[j, 2]))
+    return last

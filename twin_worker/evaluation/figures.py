@@ -12,8 +12,8 @@ from fleet.report.ink import INK, LINES, MUTED, ROUTE
 from twin_worker.confidence.tube_and_horizon import LIMIT, QUANTILE
 from twin_worker.evaluation.scoring.case import OURS, Case
 from twin_worker.evaluation.scoring.score import LIMITS, Scores, score
-from twin_worker.paper_experiments.figures import house
-from twin_worker.paper_experiments.recorded_flights import MODES
+from twin_worker.numerics.plot_style import house
+from twin_worker.telemetry.flight_phase import MODES
 
 _COLOURS = dict(zip((OURS, "paper", "dynamics", "route_wind", "route", "imm", "ct", "cv"), LINES, strict=True))
 _BESIDE = ("paper", "route_wind")  # drawn beside ours where all would be too many

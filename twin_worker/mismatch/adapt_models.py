@@ -13,8 +13,7 @@ import numpy as np
 from fleet.contract import Outcome
 from fleet.physics.wrench import NAMES, WIND, L, M, N, X, Y, Z, terms
 from fleet.window import Window
-from twin_worker.estimation.wind_filter import WindFilter
-from twin_worker.estimation.wind_update import blow
+from twin_worker.estimation.wind_filter import WindFilter, blow
 from twin_worker.identification.fixed_wing.derivatives_model import Coupled
 from twin_worker.identification.fixed_wing.point_mass_with_effects import Added
 from twin_worker.identification.fixed_wing.point_mass_with_effects import extended as extended_hybrid

@@ -23,7 +23,8 @@ from fleet.cli import guarded, parser_for
 from fleet.process.logs import tell
 from twin_worker.paper_experiments.experiment import FIRST, NAMES, Experiment, Plan, experiments
 from twin_worker.paper_experiments.figures import draw
-from twin_worker.paper_experiments.recorded_flights import MODES, Flown, flown
+from twin_worker.paper_experiments.recorded_flights import Flown, flown
+from twin_worker.telemetry.flight_phase import MODES
 
 _SAY_EVERY = 20  # experiments between two words of progress
 

@@ -18,7 +18,8 @@ from twin_worker.identification.linear.prediction_error_method import refine
 from twin_worker.identification.linear.state_space import StateSpace
 from twin_worker.identification.linear.subspace import pbsid
 from twin_worker.identification.linear.subspace_open_loop import projection
-from twin_worker.paper_experiments.recorded_flights import Flown, mode_of
+from twin_worker.paper_experiments.recorded_flights import Flown
+from twin_worker.telemetry.flight_phase import mode_of
 from twin_worker.validation.held_out import Unseen
 from twin_worker.validation.verify import fit_percent, verify
 

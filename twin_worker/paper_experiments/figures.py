@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from fleet.report.ink import BAD, GRID, INK, LINES, MUTED, spread
-from twin_worker.paper_experiments.recorded_flights import MODES
+from fleet.report.ink import BAD, INK, LINES, MUTED, spread
+from twin_worker.numerics.plot_style import house
+from twin_worker.telemetry.flight_phase import MODES
 
 if TYPE_CHECKING:
     from twin_worker.paper_experiments.experiment import Experiment
@@ -87,12 +88,3 @@ def _boxes(fits: dict[str, np.ndarray], names: Sequence[str], title: str) -> Fig
     figure.supylabel("fit of a free run, at least −100 [%]", fontsize=9, color=INK)
     figure.suptitle(f"Fit per state: {title}", fontsize=11, color=INK)
     return figure
-
-
-def house(ax: Any, title: str) -> None:
-    """Give a panel its title and the colours of the page."""
-    ax.set_title(title, fontsize=9, color=INK)
-    ax.tick_params(labelsize=8, colors=MUTED)
-    ax.grid(color=GRID, lw=0.6)
-    for side in ax.spines.values():
-        side.set_color(GRID)

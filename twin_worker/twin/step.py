@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from fleet.contract import Alert, Event, FleetRow, Link, Message, Sample, State, Status
 from fleet.frames import to_ned
-from twin_worker.estimation.wind_update import blow
+from twin_worker.estimation.wind_filter import blow
 from twin_worker.prediction import method_selection
 from twin_worker.twin.state.checkpoint import EVERY_S, mark
 from twin_worker.twin.state.events import note

@@ -19,7 +19,7 @@ from twin_worker.diagnosis.inference.report import Outcome, Report
 from twin_worker.diagnosis.output.marks import LEGEND, SAID, empty, marks, span, times
 from twin_worker.diagnosis.output.traces import residuals, simulated
 from twin_worker.diagnosis.output.written import safe
-from twin_worker.paper_experiments.figures import house
+from twin_worker.numerics.plot_style import house
 
 KINDS = ("path", "residuals", "simulated", "candidates")
 _LETTERS = 50  # of a flight's name in a file's name, which holds 255 bytes

@@ -10,7 +10,7 @@ from twin_worker.diagnosis.inference.report import Report
 from twin_worker.diagnosis.inference.validation.cross_validate import SHOWS
 from twin_worker.diagnosis.model.baseline import CHANNELS
 from twin_worker.diagnosis.output.marks import AFTER, BEFORE, LEGEND, MEANING, empty, marks, runs, span
-from twin_worker.paper_experiments.figures import house
+from twin_worker.numerics.plot_style import house
 
 _MOST = 8  # channels drawn
 _FEW = 4  # drawn where none differs: that there is nothing must be seen

@@ -11,7 +11,7 @@ from twin_worker.evaluation.scoring.case import Case
 from twin_worker.evaluation.scoring.compare import compare
 from twin_worker.evaluation.scoring.score import LIMITS, Scores, quantile, score, surviving
 from twin_worker.evaluation.scoring.truth import WHOLE_S
-from twin_worker.paper_experiments.recorded_flights import MODES
+from twin_worker.telemetry.flight_phase import MODES
 
 LOOK_S = (5, 10, 16, 30, 60, 120, 180)  # look-aheads that are told, as far as predictions reach [s]
 _HEAD = ("t10", "t5", "t3")

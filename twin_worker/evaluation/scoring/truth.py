@@ -7,7 +7,7 @@ from fleet.mission import P_D, P_N, route
 from twin_worker.evaluation.scoring.case import Asked, Case
 from twin_worker.evaluation.scoring.log import Log
 from twin_worker.numerics.prediction_errors import path_length
-from twin_worker.paper_experiments.recorded_flights import mode_named
+from twin_worker.telemetry.flight_phase import mode_named
 
 FIRST_S = 120.0  # a start counts from here on: before, the twin has not seen its identification window [s]
 WHOLE_S = 60.0  # a start counts where so much was flown without an event [s]

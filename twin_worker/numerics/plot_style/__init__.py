@@ -1,0 +1,14 @@
+"""Style of the figures."""
+
+from typing import Any
+
+from fleet.report.ink import GRID, INK, MUTED
+
+
+def house(ax: Any, title: str) -> None:
+    """Give a panel its title and the colours of the page."""
+    ax.set_title(title, fontsize=9, color=INK)
+    ax.tick_params(labelsize=8, colors=MUTED)
+    ax.grid(color=GRID, lw=0.6)
+    for side in ax.spines.values():
+        side.set_color(GRID)
