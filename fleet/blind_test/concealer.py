@@ -1,4 +1,4 @@
-"""`python -m fleet.blind_test.concealer`: flies the examination, seals its labels, and ends; the only process that knows."""
+"""`python -m fleet.blind_test.concealer`: fly the flights of a blind test, seal their labels, exit."""
 
 import argparse
 import json

@@ -1,6 +1,7 @@
 """`python -m tests.bench.ensemble`: 100 aircraft, 50 members each, 60 s ahead on one core; beside all control loops.
 
-The peer flies as many members through `fleet.physics.simulate`: the same guidance, with attitude loops and coupled dynamics.
+The peer flies as many members through `fleet.physics.simulate`: the same guidance, with attitude loops and coupled
+dynamics.
 """
 
 import argparse
@@ -92,7 +93,8 @@ def _run(args: argparse.Namespace) -> int:
     ours, peer = seconds(bundles(control)), 10.0 * seconds(loops(control), 3)
     print(f"{UAVS} aircraft x {MEMBERS} members x {SECONDS} s: {ours:.2f} s of one core")
     print(
-        f"the same through attitude loops and coupled dynamics (fleet.physics.simulate): {peer:.2f} s, {peer / ours:.1f} times"
+        f"the same through attitude loops and coupled dynamics (fleet.physics.simulate): "
+        f"{peer:.2f} s, {peer / ours:.1f} times"
     )
     if args.json:
         args.json.write_text(json.dumps({"bundles_s": ours, "simulate_s": peer, "ratio": peer / ours}, indent=2) + "\n")

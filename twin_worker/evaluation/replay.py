@@ -1,4 +1,4 @@
-"""`python -m twin_worker.evaluation.replay FILE…`: run recordings through the twins offline, and say how their predictions fared.
+"""`python -m twin_worker.evaluation.replay FILE…`: replay recordings through the twins, offline.
 
 Per UAV: vehicle, methods and how many predictions each made, when it was first verified, the share of predictions
 within 10 % (relative error M1) up to 10, 30, 60 and 120 s, those ended by an event counted as long as they were

@@ -10,8 +10,8 @@
     delta_a, delta_e, delta_r = stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
 
 `fleet.autopilots.laws` makes `guide` and the shadow run of them. NPFG flies by the wind that the autopilot believes
-in: par[W_N], par[W_E] of `fleet.autopilots.common.parameter_vector`. Not modelled: terrain following, flaps, landing, the upper bound of
-the period in wind on circles, throttle compensation for airspeed and air density.
+in: par[W_N], par[W_E] of `fleet.autopilots.common.parameter_vector`. Not modelled: terrain following, flaps,
+landing, the upper bound of the period in wind on circles, throttle compensation for airspeed and air density.
 
 Source: see `npfg`, `tecs`; PX4 1.13 to 1.16 for the law as flown.
 """

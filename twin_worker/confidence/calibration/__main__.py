@@ -1,4 +1,4 @@
-"""`python -m twin_worker.confidence.calibration fit|check FILE…`: calibration tables from scored predictions, and their worth.
+"""`python -m twin_worker.confidence.calibration fit|check FILE…`: fit and evaluate calibration tables.
 
 `fit` writes a table for every group and every wider one, and says what tables that had not seen a flight claim of it
 (a setting of law, airframe and parameters, where a table spans several). `check` says what tables claim of other

@@ -33,7 +33,7 @@ def finite(plant: Plant) -> bool:
 
 
 def settled(plant: Plant, good: Window) -> tuple:
-    """Give the plant as `fleet.physics.simulate` flies it, its offsets moved by its mean miss of late: it starts without drift.
+    """Return the plant for `fleet.physics.simulate`, its offsets moved by its recent mean error: no drift at the start.
 
     Args:
         plant: the model

@@ -25,7 +25,7 @@ _POWER = 1.5  # on the standard deviations of the power: a closed loop tells it 
 def draw(
     now: Situation, start: Start, found: Hybrid, chance: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, ...]:
-    """Draw body, air and start for each member that `chance`, (m, seconds, 4), belongs to; see `fleet.physics.point_mass.bundle`.
+    """Draw body, air and start of each member for `chance`, (m, seconds, 4); see `fleet.physics.point_mass.bundle`.
 
     The first member is the likeliest flight itself: nothing is drawn for it.
     """

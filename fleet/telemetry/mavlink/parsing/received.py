@@ -1,7 +1,8 @@
 """What a link heard, as one stretch of bytes: the seam between receiving and decoding.
 
 A receiving thread lays the datagrams (or pieces of a stream) it got at once into one buffer, says where each begins
-and ends, when it came and who sent it, and puts all on the queue as one `gateway.links.link.Batch(number, heard=Heard(...))`:
+and ends, when it came and who sent it, and puts all on the queue as one
+`gateway.links.link.Batch(number, heard=Heard(...))`:
 
     slots: (1024, 2048) uint8 as `recvmmsg` filled them, lengths: (n,), addresses: a bytes-like per slot
     buf, stop = tight(slots.ravel(), np.arange(n) * 2048, lengths)            # a copy: the slots are free again
