@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from .door import BY_CERTIFICATE, BY_PASSWORD, ends_while_joined, renewed_while_joined
+from .limits import BY_LIMIT
 from .role import BY_ROLE
 from .site import OURS, REAL, Site, free_port, make_papers, make_passwords, routed, zenohd
 from .size import BY_SIZE
@@ -34,6 +35,7 @@ def main() -> int:
     if REAL not in kinds:
         print("no zenohd found (PARAUAV_ZENOHD, the path, ~/.cargo/bin): only our own router is tried", file=sys.stderr)
     found = [row for kind in kinds for row in _tried(kind)]
+    found += [_row(("", "gateway and page", one.__name__, one.__doc__ or ""), one) for one in BY_LIMIT]
     held = sum(row["held"] for row in found)
     print(f"{held} of {len(found)} held")
     if args.json:
