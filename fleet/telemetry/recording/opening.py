@@ -14,7 +14,7 @@ from typing import IO, Any
 _OPENERS: dict[str, Callable[..., Any]] = {".xz": lzma.open, ".gz": gzip.open, ".bz2": bz2.open}
 COMPRESSED = tuple(_OPENERS)
 _BROKEN = (EOFError, lzma.LZMAError, OSError, MemoryError, zlib.error)  # what a damaged archive raises
-RATIO = 15  # a recording compresses to a fifth, at best to a tenth: what unfolds further is no recording
+RATIO = 12  # a recording compresses to a fifth, at best to a tenth: what unfolds further is no recording
 UNFOLDED = 1 << 24  # bytes a compressed file may unfold to, whatever its size
 LARGEST_UNFOLDED = 1 << 28  # bytes of a compressed file that are read
 

@@ -21,6 +21,7 @@ from typing import Any
 from .door import BY_CERTIFICATE, BY_PASSWORD, ends_while_joined, renewed_while_joined
 from .forged import BY_FORGING
 from .hostile_files import BY_FILE
+from .limits import BY_LIMIT
 from .planted import BY_PLANTING
 from .role import BY_ROLE
 from .site import OURS, REAL, Site, free_port, make_papers, make_passwords, routed, zenohd
@@ -37,7 +38,7 @@ def main() -> int:
     if REAL not in kinds:
         print("no zenohd found (PARAUAV_ZENOHD, the path, ~/.cargo/bin): only our own router is tried", file=sys.stderr)
     found = [row for kind in kinds for row in _tried(kind)]
-    for what, attempts in (("caches", BY_PLANTING), ("epochs", BY_FORGING), ("files", BY_FILE)):
+    for what, attempts in (("caches", BY_PLANTING), ("epochs", BY_FORGING), ("files", BY_FILE), ("limits", BY_LIMIT)):
         found += [_row(("-", what, one.__name__, one.__doc__ or ""), one) for one in attempts]
     held = sum(row["held"] for row in found)
     print(f"{held} of {len(found)} held")
