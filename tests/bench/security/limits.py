@@ -16,13 +16,13 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-from fleet.telemetry.intake import FORGET_S, Intake
-from gateway.link import Batch
+from fleet.telemetry.mavlink.intake import FORGET_S, Intake
+from gateway.links.link import Batch
 from gateway.links.tcp_listener import MOST, TcpListener
 from gateway.record.tape import AGAIN_S, Budget, Tape
-from gateway.spec import read_spec
+from gateway.settings.link_spec import read_spec
 from tests.talker import T0, Talker
-from viewer.door import VIOLATION, quiet, serve
+from viewer.browser.http_server import VIOLATION, quiet, serve
 
 from . import hostile
 from .site import PATIENCE_S, free_port
