@@ -209,9 +209,8 @@ def _silent(site: Site, uavs: set[int], since: float) -> list[str]:
     rows = {row.uav: row for state, _ in site.reader.bus.ask(FleetState, timeout_s=5.0) for row in state.rows}
     found = [(gap, uav, rows.get(uav)) for gap, uav in gaps if gap > _LONG_S]
     return [
-        f"uav-{uav} {gap:.1f} s: "
-        + (f"{r.state}, sample {r.sample_age_s}, prediction {r.prediction_age_s}" if r else "?")
-        for gap, uav, r in found
+        f"uav-{uav} {gap:.1f} s: {row and (row.state.value, row.sample_age_s, row.prediction_age_s)}"
+        for gap, uav, row in found
     ]
 
 
