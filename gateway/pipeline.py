@@ -1,5 +1,6 @@
 """The working thread: queue -> decode -> intake -> bus, and questions back to the aircraft."""
 
+import gc
 import queue
 import threading
 import time
@@ -25,7 +26,7 @@ from gateway.status.link_statistics import Tally
 
 TICK_S = 0.1  # between two publications of a live link [s]
 NAP_S = 0.02  # at an empty queue [s]
-AT_ONCE = 4 << 20  # bytes heard between two publications; in a flood these come sooner than a tick
+AT_ONCE = 1 << 20  # bytes heard between two publications; in a flood these come sooner than a tick
 ACCOUNT_S = 1.0  # between two counts [s]
 
 
@@ -165,8 +166,9 @@ class Pump:
     def _forget(self, now: float) -> None:
         """Forget who is silent, as far as the intakes of live links do; `now` is fleet time [s since 1970]."""
         gone = {uav for number in self._live for uav in self.intakes[number].forget(now)}
-        if gone := gone - self._claims.keys():
-            self.publisher.forget(gone)
+        if gone:
+            self.publisher.forget(gone - self._claims.keys())
+            gc.collect()  # an aircraft and its parts refer to each other, and cycles are looked for rarely
 
     def _tell(self) -> None:
         now = wall() if self._live else self._recorded

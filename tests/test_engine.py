@@ -114,6 +114,19 @@ def test_heavy_work_falls_in_proportion_to_the_cpu_time_that_is_granted(clock: l
     assert usual > 0.7 and 0.4 < starved < 0.8
 
 
+def test_in_late_sweeps_no_ensemble_is_begun_while_flights_ahead_wait(clock: list[float]) -> None:
+    quota, granted = Quota(limit=0.01), []
+    for late, wanted in ((True, 9), (True, 9), (False, 9), (True, 9), (True, 1), (True, 1)):
+        quota.yield_to_telemetry(late)
+        quota.sweep()
+        granted.append(quota.grants(Work.ENSEMBLE))
+        clock[0] += 0.001
+        for _ in range(wanted):
+            quota.grants(Work.PREDICT)
+            clock[0] += 0.005 if wanted > 1 else 0.0001
+    assert granted == [True, False, True, False, False, True]
+
+
 def test_what_one_piece_of_work_took_too_much_is_missing_in_the_next_sweeps(clock: list[float]) -> None:
     quota, granted = Quota(limit=2.0**-7), []
     for _ in range(12):

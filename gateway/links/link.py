@@ -11,7 +11,7 @@ from fleet.telemetry.mavlink.parsing.received import Heard
 from gateway.settings.link_spec import Spec
 
 QUEUE = 20_000  # batches between receiving and decoding
-QUEUE_BYTES = 24 << 20  # in them
+QUEUE_BYTES = 8 << 20  # of one link in them: a flood on one link must not delay the others for long
 POLL_S = 0.2  # how soon a receiving thread notices the end [s]
 _T0 = time.time() - time.monotonic()
 

@@ -4,6 +4,7 @@ import logging
 import queue
 import threading
 import time
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from typing import NamedTuple
@@ -123,12 +124,13 @@ class Tapped(queue.Queue[Batch]):
 
     Args:
         most: batches
-        most_bytes: heard, in them
+        most_bytes: heard, in those of one link
     """
 
     def __init__(self, most: int, recorder: Recorder | None, most_bytes: int = QUEUE_BYTES) -> None:
         super().__init__(most)
-        self._recorder, self._size, self._most_bytes = recorder, 0, most_bytes
+        self._recorder, self._most_bytes = recorder, most_bytes
+        self._sizes: Counter[int] = Counter()  # bytes that wait, by link
 
     def put(self, item: Batch, block: bool = True, timeout: float | None = None) -> None:
         """Record what was heard, then queue it.
@@ -138,15 +140,16 @@ class Tapped(queue.Queue[Batch]):
         """
         if self._recorder is not None and item.heard is not None:
             self._recorder.hear(item.link, item.heard)
-        if item.size and self._size + item.size > self._most_bytes:
+        waiting = self._sizes[item.link]
+        if item.size and waiting and waiting + item.size > self._most_bytes:  # one batch alone always has room
             raise queue.Full
         super().put(item, block, timeout)
 
     def _put(self, item: Batch) -> None:
-        self._size += item.size
+        self._sizes[item.link] += item.size
         super()._put(item)
 
     def _get(self) -> Batch:
         item = super()._get()
-        self._size -= item.size
+        self._sizes[item.link] -= item.size
         return item

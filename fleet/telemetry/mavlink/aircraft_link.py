@@ -102,6 +102,9 @@ class Craft:
             arrival, what, arguments = self._waiting[self._done]
             self._done += 1
             what(*arguments, arrival)
+        if self._done == len(self._waiting):  # what was heard is not kept
+            self._waiting.clear()
+            self._done = 0
         found = (self.route.take(now), self.params.take(now), self._status(now))
         self.flock.look[self.number] = self._next(now)
         return [message for message in found if message is not None]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from fleet.contract import FleetState
 from twin_worker.ownership.rendezvous import owners
 
 from .site import Site, Worker, until
@@ -16,6 +17,7 @@ from .starve import limited
 _PATIENCE_S = 30.0
 _AFTER_S = 2.0  # looked at after it is over [s]
 _CALM_S = 4.0
+_SHOWN, _LONG_S = 5, 3.0  # aircraft of which is told what was wrong, and from which gap on [s]
 _STARVED = 0.1  # share of a core [-]
 
 
@@ -201,6 +203,17 @@ def busy(site: Site, _: Worker, seconds: float = 20.0) -> dict[str, Any]:
     return {"owners_changed": site.reader.moved - changes, "gap_s": site.reader.gap(uavs, begun)}
 
 
+def _silent(site: Site, uavs: set[int], since: float) -> list[str]:
+    """Tell of the aircraft with the longest gaps what their workers say of them."""
+    gaps = sorted(((site.reader.gap({uav}, since), uav) for uav in uavs), reverse=True)[:_SHOWN]
+    rows = {row.uav: row for state, _ in site.reader.bus.ask(FleetState, timeout_s=5.0) for row in state.rows}
+    found = [(gap, uav, rows.get(uav)) for gap, uav in gaps if gap > _LONG_S]
+    return [
+        f"uav-{uav} {gap:.1f} s: {row and (row.state.value, row.sample_age_s, row.prediction_age_s)}"
+        for gap, uav, row in found
+    ]
+
+
 def _starved(site: Site, pids: list[int], seconds: float) -> dict[str, Any]:
     """Limit processes for some time [s]; give how many owners changed, and how many predictions there are left."""
     uavs = set(range(site.uavs))
@@ -213,13 +226,14 @@ def _starved(site: Site, pids: list[int], seconds: float) -> dict[str, Any]:
         wait(seconds)
         took = time.monotonic() - begun
         per_s, gap, late = site.reader.count(uavs, begun) / took, site.reader.gap(uavs, begun), site.reader.late(begun)
-        claims = site.reader.announced(begun)
+        claims, silent = site.reader.announced(begun), _silent(site, uavs, begun)
         used = (sum(worker.cpu_s for worker in site.workers) - used) / took
     back = time.monotonic()
     wait(_CALM_S)
     return {
         "owners_changed": site.reader.moved - changes,
         "claims_gap_s": claims,
+        "longest": silent,
         "gap_s": gap,
         "predictions_per_s": [round(usual, 1), round(per_s, 1)],
         "behind_s": late,

@@ -198,7 +198,8 @@ def gateway(at: str, *options: str) -> Iterator[subprocess.Popen[str]]:
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as child:
         assert child.stdout is not None
         reader = threading.Thread(target=child.stdout.read)
-        child.stdout.readline()
+        while (line := child.stdout.readline()) and "udpin" not in line:
+            pass  # it may have to compile first
         reader.start()
         try:
             yield child

@@ -3,6 +3,7 @@
 A token bucket. While sweeps are in time it is filled with a fixed amount in each. A late sweep fills it with a share of
 the CPU time that this thread was really given since the sweep before: where the processor is shared with others, or
 limited, heavy work falls in proportion to the CPU time and no faster, however late every sweep is by the wall clock.
+While flights ahead wait in late sweeps, nothing else is begun.
 """
 
 import time
@@ -40,6 +41,9 @@ class Quota:
     refused: Counter[Work] = field(default_factory=Counter)
     _spent: float = 0.0
     _since: float | None = None  # when the work in hand was begun
+    _late: bool = False  # the last sweep was
+    _waits: bool = False  # a flight ahead was refused in the last sweep
+    _wanted: bool = False  # and in this one
     _swept: float = float("nan")  # CPU time of this thread when the sweep began [s]
 
     @property
@@ -50,12 +54,13 @@ class Quota:
     def sweep(self, *, hurry: bool = False) -> None:
         """Begin another sweep."""
         self.settle()
+        self._waits, self._wanted = self._wanted, False
         self._spent, self.hurry = max(self._spent - self.limit, 0.0), hurry and self.limited
 
     def yield_to_telemetry(self, late: bool) -> None:
         """Grant a share of the CPU time of the last sweep where that was late, else a little more again."""
         limit, now = min(self.limit, self.most), time.thread_time()
-        used, self._swept = now - self._swept, now
+        used, self._swept, self._late = now - self._swept, now, late
         if not late:
             self.limit = min(_GROWS * limit, self.most)
         elif used == used:
@@ -74,7 +79,9 @@ class Quota:
         if work is Work.RENEW:
             return True
         self.settle()
-        granted = self._spent < self.limit * _SHARE[work] and not (self.hurry and work is not Work.PREDICT)
+        first = self.hurry or (self._late and self._waits)
+        granted = self._spent < self.limit * _SHARE[work] and not (first and work is not Work.PREDICT)
+        self._wanted |= work is Work.PREDICT and not granted
         (self.done if granted else self.refused)[work] += 1
         if granted:
             self._since = time.thread_time()

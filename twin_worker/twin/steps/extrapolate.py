@@ -11,7 +11,7 @@ from fleet.physics.kernel import kernel
 from twin_worker.twin.state.state import Twin
 
 LATEST_S = 10.0  # after a flight ahead it is renewed no longer [s]
-OVERDUE_S = 60.0  # the same where the next is due and has to wait for CPU time: better than nothing [s]
+OVERDUE_S = 150.0  # the same where the next is due and has to wait for CPU time: better than nothing [s]
 _BACK_S = 10.0  # in which an aircraft is back on the path that was foreseen [s]
 
 
