@@ -6,6 +6,7 @@ TESTS ?=
 BIN := .venv/bin
 LOCK := requirements.lock
 BENCH_LOCK := requirements-bench.lock
+DOCS_LOCK := requirements-docs.lock
 STAMP := .venv/setup-done
 export PARAUAV_RECORDINGS ?= $(abspath ../shared/recordings)
 
@@ -14,14 +15,15 @@ ifneq ($(shell cat $(STAMP) 2>/dev/null && $(BIN)/python -c '' 2>&1),$(CURDIR))
 STALE := stale
 endif
 
-.PHONY: help setup bench-setup run test lint browser lock clean stale
+.PHONY: help setup bench-setup run test lint docs browser lock clean stale
 
 help:
 	@echo "make run [UP='--uavs 8']    set up, then fly a fleet, twin it and show it; Ctrl-C ends it"
 	@echo "make test [TESTS='…']       set up, then run every test, the browser's included"
 	@echo "make setup                  only set up: packages into .venv, by version and hash"
 	@echo "make lint                   ruff and mypy"
-	@echo "make lock                   renew both locks after an edit of the dependencies"
+	@echo "make docs                   build the documentation into site/; the result works offline"
+	@echo "make lock                   renew all locks after an edit of the dependencies"
 	@echo "make bench-setup            the packages ParaUAV is measured against, into .venv-bench"
 	@echo "make clean                  remove .venv and everything else that was made"
 
@@ -51,16 +53,31 @@ lint: setup
 browser:
 	@sh deploy/browser.sh
 
+# Reference pages are generated from the code, then the site is built strictly and searched for external resources.
+docs: setup .venv-docs/setup-done
+	@$(BIN)/python -m docs.generate
+	@NO_MKDOCS_2_WARNING=1 .venv-docs/bin/python -m mkdocs build --strict --quiet
+	@$(BIN)/python -m docs.check_offline site
+	@echo "documentation: site/index.html"
+
+.venv-docs/setup-done: $(DOCS_LOCK)
+	@$(PYTHON) -m venv --clear .venv-docs
+	@.venv-docs/bin/python -m pip install -q --require-hashes -r $(DOCS_LOCK)
+	@touch $@
+
+COMPILE := .venv-lock/bin/pip-compile --allow-unsafe --generate-hashes --no-emit-options --no-header --no-annotate --strip-extras --quiet
+LOCK_HEAD := \# Every package by version and hash, build backend included. Made from pyproject.toml by `make lock`; not by hand.
+
 lock:
 	@rm -rf .venv-lock && $(PYTHON) -m venv .venv-lock && .venv-lock/bin/pip install -q pip-tools
 	@for pair in dev:$(LOCK) bench:$(BENCH_LOCK); do \
-	  .venv-lock/bin/pip-compile pyproject.toml --extra $${pair%:*} --all-build-deps --allow-unsafe --generate-hashes \
-	    --no-emit-options --no-header --no-annotate --strip-extras \
-	    --quiet --output-file $${pair#*:} || exit 1; \
-	  sed -i -e '/^#/d' -e '1i # Every package by version and hash, build backend included. Made from pyproject.toml by `make lock`; not by hand.' $${pair#*:}; \
+	  $(COMPILE) pyproject.toml --extra $${pair%:*} --all-build-deps --output-file $${pair#*:} || exit 1; \
 	done
+	@.venv-lock/bin/python -c "import tomllib; extras = tomllib.load(open('pyproject.toml', 'rb'))['project']; \
+	  print(*extras['optional-dependencies']['docs'], sep='\n')" | $(COMPILE) - --output-file $(DOCS_LOCK)
+	@sed -i -e '/^#/d' -e '1i $(LOCK_HEAD)' $(LOCK) $(BENCH_LOCK) $(DOCS_LOCK)
 	@rm -rf .venv-lock
 
 clean:
-	@rm -rf .venv .venv-bench .venv-lock build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	@rm -rf .venv .venv-bench .venv-docs .venv-lock site build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
