@@ -67,7 +67,10 @@ def messages_page() -> str:
     text += "Array fields give their shape and numpy type; units are in brackets.\n\n"
     text += table(
         ("Key", "Message", "Content"),
-        [(code(schema.wire_key(kind)), f"[{kind.__name__}](#{anchor(kind)})", summary(kind)) for kind in TOPICS.values()],
+        [
+            (code(schema.wire_key(kind)), f"[{kind.__name__}](#{anchor(kind)})", summary(kind))
+            for kind in TOPICS.values()
+        ],
     )
     shown: set[type] = set()
     for kind in TOPICS.values():
@@ -130,7 +133,9 @@ def configuration_page() -> str:
         for topic, rule in SAID.items()
     ]
     text += table(("Keys", "Published and answered by", "Queried by", "Largest message"), rows)
-    text += "\n## Airframe\n\n`twin_worker --airframe FILE` takes a copy of `fleet/airframes/small_fixed_wing.toml`:\n\n"
+    text += (
+        "\n## Airframe\n\n`twin_worker --airframe FILE` takes a copy of `fleet/airframes/small_fixed_wing.toml`:\n\n"
+    )
     text += f"```toml\n{(ROOT / 'fleet' / 'airframes' / 'small_fixed_wing.toml').read_text().rstrip()}\n```\n"
     return text
 
@@ -178,8 +183,13 @@ def filled(hint: Any) -> Any:
     if issubclass(hint, enum.Enum):
         return next(iter(hint))
     if issubclass(hint, msgspec.Struct):
-        return hint(**{name: filled(part) for name, part in get_type_hints(hint, include_extras=True).items()
-                       if name in hint.__struct_fields__})
+        return hint(
+            **{
+                name: filled(part)
+                for name, part in get_type_hints(hint, include_extras=True).items()
+                if name in hint.__struct_fields__
+            }
+        )
     return "x" if hint is str else hint(1)
 
 
@@ -241,7 +251,10 @@ def code(text: str) -> str:
 def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
     """Format rows as a Markdown table."""
     lines = [head, ("---",) * len(head), *rows]
-    return "".join("| " + " | ".join(re.sub(r"\s*\n\s*", " ", cell).replace("|", "\\|") for cell in line) + " |\n" for line in lines)
+    return "".join(
+        "| " + " | ".join(re.sub(r"\s*\n\s*", " ", cell).replace("|", "\\|") for cell in line) + " |\n"
+        for line in lines
+    )
 
 
 def main() -> None:

@@ -1,9 +1,11 @@
 """A new effect is one new file: dropped into a folder at run time it is listed, flown, found and proven."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from conftest import ROOT
 from effect_flights import CARD, Plan, flown
 
 from fleet import cli
@@ -13,29 +15,9 @@ from twin_worker.diagnosis.data.fault_hypothesis import Guess, When
 from twin_worker.diagnosis.inference.diagnose import HELD, diagnose
 from twin_worker.diagnosis.inference.report import Outcome
 
-DOOR = '''
-"""A door that jammed open on the right: it pushes to the left, turns the nose to the right, and drags."""
-
-from fleet.effects import Effect, Parameter, Stage
-
-
-def act(flow, open):
-    """Push and turn with the dynamic pressure, more where air comes from the door's side."""
-    caught = open * (1.0 + 2.0 * flow.beta)
-    return {"C_Y": -0.05 * caught, "C_n": 0.01 * caught, "C_D": 0.03 * open}
-
-
-EFFECT = Effect(
-    name="door_jammed",
-    stage=Stage.WRENCH,
-    channel="yaw",
-    equation="C_Y = -0.05 open (1 + 2 beta), C_n = 0.01 open (1 + 2 beta), C_D = 0.03 open",
-    source="round numbers",
-    parameters=(Parameter("open", "-", "how far it stands open", step=0.05, low=0.0, high=2.0),),
-    act=act,
-    examples=((0.2,), (0.4,), (0.8,)),
-)
-'''
+PAGE = (ROOT / "docs" / "extending.md").read_text()
+(DOOR,) = re.findall(r'^```python title="door_jammed.py"\n(.*?)^```', PAGE, re.M | re.S)
+"""The file of the walk-through in the documentation."""
 
 
 @pytest.fixture
