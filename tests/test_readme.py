@@ -190,6 +190,8 @@ def known(line: str) -> bool:
         return False
     path = ROOT / words[2].replace(".", "/")
     files = sorted(path.glob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
+    if not all(file.is_file() for file in files):
+        return False
     sources = "".join(file.read_text() for file in files)
     return "__main__" in sources + str(files) and all(f'"{word}"' in sources for word in words if word.startswith("--"))
 
