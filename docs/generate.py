@@ -126,8 +126,8 @@ def configuration_page() -> str:
     text = "# Configuration\n\n## Router and identity\n\n"
     text += "Every command takes this file as `--config FILE`. It is `deploy/fleet.toml`:\n\n"
     text += f"```toml\n{(ROOT / 'deploy' / 'fleet.toml').read_text().rstrip()}\n```\n"
-    text += "\n## Rules by role\n\nEnforced by the router where certificates or passwords are in use; whatever is not listed is "
-    text += "denied.\nThe size limit holds everywhere.\n\n"
+    text += "\n## Rules by role\n\nEnforced by the router where certificates or passwords are used; whatever is not "
+    text += "listed is denied.\nThe size limit holds everywhere.\n\n"
     rows = [
         (code(keys(topic)), ", ".join(rule.by), ", ".join(rule.asked), f"{rule.most / 1024:,.0f} KiB")
         for topic, rule in SAID.items()
