@@ -44,7 +44,7 @@ def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
         fail(prog, str(error), logged=logs)
         return 2
     if code == INTERRUPTED and not os.environ.get(PARENT):  # else the parent says so
-        fail(prog, "interrupted")
+        fail(prog, "interrupted", logged=logs)
     return code
 
 

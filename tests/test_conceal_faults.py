@@ -232,7 +232,7 @@ def test_winds_blow_from_where_they_say(text: str, height: float, wind: tuple[fl
 
 def test_a_label_tells_the_whole_servo() -> None:
     assert told("actuator_lag", "small", {"tau_s": 0.2}) == {"tau_s": 0.2 + SERVO_LAG_S["small"]}
-    small = Path("fleet/simulator/aircraft/aerosonde/aerosonde.xml").read_text()
+    small = Path("fleet/simulator/vehicle/aircraft/aerosonde/aerosonde.xml").read_text()
     assert f"<lag>{1 / SERVO_LAG_S['small']:.0f}</lag>" in small
     assert told("actuator_lag", "c172p", {"tau_s": 0.2}) == {"tau_s": 0.2}
 

@@ -9,7 +9,7 @@ from conftest import ROOT
 
 ASK = """
 import ctypes, sys, threading
-from fleet.heap import give_back
+from fleet.process.malloc_trim import give_back
 names = "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keepcost".split()
 class Info(ctypes.Structure):
     _fields_ = [(name, ctypes.c_size_t) for name in names]

@@ -106,7 +106,7 @@ def test_a_stretch_that_was_searched_from_afresh_is_gone_on_with_for_a_while(mon
         afresh.extend([round(window.t[-1] - WINDOW.t[-1])] if near is None else [])
         return known(aircraft(0), window.t[0], window.t[-1])
 
-    monkeypatch.setattr(learning.coupled, "identify", identify)
+    monkeypatch.setattr(learning.derivatives_model, "identify", identify)
     for second in range(20):
         learning._identify(twin, replace(WINDOW, t=WINDOW.t + second))
     every = round(learning._AFRESH_S)

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from fleet.process.logs import untimed
 from fleet.simulator.flight.drive import to_tlog
 from fleet.simulator.flight.uav import PretendUav
 from twin_worker.evaluation.replay import WITHIN_S, main, replay, text
@@ -39,7 +40,7 @@ def test_the_command_writes_what_it_prints(tmp_path, capsys):
 def test_progress_goes_to_stderr(heard, capsys):
     replay(heard, "flight")
     err = capsys.readouterr().err
-    assert err.startswith("flight: 60 s of flight, 1 UAVs")
+    assert untimed(err).startswith("flight: 60 s of flight, 1 UAVs")
 
 
 @pytest.mark.parametrize("name", ["nothing.tlog", "notes.txt"])

@@ -10,8 +10,8 @@ FLY = """
 import sys
 from pathlib import Path
 
-from twin_worker import worker
-from twin_worker.warm import warm_up
+from twin_worker.service import worker
+from twin_worker.service.warm_up import warm_up
 
 sys.path.insert(0, "tests")
 import flights
@@ -22,11 +22,11 @@ warm_up()
 
 from numba.core.dispatcher import Dispatcher
 
-from fleet.codec import encode
+from fleet.bus.codec import encode
 from fleet.contract import History, Sample
-from twin_worker.claims.carry import Load, packed, unpacked
-from twin_worker.claims.tape import read
-from twin_worker.memory import hear
+from twin_worker.ownership.handover import Load, packed, unpacked
+from twin_worker.ownership.history_decoder import read
+from twin_worker.twin.state.state import hear
 
 ours = [name for name in sys.modules if name.startswith(("twin_worker", "fleet"))]
 kernels = {f"{name}.{key}": one for name in ours for key, one in vars(sys.modules[name]).items()

@@ -8,7 +8,7 @@ import numpy as np
 from fleet.contract import Message, Prediction
 from twin_worker.ownership.twin_store import Held
 from twin_worker.twin.state.schedule import SOON
-from twin_worker.twin.steps.extrapolate import OVERDUE_S, renewed
+from twin_worker.twin.steps.extrapolate import LATEST_S, OVERDUE_S, renewed
 
 LOOK_S = 0.4  # between looks for aircraft without a prediction [s]
 OLD_S = 1.0  # since an aircraft's last prediction was published, from which on another is due: least [s]
@@ -60,7 +60,7 @@ def said_already(result: Message, held: Held) -> bool:
     """Tell whether a prediction, come late, is older than what was said meanwhile."""
     if not isinstance(result, Prediction) or not held.stood - OVERDUE_S < result.t <= held.stood:
         return False
-    return held.placed is None or _newest(held) > held.stood - _BACK_S
+    return result.t > held.stood - LATEST_S or held.placed is None or _newest(held) > held.stood - _BACK_S
 
 
 def _newest(held: Held) -> float:

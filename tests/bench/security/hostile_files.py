@@ -18,8 +18,8 @@ CPU_S, MEMORY_MB = 30.0, 300.0
 _ROW = "vehicle_attitude"
 _READ = """
 import json, resource, sys
-from fleet.telemetry.recordings import Recording
-from fleet.telemetry.warm import warm_up
+from fleet.telemetry.recording.recordings import Recording
+from fleet.telemetry.mavlink.warm import warm_up
 warm_up()
 begun = resource.getrusage(resource.RUSAGE_SELF)
 said, news = "", 0
