@@ -8,7 +8,7 @@ from fleet.contract import Status
 
 STEP_S = 0.1  # recorded time between two publications [s]
 SILENT_STEPS = 100  # steps made after the last message of a gap; by then everybody knows of the silence
-_MOST_GAPS = 1000  # with so many silences the later ones are stepped over at once
+MOST_GAPS = 1000  # with so many silences the later ones are stepped over at once
 SETTLE_S = 2.5  # after the end: what waited for more is handed over [s]
 
 
@@ -23,7 +23,7 @@ class Steps:
         self._take = take
         self._first: float | None = None
         self._number = 0  # of the newest step
-        self._gaps = 0
+        self.gaps = 0  # silences longer than `SILENT_STEPS`
 
     def upto(self, arrival: np.ndarray) -> Iterator[tuple[float, list]]:
         """Give the steps that are complete once these have arrived: (end of the step [s since 1970], news).
@@ -34,8 +34,8 @@ class Steps:
         if self._first is None:
             self._first = float(arrival[0])
         for number in np.unique(np.floor((arrival - self._first) / STEP_S).astype(int)).tolist():
-            silent = SILENT_STEPS if self._gaps < _MOST_GAPS else 1
-            self._gaps += number - self._number > silent
+            silent = SILENT_STEPS if self.gaps < MOST_GAPS else 1
+            self.gaps += number - self._number > silent
             for step in range(self._number, min(number, self._number + silent)):
                 now = self._first + (step + 1) * STEP_S
                 yield now, self._take(now)

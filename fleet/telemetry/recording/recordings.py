@@ -12,7 +12,7 @@ from fleet.telemetry.mavlink.intake import Intake, News
 from fleet.telemetry.mavlink.onboard_log import OnboardLog
 from fleet.telemetry.mavlink.parsing.decode import frames_of
 from fleet.telemetry.mavlink.parsing.scan import COUNTS, STAMP, START, STOP
-from fleet.telemetry.mavlink.steps import STEP_S, Steps
+from fleet.telemetry.mavlink.steps import MOST_GAPS, SILENT_STEPS, STEP_S, Steps
 from fleet.telemetry.onboard_logs.dataflash.reader import DataflashLog
 from fleet.telemetry.onboard_logs.onboard_news import UNDATED_S, craft_of, log_steps
 from fleet.telemetry.onboard_logs.ulog.reader import UlogLog
@@ -110,6 +110,11 @@ class Recording:
             for step in steps.upto(frames.arrival):
                 waiting = 0
                 yield step
+        if steps.gaps > MOST_GAPS:
+            self._told.append(
+                f"{steps.gaps} silences of over {SILENT_STEPS * STEP_S:.0f} s, more than {MOST_GAPS}: "
+                "what a twin does in the later ones is left out"
+            )
         if left_out:
             self._told.append(
                 f"{left_out} frames left out: over {_MOST_AT_ONCE:,} in {STEP_S} s, which no radio carries"
