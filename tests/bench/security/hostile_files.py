@@ -134,7 +134,7 @@ def _frames(n: int, step_us: int = 10_000, system: int = 1) -> bytes:
     beat = mav.MAVLink_heartbeat_message(mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 4, 3)
     out = []
     for k in range(n):
-        message = mav.MAVLink_attitude_message(k * step_us // 1000 % 2**32, 0.1, 0.1, 0.1, 0.0, 0.0, 0.0) if k % 10 else beat
+        message = mav.MAVLink_attitude_message(k * 10, 0.1, 0.1, 0.1, 0.0, 0.0, 0.0) if k % 10 else beat
         out.append(struct.pack(">Q", 1_600_000_000_000_000 + k * step_us) + message.pack(talker))
     return b"".join(out)
 
