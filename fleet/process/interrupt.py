@@ -2,6 +2,8 @@
 
 While the work of a command runs, Ctrl-C raises KeyboardInterrupt in the main thread, once, so that files, terminals
 and child processes are cleaned up. Before and after there is nothing to clean up, and the process ends at once.
+Once its work is done a process does not tear down the interpreter: threads of foreign libraries that ask for it in that
+moment are ended inside Rust or C++ code, which aborts the process ("FATAL: exception not rethrown", exit code 134).
 The package `fleet` imports this module before anything else. The handler is installed only where the program is one of
 `COMMANDS`; a program that uses ParaUAV as a library keeps its own.
 """
@@ -29,6 +31,7 @@ class _State:
     deferring = False
     arrived = False
     raised = False
+    code: int | None = None  # exit code of the work, once it is done
 
 
 _now = _State()
@@ -55,6 +58,12 @@ def interruptible(work: Callable[[], int]) -> int:
     return INTERRUPTED if _now.arrived else code
 
 
+def exits_with(code: int) -> int:
+    """Note the exit code that the process is about to end with, and return it."""
+    _now.code = code
+    return code
+
+
 @contextmanager
 def deferred() -> Iterator[None]:
     """Let Ctrl-C wait until the block is over, for steps that must not be left half done; they must be short."""
@@ -74,7 +83,7 @@ def install() -> None:
         return
     signal.signal(signal.SIGINT, _on_sigint)
     sys.unraisablehook = _on_unraisable
-    atexit.register(_ignore_from_now_on)  # registered first, so it runs last
+    atexit.register(_exit)  # registered first, so it runs last
 
 
 def _on_sigint(*_: object) -> None:
@@ -109,10 +118,18 @@ def _end() -> None:
     os._exit(INTERRUPTED)
 
 
-def _ignore_from_now_on() -> None:
-    """Ignore Ctrl-C while the interpreter itself ends: the work is done, and its exit code is known."""
+def _exit() -> None:
+    """End the process with its exit code, without tearing down the interpreter; from here on Ctrl-C is ignored."""
     if signal.getsignal(signal.SIGINT) is _on_sigint:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if _now.code is None:
+        return
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):  # closed, or a pipe that nobody reads; the interpreter reports that
+            return
+    os._exit(_now.code)
 
 
 def _program() -> str:

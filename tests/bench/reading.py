@@ -9,7 +9,6 @@ The peer only decodes; ours also gives SI rows on the fleet clock, cut into mess
 import argparse
 import json
 import platform
-import resource
 import sys
 import tempfile
 import time
@@ -21,6 +20,7 @@ from pymavlink import mavutil
 
 from fleet.telemetry.recording.opening import Source
 from fleet.telemetry.recording.recordings import Recording
+from tests.bench.peak_memory import peak_mb, reset_peak
 
 SHIFT_US = 86_400 * 1_000_000 - 3_600_000_000  # between two copies in a grown file; less than a day [us]
 
@@ -99,9 +99,9 @@ def main() -> int:
             print(f"{path.name}: {messages} messages, {theirs / took:.1f} times as fast as pymavlink's own loop")
         if args.grow:
             big = grown(plain(args.file[0], Path(name)), args.grow, Path(name))
-            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            before = reset_peak()
             took, _ = best(ours, big, 1)
-            more = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+            more = peak_mb() - before
             found["grown"] = {"mb": big.stat().st_size / 1e6, "s": round(took, 1), "more_memory_mb": round(more)}
             print(f"{big.stat().st_size / 1e6:.0f} MB in {took:.0f} s, {more:.0f} MB more memory")
     if args.json:

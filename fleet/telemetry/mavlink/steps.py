@@ -8,7 +8,7 @@ from fleet.contract import Status
 
 STEP_S = 0.1  # recorded time between two publications [s]
 SILENT_STEPS = 100  # steps made after the last message of a gap; by then everybody knows of the silence
-MOST_GAPS = 1000  # with so many silences the later ones are stepped over at once
+MOST_GAPS = 1000  # silences that are played; frames between later ones are combined into one step
 SETTLE_S = 2.5  # after the end: what waited for more is handed over [s]
 
 
@@ -31,11 +31,17 @@ class Steps:
         Args:
             arrival: of everything new, never falling, (n,) [s since 1970]
         """
+        if not len(arrival):
+            return
         if self._first is None:
             self._first = float(arrival[0])
-        for number in np.unique(np.floor((arrival - self._first) / STEP_S).astype(int)).tolist():
-            silent = SILENT_STEPS if self.gaps < MOST_GAPS else 1
-            self.gaps += number - self._number > silent
+        numbers = np.unique(np.floor((arrival - self._first) / STEP_S).astype(int))
+        silence = np.diff(numbers, prepend=self._number) > SILENT_STEPS
+        order = self.gaps + np.cumsum(silence)  # the number of each silence
+        combined = np.append(silence[1:] & (order[1:] > MOST_GAPS), False)  # another silence follows
+        self.gaps = int(order[-1])
+        for number, gaps in zip(numbers[~combined].tolist(), order[~combined].tolist(), strict=True):
+            silent = SILENT_STEPS if gaps <= MOST_GAPS else 1
             for step in range(self._number, min(number, self._number + silent)):
                 now = self._first + (step + 1) * STEP_S
                 yield now, self._take(now)

@@ -9,7 +9,6 @@ with every block. Slowest: of any 100,000 bytes.
 
 import argparse
 import json
-import resource
 import sys
 import time
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ from fleet.bus.codec import Wire
 from fleet.telemetry.mavlink.intake import Intake
 from fleet.telemetry.mavlink.parsing.received import Heard
 from tests import oracle
+from tests.bench.peak_memory import peak_mb
 from tests.talker import Talker
 
 BLOCK = 100_000  # bytes at a time
@@ -71,7 +71,7 @@ def run(seed: int, total: int) -> dict[str, Any]:
         slowest = max(slowest, time.process_time() - took) if k > 3 else 0.0  # the first ones compile
         fed += len(block)
         if fed >= total // 10 and not early:
-            early = _memory()
+            early = peak_mb()
     return {
         "bytes": fed,
         "counters": dict(intake.counters()),
@@ -81,12 +81,8 @@ def run(seed: int, total: int) -> dict[str, Any]:
         "aircraft": len(intake.crafts),
         "slowest_cpu_s": round(slowest, 3),
         "took_s": round(time.perf_counter() - began, 1),
-        "more_memory_mb": round((_memory() - early) / 1024, 1),
+        "more_memory_mb": round(peak_mb() - early, 1),
     }
-
-
-def _memory() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def main() -> int:

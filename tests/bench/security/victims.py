@@ -1,7 +1,6 @@
 """Everyone who reads the bus, bombarded on it: whoever is still right afterwards, in bounded memory, has survived."""
 
 import io
-import resource
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -17,6 +16,7 @@ from fleet.commands.live.status import as_objects, fleet_rows, table
 from fleet.commands.live.whatif import as_object, ask, text
 from fleet.contract import Account, FleetState, Mission, Prediction, Sample, Status, WhatIf
 from gateway.publication.publish import Publisher
+from tests.bench.peak_memory import peak_mb, reset_peak
 from tests.examples import EXAMPLES
 from twin_worker.service.worker import Worker
 from viewer.store.store import Feed
@@ -123,15 +123,11 @@ def survived(name: str, at: str) -> str:
         Fallen: when it is wrong afterwards, or took too much memory.
     """
     victim = {one.__name__: one for one in VICTIMS}[name]
-    before = _peak_mb()
+    before = reset_peak()
     words = victim(at, from_outside)
-    if (grown := _peak_mb() - before) > MOST_MB:
+    if (grown := peak_mb() - before) > MOST_MB:
         raise Fallen(f"{words}; but it took {grown:.0f} MB more")
     return f"{words}; {grown:.0f} MB more at most"
-
-
-def _peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _last_word(at: str, heard: Callable[[], bool]) -> None:
