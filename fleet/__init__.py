@@ -60,7 +60,7 @@ def _compile_cache() -> tuple[Path, str]:
 
 
 def _within(base: Path) -> Path:
-    """Give the folder of these sources, for its owner alone; with a new one those that nobody uses any more go."""
+    """Return the folder of these sources, for its owner alone; with a new one those that nobody uses any more go."""
     found = base / f"numba-{SOURCES}"
     if not found.exists():
         for old in base.glob("numba-*"):

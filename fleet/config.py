@@ -19,7 +19,7 @@ def router_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def entry(args: argparse.Namespace, role: str = TOOLS) -> Entry:
-    """Give this process's way onto the bus, as it was told on the command line.
+    """Return this process's way onto the bus, as it was told on the command line.
 
     Raises:
         ValueError: when the file says what cannot be; the sentence names the line's key.
@@ -32,7 +32,7 @@ def entry(args: argparse.Namespace, role: str = TOOLS) -> Entry:
 
 
 def passed_on(args: argparse.Namespace) -> list[str]:
-    """Give the same as options for a process that is started here."""
+    """Return the same as options for a process that is started here."""
     router = [] if args.router is None else [f"--router={args.router}"]
     return router + ([] if args.config is None else [f"--config={args.config.absolute()}"])
 

@@ -429,7 +429,7 @@ class Prediction(Message, frozen=True, kw_only=True):
     ] = None
 
     def ned_origin(self) -> Origin:
-        """Give the origin as a named tuple."""
+        """Return the origin as a named tuple."""
         return Origin(*self.origin)
 
 
@@ -511,7 +511,7 @@ class Mismatch(Message, frozen=True, kw_only=True):
 
     @property
     def onset(self) -> float | None:
-        """Give when the first cause began [s since 1970]; None where there is none."""
+        """Return when the first cause began [s since 1970]; None where there is none."""
         return self.causes[0].segments[0][0] if self.causes and self.causes[0].segments else None
 
 
@@ -548,7 +548,7 @@ class Alert(Message, frozen=True, kw_only=True):
 
     @property
     def about(self) -> About:
-        """Give what it is told apart by."""
+        """Return what it is told apart by."""
         return self.kind, self.other
 
 

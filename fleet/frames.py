@@ -110,7 +110,7 @@ def _turn_each(euler: np.ndarray, ned: np.ndarray, out: np.ndarray) -> None:
 
 
 def rotation(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
-    """Give the matrices from body to NED, (3, 3, n); angles (n,) [rad]. Source: Beard & McLain eq. 2.5."""
+    """Return the matrices from body to NED, (3, 3, n); angles (n,) [rad]. Source: Beard & McLain eq. 2.5."""
     cf, sf, ct, st, cp, sp = np.cos(phi), np.sin(phi), np.cos(theta), np.sin(theta), np.cos(psi), np.sin(psi)
     rows = [
         [ct * cp, sf * st * cp - cf * sp, cf * st * cp + sf * sp],

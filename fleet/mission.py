@@ -64,7 +64,7 @@ class Route:
 
     @property
     def said(self) -> str:
-        """Give the first sentences, and how many more there are; empty where nothing was wrong."""
+        """Return the first sentences, and how many more there are; empty where nothing was wrong."""
         return few(self.sentences)
 
     def __str__(self) -> str:
@@ -99,7 +99,7 @@ class _Walk:
 
 
 def few(sentences: Sequence[str]) -> str:
-    """Give the first sentences in one, and how many more there are."""
+    """Return the first sentences in one, and how many more there are."""
     more = len(sentences) - _SAID
     return " ".join([*sentences[:_SAID], *([f"and {more} more remarks on the mission"] if more > 0 else [])])
 
@@ -222,7 +222,7 @@ def _unroll(walk: _Walk, at: int, limit: int) -> None:
 
 
 def _ends(walk: _Walk) -> bool:
-    """Tell whether the last leg is one that nothing follows by itself."""
+    """Return whether the last leg is one that nothing follows by itself."""
     return bool(walk.legs) and int(walk.legs[-1][KIND]) in (LAND, LOITER_UNLIMITED)
 
 
@@ -236,7 +236,7 @@ def _target(walk: _Walk, item: Item) -> int:
 
 
 def _jump(walk: _Walk, item: Item) -> int:
-    """Take a DO_JUMP while it has jumps left, and give the next sequence number."""
+    """Take a DO_JUMP while it has jumps left, and return the next sequence number."""
     target = _target(walk, item)
     left = walk.left.get(item.seq, _number(item.param2))
     if target < 0 or left == 0:

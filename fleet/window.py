@@ -35,19 +35,19 @@ class Window:
 
     @cached_property
     def over_ground(self) -> np.ndarray:
-        """Give the states with u v w over the ground, (n, 9)."""
+        """Return the states with u v w over the ground, (n, 9)."""
         y = self.x.copy()
         y[:, :3] = ned_to_body(y[:, 6], y[:, 7], y[:, 8], self.v)
         return y
 
     @property
     def dt(self) -> float:
-        """Give the sample time [s]."""
+        """Return the sample time [s]."""
         return float(self.t[1] - self.t[0])
 
     @property
     def seconds(self) -> float:
-        """Give the length [s]."""
+        """Return the length [s]."""
         return float(self.t[-1] - self.t[0])
 
     def __len__(self) -> int:

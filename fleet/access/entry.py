@@ -60,7 +60,7 @@ class Entry:
 
     @property
     def mutual(self) -> bool:
-        """Tell whether a role is known by its certificate."""
+        """Return whether a role is known by its certificate."""
         return self.certificates is not None and self.passwords is None
 
     def papers(self) -> Papers | None:
@@ -73,7 +73,7 @@ class Entry:
         return papers_of(self.certificates, self.role) if self.certificates and not self.passwords else None
 
     def session(self, *, patient: bool = False) -> dict[str, Any]:
-        """Give a session that joins, by Zenoh's configuration paths; `patient`: it begins without a router, too.
+        """Return a session that joins, by Zenoh's configuration paths; `patient`: it begins without a router, too.
 
         Raises:
             ValueError: when a file is missing, expired, or open to others.
@@ -92,7 +92,7 @@ class Entry:
         return out
 
     def router(self, listen: list[str] | None = None, beside: list[str] | None = None) -> dict[str, Any]:
-        """Give the router itself, by Zenoh's configuration paths.
+        """Return the router itself, by Zenoh's configuration paths.
 
         Args:
             listen: endpoints, `at` unless said

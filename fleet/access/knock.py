@@ -11,7 +11,7 @@ _REFUSAL_S = 0.3  # with TLS 1.3 a certificate is refused only after the handsha
 
 
 def reachable(router: str) -> bool:
-    """Tell whether something accepts connections at an endpoint.
+    """Return whether something accepts connections at an endpoint.
 
     Raises:
         ValueError: when it is no endpoint.
@@ -24,7 +24,7 @@ def reachable(router: str) -> bool:
 
 
 def answers(entry: Entry) -> bool:
-    """Tell whether a router is there; with certificates, shake hands as a session would, and let go again.
+    """Return whether a router is there; with certificates, shake hands as a session would, and let go again.
 
     Raises:
         ConnectionError: when one side refuses the other; the sentence says which and why.

@@ -48,5 +48,5 @@ MESSAGE_MOST = MOST + MB  # what a session puts together from fragments before a
 
 
 def keys(topic: str) -> str:
-    """Give the keys of one topic: `parauav/*/sample`, `parauav/@claim/*`."""
+    """Return the keys of one topic: `parauav/*/sample`, `parauav/@claim/*`."""
     return f"{ROOT}/{topic}/*" if topic.startswith("@") else f"{ROOT}/*/{topic}"

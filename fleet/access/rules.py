@@ -19,7 +19,7 @@ _LIVE = f"{ROOT}/{LIVE}/**"
 
 
 def access_control(known_by: str = CERTIFICATE) -> dict[str, Any]:
-    """Give `access_control`; `known_by`: what tells the router a role, CERTIFICATE or PASSWORD."""
+    """Return `access_control`; `known_by`: what tells the router a role, CERTIFICATE or PASSWORD."""
     control = [topic for topic in SAID if topic.startswith("@")]
     common = [_EVERY, *(keys(topic) for topic in control if SAID[topic].asked == ROLES)]
     rules = [
@@ -50,7 +50,7 @@ def access_control(known_by: str = CERTIFICATE) -> dict[str, Any]:
 
 
 def limits() -> dict[str, Any]:
-    """Give what keeps large messages out, by Zenoh's configuration paths."""
+    """Return what keeps large messages out, by Zenoh's configuration paths."""
     by_size = sorted(SAID, key=lambda topic: SAID[topic].most)
     filters = [
         _filter(("put", "reply"), [keys(topic) for topic in topics], most + _STAMP)

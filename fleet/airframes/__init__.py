@@ -87,7 +87,7 @@ def _numbers(file: str, table: object, names: tuple[str, ...]) -> dict[str, floa
 
 
 def derivatives(of: Airframe, V: float) -> dict[str, float]:
-    """Give the dimensional derivatives at airspeed V in level flight, by their names in `fleet.physics.wrench`.
+    """Return the dimensional derivatives at airspeed V in level flight, by their names in `fleet.physics.wrench`.
 
     Specific force [m/s2] and angular acceleration [rad/s2] per m/s, rad/s and full command; offsets are left out.
     Body axes at a small angle of attack: lift along -z, drag and what speed takes from thrust along -x.

@@ -39,7 +39,7 @@ class ServoMap:
     sentence: str
 
     def same(self, other: "ServoMap") -> bool:
-        """Tell whether another turns pulses into the same inputs."""
+        """Return whether another turns pulses into the same inputs."""
         pairs = ((self.trim, other.trim), (self.gain_up, other.gain_up), (self.gain_down, other.gain_down))
         return self is other or all(np.array_equal(one, another) for one, another in pairs)
 

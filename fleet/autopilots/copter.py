@@ -101,7 +101,7 @@ def limits(values: Mapping[str, float], prefix: str = "") -> tuple[Limits, tuple
 
 
 def along(limit: float, limit_up: float, limit_down: float, t: np.ndarray) -> float:
-    """Give the limit along a direction, from those along the horizontal, up and down [same unit].
+    """Return the limit along a direction, from those along the horizontal, up and down [same unit].
 
     Args:
         limit, limit_up, limit_down: along each of the three
@@ -113,7 +113,7 @@ def along(limit: float, limit_up: float, limit_down: float, t: np.ndarray) -> fl
 
 
 def corner_speed(before: np.ndarray, after: np.ndarray, limit: Limits) -> float:
-    """Give the speed of a corner between two directions (3,) rounded within the radius [m/s]."""
+    """Return the speed of a corner between two directions (3,) rounded within the radius [m/s]."""
     half = sqrt(max((1.0 + float(before @ after)) / 2.0, 0.0))  # cos(theta / 2)
     if half < 0.1:
         return 0.0
@@ -122,7 +122,7 @@ def corner_speed(before: np.ndarray, after: np.ndarray, limit: Limits) -> float:
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
 def _fastest(to_go: float, end: float, acc: float, jerk: float) -> float:
-    """Give the speed from which the end is reached at its speed: d = v^2 / 2a + v a / 2j [m/s]."""
+    """Return the speed from which the end is reached at its speed: d = v^2 / 2a + v a / 2j [m/s]."""
     way = max(to_go, 0.0) + end * end / (2.0 * acc) + end * acc / (2.0 * jerk)
     b = acc / (2.0 * jerk)
     return acc * (sqrt(b * b + 2.0 * way / acc) - b)
@@ -130,7 +130,7 @@ def _fastest(to_go: float, end: float, acc: float, jerk: float) -> float:
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
 def _top(n: float, e: float, limit: float, par: np.ndarray) -> float:
-    """Give the ground speed along the horizontal direction (n, e) that the top airspeed leaves [m/s]."""
+    """Return the ground speed along the horizontal direction (n, e) that the top airspeed leaves [m/s]."""
     level = sqrt(n * n + e * e)
     if not par[V_AIR] > 0.0 or level < 0.3:
         return limit

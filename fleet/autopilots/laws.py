@@ -40,7 +40,7 @@ class Law(NamedTuple):
 
     @property
     def defaults(self) -> dict[str, float]:
-        """Give the defaults by name, in the autopilot's units."""
+        """Return the defaults by name, in the autopilot's units."""
         return {row.name: float(row.default) for row in self.table}
 
 
@@ -76,7 +76,7 @@ def vector(law: str, found: Mapping[str, float], altitude_m: float = 0.0) -> np.
 
 
 def read(law: str, values: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Give every parameter of a law under its current name, in the autopilot's units, and which are defaults."""
+    """Return every parameter of a law under its current name, in the autopilot's units, and which are defaults."""
     if law == "arduplane":
         return arduplane.read(values)
     found = {row.name: find(row, values) for row in LAWS[law].table}
@@ -85,7 +85,7 @@ def read(law: str, values: Mapping[str, float]) -> tuple[dict[str, float], tuple
 
 
 def blown(par: np.ndarray, w_n: float, w_e: float) -> np.ndarray:
-    """Give a copy of `par` that believes in a wind, NED, where it blows to [m/s]."""
+    """Return a copy of `par` that believes in a wind, NED, where it blows to [m/s]."""
     par = par.copy()
     par[W_N], par[W_E] = w_n, w_e
     return par
@@ -93,7 +93,7 @@ def blown(par: np.ndarray, w_n: float, w_e: float) -> np.ndarray:
 
 @inlined
 def mark(par: np.ndarray) -> float:
-    """Give the mark of the law; what ends in anything else than a mark is ArduPlane's."""
+    """Return the mark of the law; what ends in anything else than a mark is ArduPlane's."""
     return par[par.shape[0] + LAW]
 
 
@@ -226,7 +226,7 @@ def stabilise(
     Va: float,
     dt: float,
 ) -> tuple[float, float, float]:
-    """Give the surfaces for a commanded attitude. Made for 50 Hz; arguments as for ArduPlane's `stabilise`."""
+    """Return the surfaces for a commanded attitude. Made for 50 Hz; arguments as for ArduPlane's `stabilise`."""
     law = mark(par)
     if law >= ARDUPLANE:
         return arduplane.stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
@@ -249,7 +249,7 @@ def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) 
 
 @kernel
 def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray) -> float:
-    """Give the height to be at, up positive above the origin [m]; p, v: position and ground velocity, NED, (3,)."""
+    """Return the height to be at, up positive above the origin [m]; p, v: position and ground velocity, NED, (3,)."""
     law = mark(par)
     if law == PX4:
         return px4_fixedwing.height_demand(ctl, par, legs, p, hypot(v[0], v[1]))

@@ -21,7 +21,7 @@ _LONGEST = 0.2  # a longer gap in the telemetry counts as one step of this lengt
 
 @kernel
 def _find(ctl: np.ndarray, legs: np.ndarray, seq: float) -> int:
-    """Give the leg of a reported item: the current or next such; -1 where the route has none."""
+    """Return the leg of a reported item: the current or next such; -1 where the route has none."""
     now, n = leg_rules.current(ctl, legs), legs.shape[0]
     for j in range(n):
         i = (max(now, 0) + j) % n
@@ -32,7 +32,7 @@ def _find(ctl: np.ndarray, legs: np.ndarray, seq: float) -> int:
 
 @kernel
 def _known(x: np.ndarray) -> bool:
-    """Tell whether all three are finite; `numpy.all` would make an array each time."""
+    """Return whether all three are finite; `numpy.all` would make an array each time."""
     return isfinite(x[0]) and isfinite(x[1]) and isfinite(x[2])
 
 
@@ -99,21 +99,21 @@ def shadow(
 
 @making
 def _mean(values: np.ndarray, otherwise: float) -> float:
-    """Give the mean of what is finite."""
+    """Return the mean of what is finite."""
     kept = values[np.isfinite(values)]
     return np.mean(kept) if kept.size else otherwise
 
 
 @making
 def _median(values: np.ndarray, otherwise: float) -> float:
-    """Give the median of what is finite; a surface's short kick at a misdated command leaves it alone."""
+    """Return the median of what is finite; a surface's short kick at a misdated command leaves it alone."""
     kept = values[np.isfinite(values)]
     return np.median(kept) if kept.size else otherwise
 
 
 @making
 def _usual(miss: np.ndarray) -> np.ndarray:
-    """Give the usual miss of pitch, throttle and surfaces; 0 where none is known, (5,)."""
+    """Return the usual miss of pitch, throttle and surfaces; 0 where none is known, (5,)."""
     out = np.empty(5)
     for j in range(5):
         out[j] = _mean(miss[:, j], 0.0) if j < 2 else _median(miss[:, j], 0.0)

@@ -42,7 +42,7 @@ class Paper:
 
     @property
     def sealed(self) -> Path:
-        """Give the place of the sealed labels."""
+        """Return the place of the sealed labels."""
         return self.folder / "labels.sealed"
 
 
@@ -83,7 +83,7 @@ def examine(paper: Paper, stop: Event, say: Say) -> Marked:
 
 
 def _airframes(folder: Path) -> list[Path]:
-    """Give the folders of the airframes flown."""
+    """Return the folders of the airframes flown."""
     return sorted(path.parent for path in folder.glob("*/*.card.json"))
 
 
@@ -94,7 +94,7 @@ def _conceal(paper: Paper, key: Path, stop: Event) -> None:
 
 
 def _diagnose(paper: Paper, folder: Path, stop: Event, say: Say) -> Path:
-    """Calibrate on the nominal flights of one airframe and diagnose the others; give the file of reports."""
+    """Calibrate on the nominal flights of one airframe and diagnose the others; return the file of reports."""
     nominal, unknown = (sorted(map(str, folder.glob(f"{kind}_*.tlog"))) for kind in ("cal", "rec"))
     model, reports = folder / "model.json", folder / "reports.json"
     say(f"{folder.name}: calibrating on {len(nominal)} nominal flights")

@@ -57,7 +57,7 @@ class Size:
 
     @property
     def error(self) -> float:
-        """Give the error as a share of what was concealed; directions by 45 degrees, small angles by one."""
+        """Return the error as a share of what was concealed; directions by 45 degrees, small angles by one."""
         if self.told is None:
             return 1.0
         if self.name == "from_deg":
@@ -69,13 +69,13 @@ class Size:
 
     @property
     def away(self) -> float:
-        """Give how far what was told is from the truth; directions on the circle."""
+        """Return how far what was told is from the truth; directions on the circle."""
         off = (self.told or 0.0) - self.truth
         return abs((off + 180.0) % 360.0 - 180.0 if self.name == "from_deg" else off)
 
     @property
     def covered(self) -> bool | None:
-        """Tell whether the truth lies within two standard deviations; None where none was told."""
+        """Return whether the truth lies within two standard deviations; None where none was told."""
         return self.away <= 2.0 * self.sigma if self.sigma else None
 
 
@@ -113,12 +113,12 @@ class Mark:
 
     @property
     def said(self) -> tuple[str, ...]:
-        """Give the names, or what was said instead of any."""
+        """Return the names, or what was said instead of any."""
         return self.named or ("unknown" if self.verdict == "unknown" else "nothing",)
 
     @property
     def hit(self) -> bool:
-        """Tell whether it was answered as well as can be."""
+        """Return whether it was answered as well as can be."""
         if self.role == "control":
             return not self.named and self.verdict != "unknown"
         if self.role == "unknown":
@@ -129,7 +129,7 @@ class Mark:
 
     @property
     def in_class(self) -> bool:
-        """Tell whether a single effect is the first name or one that cannot be told from it."""
+        """Return whether a single effect is the first name or one that cannot be told from it."""
         return self.hit or (bool(self.named) and self.concealed[0] in self.rivals[0])
 
 

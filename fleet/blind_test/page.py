@@ -18,7 +18,7 @@ _HOW = (
 
 
 def write(paper: Paper, marked: Marked, scores: Mapping[str, Any]) -> Path:
-    """Write `index.html`; give its path."""
+    """Write `index.html`; return its path."""
     title = f"Blind examination of {len(marked.marks)} flights, seed {paper.seed}"
     body = "\n".join(
         (

@@ -47,7 +47,7 @@ def lines(scores: Mapping[str, Any]) -> list[Line]:
 
 
 def met(name: str, value: float | None) -> bool:
-    """Tell whether a score is as asked; one that nothing was there for is."""
+    """Return whether a score is as asked; one that nothing was there for is."""
     asked = ASKED[name][0]
     return value is None or (value <= -asked + 1e-9 if asked < 0 else value >= asked - 1e-9)
 

@@ -11,7 +11,7 @@ from fleet.process import private_files
 
 
 def digest(*paths: Path) -> str:
-    """Give the SHA-256 of files, one after the other."""
+    """Return the SHA-256 of files, one after the other."""
     told = hashlib.sha256()
     for path in paths:
         told.update(path.read_bytes())

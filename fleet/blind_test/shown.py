@@ -15,7 +15,7 @@ from fleet.blind_test.score import ASKED, lines, met
 
 
 def written(paper: Paper, marked: Marked, scores: Mapping[str, Any]) -> dict[str, Any]:
-    """Give everything as plain values: the scores by their names, then hashes, what was asked, every flight."""
+    """Return everything as plain values: the scores by their names, then hashes, what was asked, every flight."""
     return {
         **scores,
         "seed": paper.seed,

@@ -22,7 +22,7 @@ Wants = Callable[[int], bool]
 
 
 def key(kind: type, who: int | str) -> str:
-    """Give the key of one message class: `parauav/7/sample`, `parauav/@fleet/state/{writer}`; who may be `*`."""
+    """Return the key of one message class: `parauav/7/sample`, `parauav/@fleet/state/{writer}`; who may be `*`."""
     topic: str = kind.topic  # type: ignore[attr-defined]
     return f"{ROOT}/{who}/{topic}" if kind in PER_UAV else f"{ROOT}/{topic}/{who}"
 
@@ -96,7 +96,7 @@ class Bus(AbstractContextManager, Protocol):
         """
 
     def gather(self, kind: type[M], who: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
-        """Ask with a payload and give every answer as it comes, for at most `timeout_s` [s]; refusals are left out.
+        """Ask with a payload and return every answer as it comes, for at most `timeout_s` [s]; refusals are left out.
 
         Raises:
             ConnectionError: when the session is closed; join the router again.

@@ -30,7 +30,7 @@ class Stamp(NamedTuple):
 
 
 def timely(epoch: int, wall_s: float | None = None) -> bool:
-    """Tell whether an epoch may be believed: it is a time [ms since 1970], and no claim is from the future.
+    """Return whether an epoch may be believed: it is a time [ms since 1970], and no claim is from the future.
 
     Args:
         epoch: of a claim

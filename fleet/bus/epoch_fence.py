@@ -26,7 +26,7 @@ class Fence:
         self._by_uav: dict[int, _Believed] = {}
 
     def believes(self, uav: int, stamp: Stamp | None) -> bool:
-        """Tell whether a worker may speak for an aircraft: nobody with a higher timely claim has spoken lately."""
+        """Return whether a worker may speak for an aircraft: nobody with a higher timely claim has spoken lately."""
         rank, now = stamp or Stamp(0, 0), self._clock()
         if not timely(rank.epoch):
             return False

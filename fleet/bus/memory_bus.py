@@ -88,7 +88,7 @@ class MemoryBus(AbstractContextManager):
         return found[0] if found else None
 
     def gather(self, kind: type[M], who: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
-        """Ask with a payload and give every answer as it comes."""
+        """Ask with a payload and return every answer as it comes."""
         uav = who if isinstance(who, int) else None
         for reply in self._reply.get(kind, []):
             with suppress(ValueError):
@@ -96,7 +96,7 @@ class MemoryBus(AbstractContextManager):
                     yield decode(kind, encode(message), encoding(kind))
 
     def fetch(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
-        """Ask and give the bytes of every answer as it comes."""
+        """Ask and return the bytes of every answer as it comes."""
         return map(encode, self.gather(kind, who, b"", timeout_s))
 
     def present(self, name: str) -> None:

@@ -21,7 +21,7 @@ class Present(NamedTuple):
 
     @property
     def token(self) -> str:
-        """Give its token."""
+        """Return its token."""
         return f"worker/{self.worker}/{self.ids.start}-{self.ids.stop - 1}/{self.born}"
 
 

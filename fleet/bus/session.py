@@ -190,13 +190,13 @@ class ZenohBus(AbstractContextManager):
         return found[0] if found else None
 
     def gather(self, kind: type[M], who: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
-        """Ask with a payload and give every answer as it comes."""
+        """Ask with a payload and return every answer as it comes."""
         for reply in self._coming(key(kind, who), timeout_s, payload, _LARGE):
             if (found := reply.ok) is not None and (pair := self._read(kind, found)) is not None:
                 yield pair[0]
 
     def fetch(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
-        """Ask and give the bytes of every answer as it comes; other versions are left out."""
+        """Ask and return the bytes of every answer as it comes; other versions are left out."""
         for reply in self._coming(key(kind, who), timeout_s, care=_LARGE):
             if (found := reply.ok) is not None and str(found.encoding) == encoding(kind):
                 yield found.payload.to_bytes()
@@ -263,7 +263,7 @@ class ZenohBus(AbstractContextManager):
 
 
 def _care(kind: type) -> dict[str, Any]:
-    """Give how the messages of a class are sent."""
+    """Return how the messages of a class are sent."""
     if kind not in _WAITED_FOR:
         return {}
     return {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH}

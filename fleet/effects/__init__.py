@@ -195,12 +195,12 @@ class Effect:
 
     @property
     def size(self) -> int:
-        """Give the number of parameters."""
+        """Return the number of parameters."""
         return len(self.parameters)
 
     @property
     def price(self) -> int:
-        """Give the number of parameters that are evidence."""
+        """Return the number of parameters that are evidence."""
         return sum(not p.aside for p in self.parameters)
 
 

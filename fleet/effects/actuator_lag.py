@@ -21,7 +21,7 @@ def act(u: np.ndarray, memory: np.ndarray, dt: float, par: np.ndarray) -> None:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Give the whole lag, that of the healthy servo included."""
+    """Return the whole lag, that of the healthy servo included."""
     return {"tau_s": float(par[0]) + body.lag}
 
 

@@ -17,7 +17,7 @@ def act(u: np.ndarray, memory: np.ndarray, dt: float, par: np.ndarray) -> None:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Give the rate itself."""
+    """Return the rate itself."""
     return {"rate_per_s": 1.0 / float(par[0]) if par[0] > 0.0 else float("inf")}
 
 

@@ -13,7 +13,7 @@ def act(flow: Flow, share: Any) -> dict[str, Any]:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Give the ratio to the standard day."""
+    """Return the ratio to the standard day."""
     return {"density_ratio": 1.0 + float(par[0])}
 
 

@@ -14,7 +14,7 @@ def act(readings: dict[str, Any], log_scale: Any) -> dict[str, Any]:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Give the scale itself."""
+    """Return the scale itself."""
     return {"scale": exp(float(par[0]))}
 
 

@@ -10,7 +10,7 @@ LATE = ("v_n", "v_e", "v_d", "h")
 
 
 def act(readings: dict[str, Any], latency: Any) -> dict[str, Any]:
-    """Give what was a while ago; undone to first order."""
+    """Return what was a while ago; undone to first order."""
     t = readings["t"]
     return {name: np.interp(t - latency, t, readings[name]) for name in LATE}
 

@@ -13,7 +13,7 @@ def act(readings: dict[str, Any], bias: Any, of: str = "p") -> dict[str, Any]:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Give degrees per second."""
+    """Return degrees per second."""
     return {"bias_dps": float(np.degrees(par[0]))}
 
 

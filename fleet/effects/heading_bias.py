@@ -13,7 +13,7 @@ def act(readings: dict[str, Any], bias: Any) -> dict[str, Any]:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Give degrees."""
+    """Return degrees."""
     return {"bias_deg": float(np.degrees(par[0]))}
 
 

@@ -10,7 +10,7 @@ GYROS, ACCELEROMETERS = ("p", "q", "r"), ("a_x", "a_y", "a_z")
 
 
 def act(readings: dict[str, Any], roll: Any, pitch: Any, yaw: Any) -> dict[str, Any]:
-    """Give both vectors in the unit's own axes; undone by the opposite turn."""
+    """Return both vectors in the unit's own axes; undone by the opposite turn."""
     turn = np.stack(np.broadcast_arrays(roll, pitch, yaw, readings["p"])[:3])
     return _turned(readings, GYROS, turn) | _turned(readings, ACCELEROMETERS, turn)
 
@@ -25,7 +25,7 @@ def _turned(readings: dict[str, Any], names: tuple[str, ...], turn: np.ndarray) 
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Give the angles in degrees."""
+    """Return the angles in degrees."""
     return dict(zip(("roll_deg", "pitch_deg", "yaw_deg"), np.degrees(par[:3]).tolist(), strict=True))
 
 

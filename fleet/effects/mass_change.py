@@ -13,7 +13,7 @@ def act(flow: Flow, share: Any) -> dict[str, Any]:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Give the mass added; a share where there is no card."""
+    """Return the mass added; a share where there is no card."""
     return {"dmass_kg": float(par[0]) * body.mass}
 
 

@@ -16,7 +16,7 @@ def act(flow: Flow, w_n: Any, w_e: Any) -> dict[str, Any]:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Give the change every 100 m, and where what is added higher up blows from."""
+    """Return the change every 100 m, and where what is added higher up blows from."""
     w_n, w_e = map(float, par[:2])
     return {"mps_per_100m": float(np.hypot(w_n, w_e)), "from_deg": float(np.degrees(np.arctan2(-w_e, -w_n)) % 360.0)}
 

@@ -13,7 +13,7 @@ def act(flow: Flow, w_n: Any, w_e: Any) -> dict[str, Any]:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Give speed and where it blows from."""
+    """Return speed and where it blows from."""
     w_n, w_e = map(float, par[:2])
     return {"speed_mps": float(np.hypot(w_n, w_e)), "from_deg": float(np.degrees(np.arctan2(-w_e, -w_n)) % 360.0)}
 

@@ -41,7 +41,7 @@ class Seen:
         self.live = dict(live)
 
     def twice(self) -> dict[int, list[str]]:
-        """Give the aircraft that more than one worker claims."""
+        """Return the aircraft that more than one worker claims."""
         holders = defaultdict(list)
         for worker, claim in self.claims.items():
             for uav, _ in claim.held:
@@ -49,7 +49,7 @@ class Seen:
         return {uav: workers for uav, workers in holders.items() if len(workers) > 1}
 
     def orphans(self) -> set[int]:
-        """Give the aircraft that are heard and claimed by nobody."""
+        """Return the aircraft that are heard and claimed by nobody."""
         return self.known - {uav for claim in self.claims.values() for uav, _ in claim.held}
 
 

@@ -97,7 +97,7 @@ def mavlink_port(links: Collection[str] = ()) -> Finding:
 
 
 def free(kind: socket.SocketKind, host: str, port: int) -> bool:
-    """Tell whether a port of this machine can be had."""
+    """Return whether a port of this machine can be had."""
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, kind) as s:
             if kind == socket.SOCK_STREAM:

@@ -12,7 +12,7 @@ TAU = np.array([0.05, 0.05, 0.05, 0.25])  # delta_a delta_e delta_r delta_t of a
 
 @kernel
 def lagged(commands: np.ndarray, dt: float, tau: np.ndarray) -> np.ndarray:
-    """Give what acts on average in each interval, (n, 4), from the commands at its start, (n, 4).
+    """Return what acts on average in each interval, (n, 4), from the commands at its start, (n, 4).
 
     Args:
         commands: delta_a delta_e delta_r delta_t, held over each interval [-]

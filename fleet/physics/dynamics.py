@@ -25,7 +25,7 @@ LOST = 1e4  # a state beyond has left every envelope
 
 @bare
 def lost(x: np.ndarray) -> bool:
-    """Tell whether a state, (9,), has left every envelope, or is nan."""
+    """Return whether a state, (9,), has left every envelope, or is nan."""
     far = False
     for i in range(N_X):
         far |= not abs(x[i]) < LOST

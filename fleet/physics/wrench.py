@@ -37,7 +37,7 @@ SLOW, FAST = 0.4, 2.0  # limits of u_a / U0: beyond, the derivatives grow no fur
 
 @inlined
 def wrench(par, u_a, v_a, w_a, p, q, r, delta, at):  # type: ignore[no-untyped-def]
-    """Give X Y Z [m/s2], L M N [rad/s2].
+    """Return X Y Z [m/s2], L M N [rad/s2].
 
     Args:
         par: derivatives in the order of `NAMES`, (37,)

@@ -18,7 +18,7 @@ _ALONE_S = 10.0  # the same for a child that is all its parent waits for [s]
 
 
 def run_until(stop: threading.Event, module: str, *options: str) -> int:
-    """Run `python -m module options…` in the foreground until it ends or `stop` is set; give its exit code."""
+    """Run `python -m module options…` in the foreground until it ends or `stop` is set; return its exit code."""
     child = subprocess.Popen([sys.executable, "-m", module, *options], env=os.environ | {PARENT: str(os.getpid())})
     try:
         while child.poll() is None and not stop.wait(0.2):
@@ -79,7 +79,7 @@ class Children(AbstractContextManager):
                     self._words[name].append(untimed(plain(line.rstrip())))  # who says them again says when
 
     def words(self) -> list[str]:
-        """Give each child's last line."""
+        """Return each child's last line."""
         return [words[-1] for words in self._words.values() if words]
 
     def done(self) -> list[str]:
@@ -91,7 +91,7 @@ class Children(AbstractContextManager):
         return [name for name, child in self._running.items() if child.poll()]
 
     def failed(self) -> list[tuple[int, str]]:
-        """Give exit code and sentence of the children that failed; a refusal (2) is the child's own sentence."""
+        """Return exit code and sentence of the children that failed; a refusal (2) is the child's own sentence."""
         found = []
         for name, child in self._running.items():
             if code := child.poll():

@@ -78,7 +78,7 @@ class Words(logging.Formatter):
         self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
-        """Give one sentence, and how a defect was met."""
+        """Return one sentence, and how a defect was met."""
         words = timed(f"{self._process}: {plain(record.getMessage())}", record.created)
         return f"{words}\n{self.formatException(record.exc_info)}" if record.exc_info else words
 
@@ -91,7 +91,7 @@ class Lines(logging.Formatter):
         self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
-        """Give one line."""
+        """Return one line."""
         line = {
             "t": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),

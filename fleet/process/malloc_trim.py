@@ -10,7 +10,7 @@ _EVERY_S = 20.0
 
 
 def give_back(large: int) -> None:
-    """Give what is freed back to the system, where the C library is glibc; elsewhere nothing is done.
+    """Return what is freed back to the system, where the C library is glibc; elsewhere nothing is done.
 
     Left alone, glibc learns from every large block that is freed: blocks up to that size then lie among the small ones
     and leave holes, and twice that size may lie free at the end of the heap of every thread. What is set is not learnt;

@@ -83,7 +83,7 @@ def close(path: Path) -> None:
 
 
 def strangers(path: Path) -> list[Path]:
-    """Give what a folder holds that belongs to another user; root's is believed."""
+    """Return what a folder holds that belongs to another user; root's is believed."""
     owners = (0, os.geteuid())
     return [one for one in sorted(path.rglob("*")) if one.lstat().st_uid not in owners]
 

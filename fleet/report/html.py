@@ -11,7 +11,7 @@ _COLOURS = {"ink": INK, "muted": MUTED, "line": GRID, "good": GOOD, "bad": BAD, 
 
 
 def document(title: str, body: str) -> str:
-    """Give a page in the house's style; `title` is text, `body` is HTML."""
+    """Return a page in the house's style; `title` is text, `body` is HTML."""
     colours = "".join(f"--{name}:{colour};" for name, colour in _COLOURS.items())
     style = f":root{{{colours}}}\n" + Path(__file__).with_name("page.css").read_text(encoding="utf-8")
     head = (

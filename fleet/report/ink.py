@@ -27,7 +27,7 @@ _MOST_POINTS = 3_000  # of one line; more would not be seen
 
 
 def mode_colours(modes: Iterable[str]) -> dict[str, str]:
-    """Give every mode its colour; the usual ones keep theirs on every page."""
+    """Return every mode its colour; the usual ones keep theirs on every page."""
     names = list(dict.fromkeys(modes))
     free = [name for name in names if name not in _MODES]
     return {name: _MODES.get(name) or _OTHERS[free.index(name) % len(_OTHERS)] for name in names}
@@ -51,7 +51,7 @@ def drawn(t: np.ndarray, y: np.ndarray, widest: float) -> tuple[np.ndarray, np.n
 
 
 def spread(values: np.ndarray, room: float = 0.08, least: float = 1.0) -> tuple[float, float]:
-    """Give the limits of an axis that shows all values with some room."""
+    """Return the limits of an axis that shows all values with some room."""
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     more = max(room * (high - low), 0.5 * least)
     return low - more, high + more

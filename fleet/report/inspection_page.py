@@ -146,7 +146,7 @@ def _facts(figure: Figure, told: Findings, said: dict[str, str]) -> None:
 
 
 def _words(figure: Figure, y: float, x: float, words: str, width: int) -> float:
-    """Write words in lines from `y` down, with an end where there are too many; give where the next may begin."""
+    """Write words in lines from `y` down, with an end where there are too many; return where the next may begin."""
     found = textwrap.wrap(words, width)
     if len(found) > _MOST_LINES:
         found = [*found[: _MOST_LINES - 1], found[_MOST_LINES - 1][: width - 2] + " …"]

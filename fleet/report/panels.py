@@ -128,7 +128,7 @@ def rates(ax: Any, known: Survey, told: Findings) -> None:
 
 
 def _share(known: Survey, name: str, centres: np.ndarray, width: float) -> np.ndarray:
-    """Give the rate around each centre over the usual rate, (n,) 0..1."""
+    """Return the rate around each centre over the usual rate, (n,) 0..1."""
     rows = known.rows[name]
     t = rows.rows()[0]
     usual = rows.rate_hz / max(rows.stride, 1)

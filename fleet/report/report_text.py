@@ -77,7 +77,7 @@ def _aircraft(told: Findings, twin: str) -> Table:
 
 
 def events(told: Findings, most: int) -> list[tuple[str, str]]:
-    """Give the events that tell most, in time order, and how many more there are: (when, words)."""
+    """Return the events that tell most, in time order, and how many more there are: (when, words)."""
     chosen = sorted(
         (event for event in told.events if event.kind != "item"), key=lambda event: (_NEWS.index(event.kind), event.t_s)
     )[:most]

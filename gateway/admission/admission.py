@@ -24,7 +24,7 @@ class Gate:
         self._sieve, self._signing = sieve, signing
 
     def admit(self, frames: Frames, refused: Counter[str]) -> Frames:
-        """Give the frames that may come in, and count the others by reason."""
+        """Return the frames that may come in, and count the others by reason."""
         if self._signing is not None and len(frames.at):
             frames = frames.only(self._signing.passes(frames, refused))
         if self._sieve.rules and len(frames.at):
@@ -34,7 +34,7 @@ class Gate:
         return frames
 
     def sign(self, message: bytes) -> bytes:
-        """Give a message of ours as it goes out."""
+        """Return a message of ours as it goes out."""
         return message if self._signing is None else self._signing.sign(message)
 
 

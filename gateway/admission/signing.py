@@ -61,7 +61,7 @@ def read_keys(path: Path) -> dict[str, bytes]:
 
 
 def pick(keys: dict[str, bytes], name: str, link: str) -> bytes:
-    """Give the key of a link: the one it names, or the only one.
+    """Return the key of a link: the one it names, or the only one.
 
     Raises:
         ValueError: when there is no such key.
@@ -73,7 +73,7 @@ def pick(keys: dict[str, bytes], name: str, link: str) -> bytes:
 
 
 def stamp_now() -> int:
-    """Give the time as signatures have it [10 us since 2015]."""
+    """Return the time as signatures have it [10 us since 2015]."""
     return round((time.time() - _EPOCH_S) * _UNITS)
 
 

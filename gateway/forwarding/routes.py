@@ -44,13 +44,13 @@ class Routes:
         return True
 
     def to(self, system: int, component: int) -> list[Port]:
-        """Give where a component is, all of a system's for component 0."""
+        """Return where a component is, all of a system's for component 0."""
         if component:
             return [self._of[system, component][0]] if (system, component) in self._of else []
         return list(dict.fromkeys(port for (one, _), (port, _) in self._of.items() if one == system))
 
     def ports(self, link: int) -> list[Hashable]:
-        """Give the far ends of one link that speak."""
+        """Return the far ends of one link that speak."""
         return list(dict.fromkeys(port.where for port, _ in self._of.values() if port.link == link))
 
     def part(self, link: int, where: Hashable) -> None:

@@ -21,7 +21,7 @@ _SYSTEM, _COMPONENT = _places("target_system"), _places("target_component")
 
 
 def targets(frames: Frames) -> tuple[np.ndarray, np.ndarray]:
-    """Give the target system and component of every frame, (n,) each; 0: all of them."""
+    """Return the target system and component of every frame, (n,) each; 0: all of them."""
     return _read(frames, _SYSTEM), _read(frames, _COMPONENT)
 
 

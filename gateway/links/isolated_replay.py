@@ -19,7 +19,7 @@ _PATIENCE_S = 8.0  # between the request to end and the end of patience [s]
 
 
 def divided(specs: Sequence[Spec]) -> tuple[list[Spec], list[Spec]]:
-    """Give the links to open here, and the recordings to be played apart: all of them where there is a live link."""
+    """Return the links to open here, and the recordings to be played apart: all of them where there is a live link."""
     files = [spec for spec in specs if spec.kind == "replay"]
     live = [spec for spec in specs if spec.kind != "replay"]
     return (live, files) if live else (files, [])

@@ -17,7 +17,7 @@ _T0 = time.time() - time.monotonic()
 
 
 def wall() -> float:
-    """Give fleet time now [s since 1970]; steps of the system clock after the start do not show."""
+    """Return fleet time now [s since 1970]; steps of the system clock after the start do not show."""
     return _T0 + time.monotonic()
 
 
@@ -46,7 +46,7 @@ class Link(Protocol):
 
     @property
     def greets(self) -> Sequence[Hashable]:
-        """Give far ends known before they spoke: many an aircraft speaks only when spoken to."""
+        """Return far ends known before they spoke: many an aircraft speaks only when spoken to."""
 
     def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
         """Begin to receive; batches carry `number`."""

@@ -33,11 +33,11 @@ class Receiver(Protocol):
     """Takes what waits in a socket."""
 
     def take(self) -> Heard | None:
-        """Give the datagrams that wait; None where there are none."""
+        """Return the datagrams that wait; None where there are none."""
 
 
 def receiver(sock: socket.socket) -> Receiver:
-    """Give the fastest way to read a socket on this machine."""
+    """Return the fastest way to read a socket on this machine."""
     try:
         return Bulk(sock)
     except (AttributeError, OSError):  # another system, or another C library
@@ -52,7 +52,7 @@ class OneByOne:
         self._sock = sock
 
     def take(self) -> Heard | None:
-        """Give the datagrams that wait; None where there are none."""
+        """Return the datagrams that wait; None where there are none."""
         pieces: list[tuple[float, Hashable, bytes]] = []
         while len(pieces) < MOST:
             try:
@@ -117,7 +117,7 @@ class Bulk:
         return np.ndarray((MOST,), np.uint32, memoryview(self._messages).cast("B"), offset, (stride,))
 
     def take(self) -> Heard | None:
-        """Give the datagrams that wait; None where there are none."""
+        """Return the datagrams that wait; None where there are none."""
         self._name_sizes[:], self._stamp_sizes[:] = _ADDRESS, self._stamps.itemsize * _STAMP
         count = self._call(self._sock.fileno(), ctypes.addressof(self._messages), MOST, _DONTWAIT, None)
         if count <= 0:  # nothing there, or an earlier answer found nobody

@@ -91,7 +91,7 @@ class Replay:
         self._steps = itertools.chain(ahead, steps)
 
     def _meet(self, news: Sequence[Any]) -> None:
-        """Give an id to whoever is new: first to those recorded, then to their copies, copy by copy."""
+        """Return an id to whoever is new: first to those recorded, then to their copies, copy by copy."""
         new = sorted({m.uav for m in news if not isinstance(m, FleetState)} - self._known.keys())
         for uav in new:
             self._known[uav] = self._ids.give((self, uav, 0), uav)
@@ -138,7 +138,7 @@ class Replay:
             _put(out, Batch(number, copies=copied), stop, most)
 
     def _named(self, news: Sequence[Any]) -> list[Any]:
-        """Give everybody the id found for them."""
+        """Return everybody the id found for them."""
         if all(uav == known for uav, known in self._known.items()):
             return list(news)
         renamed = (renumbered(message, lambda uav: self._known.get(uav, uav)) for message in news)

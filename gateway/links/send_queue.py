@@ -55,7 +55,7 @@ class Outbox:
             self._waiting.popleft()
 
     def waits(self) -> bool:
-        """Tell whether something waits."""
+        """Return whether something waits."""
         return bool(self._waiting)
 
     def close(self) -> int:

@@ -23,11 +23,11 @@ class Tcp:
         self.outbox = Outbox(self._write)
 
     def fileno(self) -> int:
-        """Give the number to wait at."""
+        """Return the number to wait at."""
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """Give what came; it is nothing where waiting was for nothing.
+        """Return what came; it is nothing where waiting was for nothing.
 
         Raises:
             OSError: when the far end has closed or is gone.
@@ -62,11 +62,11 @@ class Serial:
         self.outbox = Outbox(self._write)
 
     def fileno(self) -> int:
-        """Give the number to wait at."""
+        """Return the number to wait at."""
         return int(self._line.fileno())
 
     def read(self) -> bytes:
-        """Give what came.
+        """Return what came.
 
         Raises:
             OSError: when the device is gone.

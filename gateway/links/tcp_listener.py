@@ -47,12 +47,12 @@ class TcpListener:
 
     @property
     def greets(self) -> Sequence[Hashable]:
-        """Give those who are there, whether they have spoken or not."""
+        """Return those who are there, whether they have spoken or not."""
         return tuple(self._callers)
 
     @property
     def port(self) -> int:
-        """Give the port listened at."""
+        """Return the port listened at."""
         return int(self._socket.getsockname()[1])
 
     def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
@@ -97,7 +97,7 @@ class TcpListener:
         return oldest
 
     def _longest_silent(self, now: float) -> Hashable:
-        """Give the caller silent for longest; None where all have sent something lately."""
+        """Return the caller silent for longest; None where all have sent something lately."""
         silent = [one for one, t in self._spoke.items() if one in self._silent or now - t > SPEAKING_S]
         return min(silent, key=self._spoke.__getitem__, default=None)
 

@@ -37,7 +37,7 @@ class Udp:
 
     @property
     def port(self) -> int:
-        """Give the port listened at; 0 as long as there is none."""
+        """Return the port listened at; 0 as long as there is none."""
         return int(self._socket.getsockname()[1]) if self._socket is not None else 0
 
     def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:

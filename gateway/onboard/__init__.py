@@ -34,7 +34,7 @@ class Onboard:
     def tick(
         self, now: float, crafts: Iterable[Craft], greets: Sequence[Hashable] = ()
     ) -> list[tuple[Hashable, bytes]]:
-        """Give (where to, bytes) of what is to be sent now.
+        """Return (where to, bytes) of what is to be sent now.
 
         Args:
             now: fleet time [s since 1970]

@@ -39,7 +39,7 @@ class Cache:
             self._check()
 
     def read(self, key: str) -> Card | None:
-        """Give what an aircraft told before; None where nothing is known or the file is damaged."""
+        """Return what an aircraft told before; None where nothing is known or the file is damaged."""
         try:
             if self._refused:
                 return None

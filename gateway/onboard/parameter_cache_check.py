@@ -41,7 +41,7 @@ class Recall:
         return f"{craft.autopilot}-{craft.board}-{craft.system}" if craft.board else ""
 
     def ask(self, now: float) -> list[Any]:
-        """Give the messages to send now; `now` is fleet time [s since 1970]."""
+        """Return the messages to send now; `now` is fleet time [s since 1970]."""
         if self._card is None and self.key:
             self._begin(now)
         if not self.over and self._card is not None:

@@ -47,7 +47,7 @@ class Questions:
         self._item_tries = 0  # since the last item that came
 
     def ask(self, now: float, share: float = 1.0) -> list[Any]:
-        """Give the messages to send now; `share` of the rates wanted fits the link."""
+        """Return the messages to send now; `share` of the rates wanted fits the link."""
         if self._recall is not None and now - self._keep_at >= KEEP_S:
             self._keep_at = now
             self._recall.keep()

@@ -25,7 +25,7 @@ _STEADY = 0.15  # a share that would change by less stays
 
 
 def budget_of(spec: Spec, text: str = "") -> float:
-    """Give what aircraft may send on a link [bytes/s]: as asked for, or what suits its kind.
+    """Return what aircraft may send on a link [bytes/s]: as asked for, or what suits its kind.
 
     Raises:
         ValueError: when `text` is no size.
@@ -36,7 +36,7 @@ def budget_of(spec: Spec, text: str = "") -> float:
 
 
 def size_of(name: str) -> int:
-    """Give the length of a message on the wire, nothing cut off [bytes]."""
+    """Return the length of a message on the wire, nothing cut off [bytes]."""
     return _FRAME + layout(name).itemsize
 
 
@@ -57,7 +57,7 @@ class Share:
         self._budget = budget
 
     def weigh(self, crafts: Collection[Craft]) -> float:
-        """Give the share for these aircraft; what they send unasked counts too, where it is known."""
+        """Return the share for these aircraft; what they send unasked counts too, where it is known."""
         unasked = sum(
             hz * size_of(name) for craft in crafts for name, hz in craft.rates.items() if name not in WANTED_HZ
         )

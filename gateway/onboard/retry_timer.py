@@ -11,7 +11,7 @@ class Patience:
         self._next = float("-inf")
 
     def due(self, now: float) -> bool:
-        """Tell whether to try now; if so the next wait is doubled."""
+        """Return whether to try now; if so the next wait is doubled."""
         if now < self._next:
             return False
         self._next, self._wait = now + self._wait, min(2 * self._wait, LONGEST_WAIT_S)

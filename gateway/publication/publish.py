@@ -70,7 +70,7 @@ class Publisher:
         self.way.send([Wire(Account, -1, encode(account))])
 
     def newest(self) -> Told:
-        """Give the newest counters, and the newest status of every aircraft by id."""
+        """Return the newest counters, and the newest status of every aircraft by id."""
         return self.told, [s for s, _ in sorted(self._answers(Status, None, {}, b""), key=lambda pair: pair[0].uav)]
 
     def repeat(self, mono: float) -> None:

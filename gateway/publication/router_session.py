@@ -33,11 +33,11 @@ class Way:
 
     @property
     def joined(self) -> bool:
-        """Tell whether a router was there at the last look."""
+        """Return whether a router was there at the last look."""
         return bool(self._router)
 
     def look(self) -> bool:
-        """Tell whether a router has come since the last look; ask a few times a second."""
+        """Return whether a router has come since the last look; ask a few times a second."""
         now, before = self._clock(), self._router
         self._router = self._bus.router
         if before and self._router != before:

@@ -96,14 +96,14 @@ class Cutter:
         return int(self._held.sum())
 
     def feed(self, heard: Heard) -> bytes:
-        """Give the records completed by these pieces."""
+        """Return the records completed by these pieces."""
         slots = np.array([self._slot(sender) for sender in heard.senders], np.int64)
         pieces = (heard.buf, heard.start, heard.stop, slots[heard.sender])
         us = np.round(heard.arrival * 1e6).astype(np.int64)
         return cut(pieces, us, self._carry, self._held, self.counts, EXTRA, CRC).tobytes()
 
     def _slot(self, sender: object) -> int:
-        """Give the place of a sender's rest; who was met first makes room, the rest counts as noise then."""
+        """Return the place of a sender's rest; who was met first makes room, the rest counts as noise then."""
         if sender not in self._slots:
             free = len(self._slots)
             if free == len(self._held):

@@ -122,7 +122,7 @@ class Tally:
 
 
 def overruns(counts: Sequence[Path] = _SYSTEM_S_COUNT) -> Counter[int]:
-    """Give the datagrams the system dropped at each UDP port as its buffer was full; none where it does not tell."""
+    """Return the datagrams the system dropped at each UDP port as its buffer was full; none where it does not tell."""
     found: Counter[int] = Counter()
     for path in counts:
         try:

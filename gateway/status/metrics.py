@@ -18,7 +18,7 @@ _UAV = Naming("parauav_uav", ("uav",), NOW, _OTHER)
 
 
 def counters(told: Callable[[], Told]) -> Families:
-    """Give what Prometheus is told."""
+    """Return what Prometheus is told."""
     return lambda: _counters(*told())
 
 

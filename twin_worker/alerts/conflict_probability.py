@@ -30,7 +30,7 @@ class Separation(NamedTuple):
 
 @kernel
 def _minimum(d0: float, d1: float, e0: float, e1: float) -> tuple[float, float]:
-    """Give the least length of the vector (d, e) on its straight way from 0 to 1, and where on it."""
+    """Return the least length of the vector (d, e) on its straight way from 0 to 1, and where on it."""
     x, y = d1 - d0, e1 - e0
     square = x * x + y * y
     s = 0.0 if square <= 0.0 else min(max(-(d0 * x + e0 * y) / square, 0.0), 1.0)
@@ -58,7 +58,7 @@ def _meets(r0: np.ndarray, r1: np.ndarray, wide: float, high: float) -> bool:
 
 @kernel
 def _root(nn: float, ne: float, ee: float) -> tuple[float, float, float]:
-    """Give the symmetric square root of a 2 x 2 covariance."""
+    """Return the symmetric square root of a 2 x 2 covariance."""
     s = sqrt(max(nn * ee - ne * ne, 0.0))
     t = sqrt(nn + ee + 2.0 * s)
     return (nn + s) / t, ne / t, (ee + s) / t
@@ -127,7 +127,7 @@ def screen(
 
 @kernel
 def chance(apart: np.ndarray, covariance: np.ndarray, draws: np.ndarray, limits: np.ndarray) -> float:
-    """Give the probability of a loss of separation.
+    """Return the probability of a loss of separation.
 
     Args:
         apart: other minus own mean position on the common grid, NED, (n, 3) [m]

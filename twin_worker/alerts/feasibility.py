@@ -72,7 +72,7 @@ def ability(params: Mapping[str, float], altitude_m: float) -> Ability:
 
 
 def achievable(now: Now, able: Ability) -> Finding:
-    """Judge the legs ahead; give the one that is least achievable. A leg of unknown airspeed ends the judgement.
+    """Judge the legs ahead; return the one that is least achievable. A leg of unknown airspeed ends the judgement.
 
     Without an estimate of the wind nothing is judged.
     """
@@ -101,7 +101,7 @@ def achievable(now: Now, able: Ability) -> Finding:
 def _worst(
     leg: np.ndarray, from_p: np.ndarray, Va: float, able: Ability, wind: np.ndarray
 ) -> tuple[float, tuple[float, str]]:
-    """Give the speed over ground on a leg [m/s], and the greatest probability that it cannot be flown, with why."""
+    """Return the speed over ground on a leg [m/s], and the greatest probability that it cannot be flown, with why."""
     way, length = leg[m.P_N : m.P_D + 1] - from_p, hypot(*(leg[m.P_N : m.P_D] - from_p[:2]))
     unit = way[:2] / length if length > 1.0 else np.array([1.0, 0.0])
     along, cross = float(wind[:2] @ unit), float(wind[1] * unit[0] - wind[0] * unit[1])

@@ -46,17 +46,17 @@ class Forecast(NamedTuple):
 
     @property
     def t(self) -> np.ndarray:
-        """Give the instants, (n,) [s since 1970]."""
+        """Return the instants, (n,) [s since 1970]."""
         return STEP * (self.first + np.arange(len(self.path)))
 
     def covariance(self) -> np.ndarray:
-        """Give nn, ne, ee of the horizontal covariance and the vertical variance, (n, 4) [m2]."""
+        """Return nn, ne, ee of the horizontal covariance and the vertical variance, (n, 4) [m2]."""
         out = np.empty((len(self.path), 4))
         _turned(self.along, self.sigma, out)
         return out
 
     def draws(self, until: float = np.inf) -> np.ndarray:
-        """Give 128 equally probable flights up to an instant [s since 1970], NED, (128, k, 3) [m]."""
+        """Return 128 equally probable flights up to an instant [s since 1970], NED, (128, k, 3) [m]."""
         k = max(int(np.searchsorted(self.t, until, side="right")), 1)
         e = DRAWS[:, None, :] * self.sigma[:k]
         c, s = self.along[:k].T
@@ -64,13 +64,13 @@ class Forecast(NamedTuple):
         return self.path[:k] + np.stack(error, axis=-1)
 
     def place(self, k: int) -> Origin:
-        """Give the mean position at row `k`."""
+        """Return the mean position at row `k`."""
         return Origin(*map(int, to_geodetic(self.made.ned_origin(), self.path[k])))
 
 
 @lru_cache(maxsize=64)
 def axis_z(quantile: float, alone: float = 0.0) -> float:
-    """Give the half-axis of a tube that holds `quantile`, in standard deviations of one axis.
+    """Return the half-axis of a tube that holds `quantile`, in standard deviations of one axis.
 
     Args:
         quantile: share that all three half-axes hold at once
@@ -110,7 +110,7 @@ def _turned(along: np.ndarray, sigma: np.ndarray, out: np.ndarray) -> None:
 
 
 def _sound(made: Prediction, ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
-    """Tell whether times rise, shapes agree, numbers are finite and the origin is on this earth."""
+    """Return whether times rise, shapes agree, numbers are finite and the origin is on this earth."""
     n = len(ahead) if ahead.ndim == 1 else 0
     if n < 1 or path.shape != (n, 3) or tube.shape != (n, 3):
         return False
@@ -128,7 +128,7 @@ def _sound(made: Prediction, ahead: np.ndarray, path: np.ndarray, tube: np.ndarr
 
 @nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
 def _credible(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
-    """Tell whether times are finite and rise, and places and half-axes are near; false for nan."""
+    """Return whether times are finite and rise, and places and half-axes are near; false for nan."""
     for k in range(len(ahead)):
         if not np.isfinite(ahead[k]) or (k and not ahead[k] > ahead[k - 1]):
             return False

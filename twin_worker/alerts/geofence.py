@@ -29,7 +29,7 @@ class Fence(NamedTuple):
     unseen: str = ""  # what of the fence is not judged
 
     def limits(self) -> bool:
-        """Tell whether anything can be judged."""
+        """Return whether anything can be judged."""
         return bool(np.isfinite(self[:3]).any())
 
 

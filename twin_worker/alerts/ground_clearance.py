@@ -14,7 +14,7 @@ _OVER = "height is kept"
 
 
 def above(flight: Forecast, home: Origin) -> np.ndarray:
-    """Give the mean height above home, (n,) [m]."""
+    """Return the mean height above home, (n,) [m]."""
     return (flight.made.origin[2] - home.alt_mm) * 1e-3 - flight.path[:, 2]
 
 

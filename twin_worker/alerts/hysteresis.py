@@ -67,7 +67,7 @@ class Ledger:
     _open: dict[About, Open] = field(default_factory=dict)
 
     def judge(self, uav: int, now: float, finding: Finding) -> list[Alert]:
-        """Take a finding at data time `now` [s since 1970]; give the alert it raises or withdraws, if any."""
+        """Take a finding at data time `now` [s since 1970]; return the alert it raises or withdraws, if any."""
         about = finding.kind, finding.other
         entry, rule = self._open.setdefault(about, Open()), RULES[finding.kind]
         p = finding.probability if isfinite(finding.probability) else 0.0
@@ -88,17 +88,17 @@ class Ledger:
         return [entry.alert]
 
     def watched(self, kind: AlertKind) -> list[int]:
-        """Give the other UAVs of all dangers of one kind that are in force or about to be."""
+        """Return the other UAVs of all dangers of one kind that are in force or about to be."""
         return [other for one, other in self._open if one is kind]
 
     @property
     def active(self) -> list[Alert]:
-        """Give the alerts in force, oldest first."""
+        """Return the alerts in force, oldest first."""
         return [entry.alert for entry in tuple(self._open.values()) if entry.alert is not None]
 
 
 def _patience(rule: Rule, found: Finding, now: float) -> float:
-    """Give how long a danger must be probable before it is told [s]: what lies far ahead has time to be borne out."""
+    """Return how long a danger must be probable before it is told [s]: what lies far ahead has time to be borne out."""
     ahead = found.at - now if found.at is not None else 0.0
     return rule.after_s + rule.per_s * max(ahead - _NEAR_S, 0.0)
 

@@ -31,7 +31,7 @@ class Traffic:
         self.board.hear(made)
 
     def after(self, uav: int, now: float, results: list[Message]) -> list[Message]:
-        """Take what a held twin published up to data time `now`; give that, and what it means to its neighbours."""
+        """Take what a held twin published up to data time `now`; return that, and what it means to its neighbours."""
         for result in results:
             if isinstance(result, Prediction):
                 self.hear(result)
@@ -54,7 +54,7 @@ class Traffic:
         self._ledgers[uav] = conflicts
 
     def show(self, uav: int) -> Ledger:
-        """Give what was found of an aircraft."""
+        """Return what was found of an aircraft."""
         return self._ledgers.get(uav) or Ledger()
 
     def forget(self, uav: int) -> None:
@@ -63,7 +63,7 @@ class Traffic:
         self._ledgers.pop(uav, None)
 
     def active(self, uav: int) -> list[Alert]:
-        """Give the conflicts of one held aircraft that are in force."""
+        """Return the conflicts of one held aircraft that are in force."""
         return self._ledgers[uav].active if uav in self._ledgers else []
 
     def _meetings(self, uav: int, now: float) -> list[Finding]:

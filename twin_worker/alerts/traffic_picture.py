@@ -71,19 +71,19 @@ class Board:
             self.corner[slot] = to_geodetic(made.ned_origin(), _FAR)
 
     def of(self, uav: int) -> tuple[int, Forecast] | None:
-        """Give slot and prediction of one aircraft; None where it has none that can be judged."""
+        """Return slot and prediction of one aircraft; None where it has none that can be judged."""
         slot = self._slots.get(uav)
         found = None if slot is None else self._laid[slot]
         return None if slot is None or found is None else (slot, found)
 
     def others(self, slot: int, now: float, stale_s: float) -> np.ndarray:
-        """Give the slots of aircraft with a higher id and a prediction made within `stale_s` of `now`, (m,)."""
+        """Return the slots of aircraft with a higher id and a prediction made within `stale_s` of `now`, (m,)."""
         n = len(self._slots)
         near = (self.uav[:n] > self.uav[slot]) & (self.rows[:n] > 0) & (np.abs(self.t[:n] - now) <= stale_s)
         return np.flatnonzero(near)
 
     def into(self, slot: int, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Give scale and shift that take the others' NED to that of `slot`, (m, 3) each [-, m].
+        """Return scale and shift that take the others' NED to that of `slot`, (m, 3) each [-, m].
 
         Both are straight in latitude and longitude (`fleet.frames`), so the images of two places tell all.
         """

@@ -65,7 +65,7 @@ def _learn_tube(level: np.ndarray, score: np.ndarray, r: np.ndarray, j: np.ndarr
 def _settle_claims(
     claimed: np.ndarray, followed: np.ndarray, horizon: np.ndarray, passed: np.ndarray, mine: np.ndarray
 ) -> tuple[int, int]:
-    """Give how many horizons of this group have held and how many have failed since, and claim them no longer."""
+    """Return how many horizons of this group have held and how many have failed since, and claim them no longer."""
     held = failed = 0
     for r in range(len(claimed)):
         if mine[r] and claimed[r]:
@@ -92,7 +92,7 @@ class Factors:
     bounded: bool = False
 
     def at(self, ahead: np.ndarray) -> np.ndarray:
-        """Give the factor on half-axes by look-ahead, (n,) [-]."""
+        """Return the factor on half-axes by look-ahead, (n,) [-]."""
         return np.interp(ahead, KNOTS, self.tube)
 
 
@@ -112,14 +112,14 @@ def factors(ledger: Ledger, group: str, table: Table, levels: Levels) -> Factors
 
 
 def _join(atoms: np.ndarray, scores: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Give quantiles of the rows of scores (r, n), a table's atoms (20,) among them."""
+    """Return quantiles of the rows of scores (r, n), a table's atoms (20,) among them."""
     r = len(scores)
     x = np.hstack([np.broadcast_to(atoms, (r, ATOMS)), scores])
     return weighted_quantile(x, np.hstack([np.full((r, ATOMS), _TABLE / ATOMS), weight]), level)
 
 
 def _horizon(ledger: Ledger, rows: np.ndarray, risks: np.ndarray, level: float) -> float:
-    """Give the factor that keeps the wanted share of first passages behind the horizon."""
+    """Return the factor that keeps the wanted share of first passages behind the horizon."""
     followed, passed = ledger.followed[rows], ledger.passed[rows]
     x = critical(ledger.ratio[rows], followed)
     age = np.clip(ledger.until - ledger.t0[rows], 0.0, None)

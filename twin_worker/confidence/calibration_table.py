@@ -61,16 +61,16 @@ class Table:
     alone: float = INDEPENDENT
 
     def sigma(self, doubt: "Doubt", ahead: np.ndarray) -> np.ndarray:
-        """Give what errors to expect, growing beyond the last knot, (..., n, 3) [m]."""
+        """Return what errors to expect, growing beyond the last knot, (..., n, 3) [m]."""
         scale, lag, floor, _ = self._curves(ahead)
         return np.sqrt((scale * doubt.spread) ** 2 + (lag * doubt.revision) ** 2 + floor**2)
 
     def half_axes(self, doubt: "Doubt", ahead: np.ndarray) -> np.ndarray:
-        """Give the half-axes that held `QUANTILE` of these flights in each look-ahead, (..., n, 3) [m]."""
+        """Return the half-axes that held `QUANTILE` of these flights in each look-ahead, (..., n, 3) [m]."""
         return self._curves(ahead)[3] * self.sigma(doubt, ahead)
 
     def _curves(self, ahead: np.ndarray) -> np.ndarray:
-        """Give scale, lag, floor and factor by look-ahead, (4, n, 3)."""
+        """Return scale, lag, floor and factor by look-ahead, (4, n, 3)."""
         n = len(ahead)
         return self._usual[:, :n] if np.array_equal(ahead, AHEAD[:n]) else self._drawn(ahead)
 
@@ -103,13 +103,13 @@ def at_look_aheads(ahead: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def law_of_growth(method: str, ahead: np.ndarray) -> np.ndarray:
-    """Give the spread a method stands in for where no ensemble says any, (n, 3) [m]; a guess, before any flight."""
+    """Return the spread a method stands in for where no ensemble says any, (n, 3) [m]; a guess, before any flight."""
     base, growth, power = _LAW.get(method, _LAW["greybox"])
     return np.hypot(base, np.outer(np.maximum(ahead, 0.0) ** power, growth))
 
 
 def doubt_of(spread: np.ndarray | None, revision: np.ndarray | None, method: str, ahead: np.ndarray) -> Doubt:
-    """Give the doubt (..., n, 3) of a prediction, by the law of growth where an ensemble gave none or nonsense."""
+    """Return the doubt (..., n, 3) of a prediction, by the law of growth where an ensemble gave none or nonsense."""
     whole = _filled(spread, law_of_growth(method, ahead))
     return Doubt(whole, _filled(revision, whole))
 
@@ -122,7 +122,7 @@ def _filled(values: np.ndarray | None, otherwise: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def untaught(method: str) -> Table:
-    """Give the table of a method no flight has taught anything: never narrower than its law of growth."""
+    """Return the table of a method no flight has taught anything: never narrower than its law of growth."""
     law = law_of_growth(method, KNOTS)
     shape = np.sqrt(2.0) * erfinv(np.cbrt(LEVELS))  # the largest of three normal errors
     shape = shape / np.interp(QUANTILE, LEVELS, shape)

@@ -24,7 +24,7 @@ def airframe_class(vehicle: str, speed: float) -> str:
 
 
 def wider(group: str) -> tuple[str, ...]:
-    """Give a group and those it belongs to, narrowest first: any of its ways, any airframe, any parameters, any law.
+    """Return a group and those it belongs to, narrowest first: any of its ways, any airframe, any parameters, any law.
 
     Parameters matter more than the airframe, and the law more than either.
     """
@@ -36,5 +36,5 @@ def wider(group: str) -> tuple[str, ...]:
 
 
 def setting(group: str) -> str:
-    """Give what a group says besides the method: law / airframe / parameters."""
+    """Return what a group says besides the method: law / airframe / parameters."""
     return group.partition("/")[2]

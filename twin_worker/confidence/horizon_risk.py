@@ -17,7 +17,7 @@ _STEP = np.gradient(np.log1p(AHEAD))
 
 
 def growth(half_axes: np.ndarray, predicted_length: np.ndarray) -> np.ndarray:
-    """Give how large half-axes (..., n, 3) ever were beside the path so far (..., n), always rising, (..., n) [-].
+    """Return how large half-axes (..., n, 3) ever were beside the path so far (..., n), always rising, (..., n) [-].
 
     A power mean of high power over log time: close to the maximum so far, but without its flat stretches, on which a
     horizon would jump by minutes.
@@ -29,7 +29,7 @@ def growth(half_axes: np.ndarray, predicted_length: np.ndarray) -> np.ndarray:
 
 
 def critical(ratio: np.ndarray, followed: np.ndarray) -> np.ndarray:
-    """Give each prediction's critical factor, (m,): exact where it passed, else no more than a bound from above.
+    """Return each prediction's critical factor, (m,): exact where it passed, else no more than a bound from above.
 
     What stayed within 10 % needs no more than what ends its horizon there. An easy minute says nothing about factors
     so small that only hard ones are ended by them: so the hard ones hold as often as all.

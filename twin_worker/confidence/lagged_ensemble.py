@@ -29,7 +29,7 @@ class Earlier:
         self._kept.clear()
 
     def revised(self, t: float, ahead: np.ndarray, path: np.ndarray) -> np.ndarray | None:
-        """Give the root mean square departure along, cross, vertical, (n, 3) [m]; None without earlier ones.
+        """Return the root mean square departure along, cross, vertical, (n, 3) [m]; None without earlier ones.
 
         Beyond the end of an earlier prediction its last departure stays.
         """

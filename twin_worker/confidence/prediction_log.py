@@ -53,11 +53,11 @@ class Ledger:
 
     @property
     def newest(self) -> float:
-        """Give when the newest prediction was made [s since 1970]."""
+        """Return when the newest prediction was made [s since 1970]."""
         return float(self.t0[self._at]) if self._at >= 0 else -np.inf
 
     def add(self, t0: float, method: str, group: str, path: np.ndarray, speed: float) -> int:
-        """Begin to follow a prediction over the first n of `AHEAD`, path (n, 3); give its row, to be completed."""
+        """Begin to follow a prediction over the first n of `AHEAD`, path (n, 3); return its row, to be completed."""
         r = self._at = (self._at + 1) % len(self.t0)
         n = len(path)
         self.t0[r], self.method[r], self.group[r], self.size[r] = t0, method, group, n
@@ -69,7 +69,7 @@ class Ledger:
 
     @property
     def coverage(self) -> tuple[float, int]:
-        """Give the share of answered look-aheads inside the tube (nan before any), and the predictions behind it."""
+        """Return the share of answered look-aheads inside the tube (nan before any), and the predictions behind it."""
         score = self.score[:, 1:].copy()  # at once: another thread may read while this one scores
         known = np.isfinite(score)
         n = int(known.any(axis=1).sum())
@@ -80,7 +80,7 @@ class Ledger:
         self._odometer = self._odometer[:0]
 
     def end(self) -> np.ndarray:
-        """Follow no prediction any further; give the rows this ended."""
+        """Follow no prediction any further; return the rows this ended."""
         rows = np.flatnonzero(self.live)
         self.live[:] = self.watched[:] = False
         return rows

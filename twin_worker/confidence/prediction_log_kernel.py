@@ -38,7 +38,7 @@ class Known(NamedTuple):
 
 @_exact
 def _before(at: float, t: np.ndarray) -> int:
-    """Give the row before `at`, at least the first, at most the last but one."""
+    """Return the row before `at`, at least the first, at most the last but one."""
     k: int = np.searchsorted(t, at)  # type: ignore[assignment]
     return max(min(k, len(t) - 1) - 1, 0)
 
@@ -53,7 +53,7 @@ def _between(at: float, t0: float, t1: float, x0: float, x1: float) -> float:
 
 @_exact
 def _run(at: float, odometer: np.ndarray) -> float:
-    """Give the length flown until `at` [m]."""
+    """Return the length flown until `at` [m]."""
     k = _before(at, odometer[:, 0])
     (t0, x0), (t1, x1) = odometer[k], odometer[min(k + 1, len(odometer) - 1)]
     return _between(at, t0, t1, x0, x1)

@@ -64,7 +64,7 @@ class Tables:
     sentence: str = ""
 
     def choose(self, group: str) -> tuple[Table, str]:
-        """Give the narrowest table for a group, and which it is in words."""
+        """Return the narrowest table for a group, and which it is in words."""
         method = group.partition("/")[0]
         for name in wider(group):
             if (table := self.by_group.get(name)) is not None:

@@ -126,7 +126,7 @@ class Record:
         return Trust(tube, horizon, open_end, said + own, now.tube, ratio, table.alone)
 
     def _factors(self, group: str, table: Table) -> Factors:
-        """Give the factors in force, reckoned anew for every prediction that was kept."""
+        """Return the factors in force, reckoned anew for every prediction that was kept."""
         key = group, self._ledger.newest
         if self._joined is None or self._joined[0] != key:
             levels = self._levels.get(group) or Levels()
@@ -223,27 +223,27 @@ class Record:
 
     @property
     def waits(self) -> bool:
-        """Tell whether any prediction waits for answers."""
+        """Return whether any prediction waits for answers."""
         return bool(self._ledger.live.any()) or (self._renewed is not None and bool(self._renewed.live.any()))
 
     @property
     def waiting(self) -> tuple[float, ...]:
-        """Give when the predictions that wait for answers were made [s since 1970]."""
+        """Return when the predictions that wait for answers were made [s since 1970]."""
         return tuple(self._ledger.t0[self._ledger.live].tolist())
 
     @property
     def held(self) -> tuple[float, int]:
-        """Give the measured share of look-aheads inside the tube so far (nan before any) and the predictions behind."""
+        """Return measured share of look-aheads inside the tube so far (nan before any) and the predictions behind."""
         return self._ledger.coverage
 
     @property
     def coverage_renewed(self) -> tuple[float | None, int]:
-        """Give the same of continued rollouts alone; None before any."""
+        """Return the same of continued rollouts alone; None before any."""
         share, n = self._renewed.coverage if self._renewed is not None else (0.0, 0)
         return (share if n else None), n
 
     def t10(self, method: str) -> tuple[float | None, float | None, int]:
-        """Give the median first passage of 10 % [s], the share still within, and how many predictions that is.
+        """Return the median first passage of 10 % [s], the share still within, and how many predictions that is.
 
         Those still flown count by how long they have stayed within; the median of what never passed is the longest.
         """

@@ -9,7 +9,7 @@ import numpy as np
 
 
 def weighted_quantile(x: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Give a quantile of each row, interpolated between the middles of the weights.
+    """Return a quantile of each row, interpolated between the middles of the weights.
 
     Args:
         x: values, (r, n); those of no weight may be anything
@@ -32,7 +32,7 @@ def weighted_quantile(x: np.ndarray, weight: np.ndarray, level: np.ndarray) -> n
 
 
 def masses(x: np.ndarray, weight: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """Give each exact value its share of all the weight, where others are only known to lie below theirs.
+    """Return each exact value its share of all the weight, where others are only known to lie below theirs.
 
     Kaplan-Meier from above: the weight of a bound goes to what lies below it.
 
@@ -54,7 +54,7 @@ def masses(x: np.ndarray, weight: np.ndarray, exact: np.ndarray) -> np.ndarray:
 
 
 def censored_quantile(x: np.ndarray, weight: np.ndarray, exact: np.ndarray, level: float) -> float:
-    """Give a quantile of values of which some are only bounded from above; 0 where it lies below every value."""
+    """Return a quantile of values of which some are only bounded from above; 0 where it lies below every value."""
     mass = masses(x, weight, exact)
     nothing = max(1.0 - float(mass.sum()), 0.0)
     x, mass = np.append(x, 0.0), np.append(mass, nothing)
@@ -65,7 +65,7 @@ Passages = Sequence[tuple[float, bool]]  # time to 10 % [s], or how long it was 
 
 
 def _survival(passages: Passages) -> tuple[np.ndarray, np.ndarray]:
-    """Give times, rising, and the share still within 10 % after each of them."""
+    """Return times, rising, and the share still within 10 % after each of them."""
     times, censored = (np.array(column) for column in zip(*passages, strict=True))
     order = np.lexsort((censored, times))
     at_risk = len(times) - np.arange(len(times))
@@ -73,7 +73,7 @@ def _survival(passages: Passages) -> tuple[np.ndarray, np.ndarray]:
 
 
 def survival(passages: Passages, t: float) -> float:
-    """Give the share of predictions still within 10 % at `t` [s]; nan of none."""
+    """Return the share of predictions still within 10 % at `t` [s]; nan of none."""
     if not passages:
         return float("nan")
     times, share = _survival(passages)
@@ -82,7 +82,7 @@ def survival(passages: Passages, t: float) -> float:
 
 
 def median_passage(passages: Passages) -> float:
-    """Give the time at which half have passed 10 % [s]; where fewer ever do, the longest any was followed."""
+    """Return the time at which half have passed 10 % [s]; where fewer ever do, the longest any was followed."""
     times, share = _survival(passages)
     half = np.flatnonzero(share <= 0.5)
     return float(times[half[0]] if len(half) else times[-1])

@@ -37,7 +37,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _against(args: argparse.Namespace) -> Against:
-    """Give what the flights are compared with."""
+    """Return what the flights are compared with."""
     if args.model:
         return keep.load(args.model)[0]
     card = card_of(args.airframe)

@@ -18,7 +18,7 @@ _APART = 0.5  # a smaller difference is rounding and noise [m/s]
 
 
 def aimed_at(history: History, t: float) -> float:
-    """Give the airspeed aimed at just before `t`, as reported; nan where it is not [m/s]."""
+    """Return the airspeed aimed at just before `t`, as reported; nan where it is not [m/s]."""
     t_c, command = history.look("command", t - _OVER_S)
     t_air, air = history.look("air", t - _OVER_S - 2.0)
     if len(t_c) < _LEAST or len(t_air) < _LEAST or air[:, 0].max() < 3.0:
@@ -28,7 +28,7 @@ def aimed_at(history: History, t: float) -> float:
 
 
 def held_to(history: History, t: float, speeds: np.ndarray) -> float:
-    """Give the one of `speeds` [m/s] that was held just before `t`; nan where the airspeed keeps to none of them."""
+    """Return the one of `speeds` [m/s] that was held just before `t`; nan where the airspeed keeps to none of them."""
     t_air, air = history.look("air", t - _STEADY_S)
     Va = air[t_air <= t, 0]
     if len(Va) < 2 * _LEAST or not len(speeds) or Va.min() < 3.0:
@@ -43,14 +43,14 @@ def held_to(history: History, t: float, speeds: np.ndarray) -> float:
 
 
 def _middle(x: np.ndarray) -> float:
-    """Give the median; nan where any is."""
+    """Return the median; nan where any is."""
     ranked = np.sort(x)
     n = len(ranked)
     return 0.5 * float(ranked[(n - 1) // 2] + ranked[n // 2]) if ranked[-1] == ranked[-1] else float("nan")
 
 
 def as_told(legs: np.ndarray, seq: float, cruise: float, told: float) -> np.ndarray:
-    """Give the legs with the speed that is aimed at on the one in force, and on its neighbours of the same speed.
+    """Return the legs with the speed that is aimed at on the one in force, and on its neighbours of the same speed.
 
     Args:
         legs: route, (n, 9)

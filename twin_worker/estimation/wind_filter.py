@@ -112,7 +112,7 @@ class WindFilter:
             self._reset()
 
     def _believable(self) -> bool:
-        """Tell whether the estimate is a wind; false for nan."""
+        """Return whether the estimate is a wind; false for nan."""
         return hypot(self.x[2] + self.x[4], self.x[3] + self.x[5]) < _STRONGEST and bool(np.isfinite(self.P).all())
 
     def _reset(self) -> None:
@@ -147,33 +147,33 @@ class WindFilter:
 
     @property
     def state(self) -> tuple[np.ndarray, np.ndarray]:
-        """Give a, b, mean, drift and gust, north before east, (8,) [-, m/s], and their covariance, (8, 8)."""
+        """Return a, b, mean, drift and gust, north before east, (8,) [-, m/s], and their covariance, (8, 8)."""
         return self.x.copy(), self.P.copy()
 
     @property
     def wind(self) -> np.ndarray:
-        """Give the wind without its gusts, NED, the direction it blows to, (3,) [m/s]."""
+        """Return the wind without its gusts, NED, the direction it blows to, (3,) [m/s]."""
         x = self.x
         return np.array([x[2] + x[4], x[3] + x[5], 0.0])
 
     @property
     def roughness(self) -> float:
-        """Give how rough the air of the last minute was, over what the filter takes for usual [-]."""
+        """Return how rough the air of the last minute was, over what the filter takes for usual [-]."""
         return sqrt(min(max(self._surprise, _CALM), _ROUGH))
 
     @property
     def scale(self) -> float:
-        """Give true over reported airspeed [-]."""
+        """Return true over reported airspeed [-]."""
         return hypot(self.x[0], self.x[1])
 
     @property
     def heading_bias(self) -> float:
-        """Give air-velocity direction minus reported heading [rad]."""
+        """Return air-velocity direction minus reported heading [rad]."""
         return atan2(self.x[1], self.x[0])
 
     @property
     def sigma(self) -> float:
-        """Give the standard deviation of the larger component of the wind without gusts [m/s]."""
+        """Return the standard deviation of the larger component of the wind without gusts [m/s]."""
         P = self.P
         both = P[2:4, 2:4] + P[2:4, 4:6] + P[4:6, 2:4] + P[4:6, 4:6]
         return sqrt(max(both[0, 0], both[1, 1]))
@@ -184,7 +184,7 @@ _STALE_S = 0.5  # airspeed and heading older than this say nothing of a velocity
 
 
 def blow(wind: WindFilter, history: History, last: float, since: float, until: float = inf) -> float:
-    """Take ground velocities, five a second; give the time of the newest taken [s since 1970].
+    """Take ground velocities, five a second; return the time of the newest taken [s since 1970].
 
     Args:
         wind: changed in place

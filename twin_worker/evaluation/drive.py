@@ -79,7 +79,7 @@ class Drive:
     examined: dict[int, Examined | None] = field(default_factory=dict)
 
     def run(self, messages: Iterable[Message]) -> Iterator[Case]:
-        """Drive messages through the twins in the order they were heard; give every start once it is answered."""
+        """Drive messages through the twins in the order they were heard; return every start once it is answered."""
         for message in messages:
             one = self._whose(message.uav)
             if one is None:
@@ -96,7 +96,7 @@ class Drive:
 
     @property
     def silent(self) -> int:
-        """Give how many starts nothing was predicted at."""
+        """Return how many starts nothing was predicted at."""
         return sum(one.silent for one in self.examined.values() if one is not None)
 
     def _whose(self, uav: int) -> Examined | None:
@@ -208,7 +208,7 @@ def _paper(one: Examined, made: Prediction, ahead: np.ndarray) -> Told | None:
 
 
 def _kept(twin: Twin, made: Prediction, ahead: np.ndarray) -> tuple[str, np.ndarray]:
-    """Give what shares the calibration of a prediction, and its ensemble's standard deviations, (k, 3) [m] or nan."""
+    """Return what shares the calibration of a prediction, and its ensemble's standard deviations, (k, 3) [m] or nan."""
     latest = twin.record.latest
     spread = np.full((len(ahead), 3), np.nan)
     if latest is None or abs(latest[0].t + latest[0].ahead[0] - made.t) > _SAME_S:

@@ -24,7 +24,7 @@ _AXES = ("along", "cross", "vertical")
 
 
 def draw(folder: Path, cases: Sequence[Case]) -> list[Path]:
-    """Draw every picture of the starts that count into a folder; give the files."""
+    """Draw every picture of the starts that count into a folder; return the files."""
     if not cases:
         return []
     names = [name for name in _COLOURS if all(name in case.asked.told for case in cases)]
@@ -79,7 +79,7 @@ def _route(case: Case, names: Sequence[str]) -> Figure:
 
 
 def _ellipse(path: np.ndarray, tube: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Give east and north of the tube's outline at one look-ahead."""
+    """Return east and north of the tube's outline at one look-ahead."""
     turn = np.linspace(0, 2 * np.pi, 40)
     way = path[min(k + 1, len(path) - 1), :2] - path[k - 1, :2]
     way = way / max(float(np.linalg.norm(way)), 1e-6)
@@ -217,12 +217,12 @@ def _phases(scores: dict[str, Scores], phases: np.ndarray) -> Figure:
 
 
 def _line(name: str) -> dict[str, Any]:
-    """Give width and dashes: ours is wide, and what may lie upon it dashed."""
+    """Return width and dashes: ours is wide, and what may lie upon it dashed."""
     return {"lw": 2.6 if name == OURS else 1.3, "ls": "--" if name == "dynamics" else "-"}
 
 
 def _quantiles(values: np.ndarray, shares: Sequence[float]) -> Any:
-    """Give quantiles by column of what is known; nan where nothing is, (q, k)."""
+    """Return quantiles by column of what is known; nan where nothing is, (q, k)."""
     out = np.full((len(shares), values.shape[1]), np.nan)
     known = np.isfinite(values).any(axis=0)
     out[:, known] = np.nanpercentile(values[:, known], shares, axis=0)

@@ -68,7 +68,7 @@ def _row(case: Case) -> dict[str, object]:
 
 
 def covariance(path: np.ndarray, tube: np.ndarray) -> np.ndarray:
-    """Give the covariance, NED, of independent normal errors of which the tube holds its share, (k, 3, 3) [m2]."""
+    """Return the covariance, NED, of independent normal errors of which the tube holds its share, (k, 3, 3) [m2]."""
     sigma = tube / ndtri(0.5 + 0.5 * QUANTILE ** (1 / 3))
     along = track_frame(path)
     axes = np.zeros((len(path), 3, 3))

@@ -45,7 +45,7 @@ class Tally:
 
 
 def replay(messages: Iterable[Message], progress: str = "") -> dict[str, dict[str, Any]]:
-    """Run messages through the twins; give each UAV's row by its id.
+    """Run messages through the twins; return each UAV's row by its id.
 
     Args:
         messages: Sample, Status, Mission, Params in the order they were heard
@@ -107,7 +107,7 @@ def _row(twin: Twin, tally: Tally, start: float) -> dict[str, Any]:
 
 
 def text(uav: str, row: dict[str, Any]) -> str:
-    """Give one UAV's row as lines to read."""
+    """Return one UAV's row as lines to read."""
     methods = ", ".join(f"{n} {method}" for method, n in row["methods"].items()) or "none"
     verified = "never" if row["first_verified_s"] is None else f"after {row['first_verified_s']:.0f} s"
     lines = [f"uav-{uav}: {row['vehicle']}, {row['seconds']:.0f} s; predictions: {methods}; verified {verified}"]

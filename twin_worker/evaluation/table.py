@@ -152,7 +152,7 @@ def _number(value: float | None, digits: int = 1) -> str:
 
 
 def _time(row: dict[str, Any], key: str) -> str:
-    """Give a quantile of times; `>`: fewer had passed by the end of what could be followed."""
+    """Return a quantile of times; `>`: fewer had passed by the end of what could be followed."""
     value, end = row[key], row["followed_s"]
     return f"> {end:.0f}" if value is not None and end is not None and value >= end else _number(value)
 

@@ -105,7 +105,7 @@ def _begun_anew(twin: Twin, push: Push, mark: Mark) -> Twin:
 
 
 def wind_since(twin: Twin, push: Push, mark: Mark) -> tuple[WindFilter, float]:
-    """Give the wind filter as it would be had it known of the effects at their onset, and its newest row's time."""
+    """Return the wind filter as it would be had it known of the effects at their onset, and its newest row's time."""
     wind = deepcopy(mark.wind)
     last = blow(wind, twin.history, mark.t, mark.t, push.onset)
     wind.jump(push.wind, 1.0 / push.scale, _DOUBT)
@@ -113,7 +113,7 @@ def wind_since(twin: Twin, push: Push, mark: Mark) -> tuple[WindFilter, float]:
 
 
 def extended_plant(plant: Coupled, push: Push, window: Window) -> Coupled:
-    """Give the model with the effects in it: derivatives by input as the servos let through, increments added.
+    """Return the model with the effects in it: derivatives by input as the servos let through, increments added.
 
     Increments are regressed on the terms of THE wrench over what was flown: their slopes about the present trim.
     """
@@ -140,7 +140,7 @@ def extended_plant(plant: Coupled, push: Push, window: Window) -> Coupled:
 
 
 def _through_servos(par: np.ndarray, push: Push) -> np.ndarray:
-    """Give the derivatives by commands, where faulty servos make  delta = g delta_c + o  of them."""
+    """Return the derivatives by commands, where faulty servos make  delta = g delta_c + o  of them."""
     out = par.copy()
     for column, letters in _COLUMNS.items():
         u, moved = push.command[:, column], push.moved[:, column]
@@ -160,7 +160,7 @@ def _at(t: np.ndarray, window: Window, column: int) -> np.ndarray:
 
 
 def _miss(twin: Twin, seconds: float) -> float:
-    """Fly the newest seconds from their start by the way in use; give the mean miss [m], inf beyond the envelope."""
+    """Fly the newest seconds from their start by the way in use; return the mean miss [m], inf beyond the envelope."""
     window = twin.window(62.0 + seconds)
     if window is None or twin.why_no_route() or not window.ok[-round(seconds / window.dt) :].all():
         return np.nan

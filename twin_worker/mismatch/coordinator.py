@@ -28,13 +28,13 @@ class Hand(Protocol):
 
     @property
     def free(self) -> bool:
-        """Tell whether a job may be given now."""
+        """Return whether a job may be given now."""
 
     def give(self, job: Job) -> None:
         """Begin a job."""
 
     def answer(self) -> Answer | None:
-        """Give an answer that has arrived; None while there is none."""
+        """Return an answer that has arrived; None while there is none."""
 
 
 class Live:
@@ -52,7 +52,7 @@ class Live:
         self._waiting: Answer | None = None  # for an aircraft whose lock is held
 
     def watch(self, uav: int) -> Watch:
-        """Give what is known of one aircraft."""
+        """Return what is known of one aircraft."""
         if uav not in self.watches:
             base = self._bases.get(uav, self._bases.get(ALL))
             self.watches[uav] = Watch(UNKNOWN if base is None else base.card, base)

@@ -69,13 +69,13 @@ def pushes(flight: Flight, base: Baseline, report: Report) -> Push | None:
 
 
 def _lasting(guess: Guess, t: float) -> Guess:
-    """Give the effect as it stands at time t, for good."""
+    """Return the effect as it stands at time t, for good."""
     gate = float(guess.when.gate(np.array([t]))[0])
     return guess.at(gate * np.array(guess.par), ALWAYS)
 
 
 def _forces(base: Baseline, ground: float, guesses: list[Guess], flown: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Give specific force and angular acceleration with these at work, (6, n)."""
+    """Return specific force and angular acceleration with these at work, (6, n)."""
     x, command = flown
     n = x.shape[1]
     simulation = Simulation(base, [guesses] * n, np.zeros(n), ground)
@@ -85,7 +85,7 @@ def _forces(base: Baseline, ground: float, guesses: list[Guess], flown: tuple[np
 
 
 def moved(guesses: list[Guess], command: np.ndarray) -> np.ndarray:
-    """Give what faulty servos make of steady commands, (n, 4)."""
+    """Return what faulty servos make of steady commands, (n, 4)."""
     out = command.copy()
     for guess in guesses:
         if guess.effect.stage is not Stage.DELTA or guess.effect.takes_lag:
@@ -104,7 +104,7 @@ def _settled(guess: Guess, u: float) -> float:
 
 
 def _wind(guesses: list[Guess], flight: Flight) -> np.ndarray:
-    """Give the wind added where the aircraft is, NED (3,) [m/s]."""
+    """Return the wind added where the aircraft is, NED (3,) [m/s]."""
     h = float(flight.readings["h"][-1])
     flow = Flow(float(flight.t[-1]), h, h - flight.ground, Body())
     out = np.zeros(3)
@@ -116,7 +116,7 @@ def _wind(guesses: list[Guess], flight: Flight) -> np.ndarray:
 
 
 def _scale(guesses: list[Guess], Va: float) -> float:
-    """Give reported over true airspeed at the reported airspeed Va [m/s]."""
+    """Return reported over true airspeed at the reported airspeed Va [m/s]."""
     reading = {"Va": np.array([Va]), "t": np.zeros(1)}
     for guess in guesses:
         if guess.effect.stage is Stage.SENSOR and guess.effect.channel == "airspeed":

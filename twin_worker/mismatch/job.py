@@ -131,7 +131,7 @@ def _work(job: Job, found: Answer) -> Answer:
 
 
 def growth(flight: Flight, base: Baseline) -> float:
-    """Give how much larger the newest residuals are than those before, mean square, of the channel that grew most."""
+    """Return how much larger the newest residuals are than those before, mean square, of the channel that grew most."""
     case = Case(flight, base)
     sight = Sight(case, own_weather(case))
     late = case.t > case.t[-1] - NEWEST_S

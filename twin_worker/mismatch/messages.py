@@ -13,7 +13,7 @@ _WILDEST = 100.0  # errors beyond are of a simulation that left the air, and tel
 
 
 def message(uav: int, report: Report, begin: float, end: float) -> Mismatch:
-    """Give the message of a report.
+    """Return the message of a report.
 
     Args:
         uav: whose

@@ -52,7 +52,7 @@ class Background:
 
     @property
     def free(self) -> bool:
-        """Tell whether a job may be given now."""
+        """Return whether a job may be given now."""
         return not self._busy and not self._closed and time.monotonic() >= self._free_at
 
     def give(self, job: Job) -> None:
@@ -62,7 +62,7 @@ class Background:
         self._thread.start()
 
     def answer(self) -> Answer | None:
-        """Give an answer that has arrived; None while there is none."""
+        """Return an answer that has arrived; None while there is none."""
         found = self._answer
         if found is not None:
             self._free_at = time.monotonic() + found.cpu_s * (1.0 / self._share - 1.0)
@@ -100,7 +100,7 @@ class Background:
         self._answer = found
 
     def _started(self) -> Connection:
-        """Give the pipe to a process that lives.
+        """Return the pipe to a process that lives.
 
         Raises:
             OSError: when no process can be started, or none is wanted any more.
@@ -125,7 +125,7 @@ class Background:
             process.kill()
 
     def _end(self) -> int | None:
-        """End the process and give its exit code; None where there was none."""
+        """End the process and return its exit code; None where there was none."""
         with self._lock:
             process, pipe = self._process, self._pipe
             self._process = self._pipe = None

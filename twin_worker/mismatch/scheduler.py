@@ -57,7 +57,7 @@ class Watch:
     none: int = 0
 
     def wants(self, twin: Twin) -> float | None:
-        """Give how urgent a look is; None where it is not due."""
+        """Return how urgent a look is; None where it is not due."""
         newest = twin.history.newest
         if newest < self.next_t - _RETRY_S - WHOLE_S:  # the clock jumped back
             self.__init__(self.card, self.base)  # type: ignore[misc]
@@ -82,7 +82,7 @@ class Watch:
         return 2.0 * (not self._sound(twin)) + 4.0 * self._to_confirm + (newest - self.whole_t) / WHOLE_S
 
     def job(self, twin: Twin) -> Job:
-        """Give the job that is due."""
+        """Return the job that is due."""
         newest = twin.history.newest
         self.next_t = newest + LOOK_S
         whole = newest - self.whole_t >= WHOLE_S or not self._sound(twin) or self._to_confirm
@@ -94,7 +94,7 @@ class Watch:
         return self.told is not None and self.told.outcome in (Found.SUSPECTED, Found.UNKNOWN)
 
     def take(self, answer: Answer) -> Mismatch | None:
-        """Take an answer; give what is to be published, None where nothing is new."""
+        """Take an answer; return what is to be published, None where nothing is new."""
         if answer.failed:
             self.give_up(answer.uav, answer.end, answer.failed)
             return None
@@ -125,7 +125,7 @@ class Watch:
         self.failed = f"uav-{uav}: its diagnosis met a defect ({why}); it is tried again in {again_s:.0f} s, report it"
 
     def _confirmed(self, report: Report, begin: float) -> bool:
-        """Tell whether the diagnosis before said the same."""
+        """Return whether the diagnosis before said the same."""
         if self.last is None:
             return False
         if report.outcome is Result.UNKNOWN:
@@ -144,7 +144,7 @@ class Watch:
 
     @staticmethod
     def _steady_s(twin: Twin) -> float:
-        """Give how long it has flown its mission without a break [s]."""
+        """Return how long it has flown its mission without a break [s]."""
         if twin.status is None or twin.status.mode not in ROUTE_MODES:
             return 0.0
         t = twin.history.rows("attitude", max(twin.since, twin.back_t, twin.history.newest - PAST_S - 5.0))[0]

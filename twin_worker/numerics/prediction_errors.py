@@ -15,7 +15,7 @@ _FLOOR_S = 2.0  # least path length, as seconds of ground speed [s]
 
 
 def track_frame(path: np.ndarray, ahead: np.ndarray = AHEAD) -> np.ndarray:
-    """Give the horizontal unit vector along paths (..., n, 3) at each point, (..., n, 2); north where one stands."""
+    """Return the horizontal unit vector along paths (..., n, 3) at each point, (..., n, 2); north where one stands."""
     out = np.empty((*path.shape[:-1], 2))
     each = np.ascontiguousarray(path, float).reshape(-1, *path.shape[-2:])
     _frame_each(each, np.ascontiguousarray(ahead, float), out.reshape(-1, path.shape[-2], 2))
@@ -55,7 +55,7 @@ def axes_error(path: np.ndarray, flown: np.ndarray, ahead: np.ndarray = AHEAD) -
 
 
 def path_length(path: np.ndarray, speed: float, before: float = 0.0) -> np.ndarray:
-    """Give the path length so far, at least two seconds of ground speed, (n,) [m].
+    """Return the path length so far, at least two seconds of ground speed, (n,) [m].
 
     Args:
         path: positions, (n, 3) [m]
@@ -67,12 +67,12 @@ def path_length(path: np.ndarray, speed: float, before: float = 0.0) -> np.ndarr
 
 
 def least_length(speed: float) -> float:
-    """Give the length below which no path counts: two seconds of ground speed, at least a metre [m]."""
+    """Return the length below which no path counts: two seconds of ground speed, at least a metre [m]."""
     return max(_FLOOR_S * speed, 1.0)
 
 
 def first_passage(relative: np.ndarray, ahead: np.ndarray = AHEAD) -> tuple[float, bool]:
-    """Give the time the relative error first passes 10 % [s], and whether it never did while it was followed.
+    """Return the time the relative error first passes 10 % [s], and whether it never did while it was followed.
 
     The flight was followed up to the first that is not finite; the time is then that of the last before.
     """

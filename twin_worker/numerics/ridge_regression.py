@@ -4,7 +4,7 @@ import numpy as np
 
 
 def ridge(A: np.ndarray, y: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
-    """Give x of  min |y - A x|^2 + sum (pull_k |a_k| x_k)^2, a_k the k-th column, (k,).
+    """Return x of  min |y - A x|^2 + sum (pull_k |a_k| x_k)^2, a_k the k-th column, (k,).
 
     Args:
         A: terms, (n, k)

@@ -73,7 +73,7 @@ def go_on(twin: Twin, made: Prediction) -> bool:
 
 
 def _coupled(twin: Twin, model: Model) -> Coupled | None:
-    """Give the coupled model of a message; None where it has none, or one that cannot be."""
+    """Return the coupled model of a message; None where it has none, or one that cannot be."""
     told = model.derivatives
     if told is None or told.names != NAMES or told.prior != twin.airframe.name:
         return None

@@ -90,12 +90,12 @@ CARRIED: Known = {
 
 
 def packed(load: Load) -> bytes:
-    """Give the bytes of what travels."""
+    """Return the bytes of what travels."""
     return pack(load, CARRIED)
 
 
 def unpacked(data: bytes, uav: int) -> Load:
-    """Give what travelled.
+    """Return what travelled.
 
     Raises:
         ValueError: when the bytes are not that of this aircraft; take it over cold.

@@ -30,7 +30,7 @@ def _names() -> np.ndarray:
 
 
 def _heads() -> np.ndarray:
-    """Give for each first byte from 0xC0 on: what it begins, bytes of the number behind it, whether that counts."""
+    """Return for each first byte from 0xC0 on: what it begins, bytes of the number behind it, whether that counts."""
     out = np.full((64, 3), (PLAIN, 0, 0), np.int64)
     out[0x01] = out[0x07:0x0A] = (BAD, 0, 0)  # never used; strangers' own types
     out[0x14:0x19] = (BAD, 0, 0)
@@ -84,7 +84,7 @@ def head(b: np.ndarray, i: int) -> tuple[int, int, int]:
 
 @bare
 def leap(b: np.ndarray, i: int) -> int:
-    """Give where it goes on after whatever begins at i; negative where that is broken."""
+    """Return where it goes on after whatever begins at i; negative where that is broken."""
     left = 1
     while left > 0:
         kind, n, i = head(b, i)
@@ -118,7 +118,7 @@ def named(b: np.ndarray, i: int, first: int, last: int) -> tuple[int, int]:
 
 @bare
 def array(b: np.ndarray, i: int, got: np.ndarray, row: int) -> int:
-    """Read an array into a row of `got`, (2, 6); give where it goes on, negative where it is broken."""
+    """Read an array into a row of `got`, (2, 6); return where it goes on, negative where it is broken."""
     got[row, DTYPE], got[row, DIMENSIONS], got[row, SIZE] = -1, 0, -1
     kind, pairs, i = head(b, i)
     if kind != MAP:
@@ -146,7 +146,7 @@ def array(b: np.ndarray, i: int, got: np.ndarray, row: int) -> int:
 
 @bare
 def rows_at(b: np.ndarray, i: int, got: np.ndarray) -> int:
-    """Read the rows of one kind: array `t` into got[0] and `x` into got[1]; give where it goes on."""
+    """Read the rows of one kind: array `t` into got[0] and `x` into got[1]; return where it goes on."""
     got[0, SIZE] = got[1, SIZE] = -1
     kind, pairs, after = head(b, i)
     if kind == PLAIN:
@@ -164,7 +164,7 @@ def rows_at(b: np.ndarray, i: int, got: np.ndarray) -> int:
 
 @bare
 def whole(got: np.ndarray, kind: int) -> bool:
-    """Tell whether rows have the shape and bytes they say."""
+    """Return whether rows have the shape and bytes they say."""
     n, dtype = got[0, LONG], got[1, DTYPE]
     if got[0, SIZE] < 0 or got[1, SIZE] < 0 or got[0, DIMENSIONS] != 1 or got[1, DIMENSIONS] != 2 or dtype < 0:
         return False
@@ -175,7 +175,7 @@ def whole(got: np.ndarray, kind: int) -> bool:
 
 @bare
 def sample(b: np.ndarray, i: int, got: np.ndarray, found: np.ndarray, n: int) -> tuple[int, int]:
-    """Find the rows in one sample; give how many finds there are now, and where it goes on."""
+    """Find the rows in one sample; return how many finds there are now, and where it goes on."""
     what, pairs, i = head(b, i)
     if what != MAP:
         return n, -1
@@ -193,7 +193,7 @@ def sample(b: np.ndarray, i: int, got: np.ndarray, found: np.ndarray, n: int) ->
 
 @bare
 def scan(b: np.ndarray, got: np.ndarray, found: np.ndarray) -> tuple[int, int, int]:
-    """Find all rows; give how many finds there are (negative: it is broken), the UAV id, and where its time lies.
+    """Find all rows; return how many finds there are (negative: it is broken), the UAV id, and where its time lies.
 
     Args:
         b: bytes, and nine more at the end

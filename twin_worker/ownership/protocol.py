@@ -121,7 +121,7 @@ class Claiming:
                 self.turn()
 
     def may_write(self) -> bool:
-        """Tell whether results may be published."""
+        """Return whether results may be published."""
         return not self.threaded or self.claims.may_write(time.monotonic())
 
     def overheard(self, uav: int, stamp: Stamp | None) -> None:
@@ -222,13 +222,13 @@ class Claiming:
             waited.wait(_TURN_S)
 
     def _heirs(self) -> bool:
-        """Tell whether anyone is there to hand what is still held to."""
+        """Return whether anyone is there to hand what is still held to."""
         with self._lock:
             others = self.claims.heirs().values()
             return any(uav in ids for uav in self.claims.held for ids in others)
 
     def tick(self) -> bool:
-        """Look at clock and router; give whether the router is in sight."""
+        """Look at clock and router; return whether the router is in sight."""
         in_sight = bool(self._bus.router)
         with self._lock:
             self.claims.tick(time.monotonic(), in_sight)
@@ -255,7 +255,7 @@ class Claiming:
             self._keeper.renew(uav, epoch)
 
     def _timely(self, worker: str, epoch: int) -> bool:
-        """Tell whether a worker's epoch may be believed; say once where it is far ahead of our clock."""
+        """Return whether a worker's epoch may be believed; say once where it is far ahead of our clock."""
         if timely(epoch):
             return True
         if worker not in self._ahead and len(self._ahead) < _MOST_AHEAD:
@@ -265,7 +265,7 @@ class Claiming:
         return False
 
     def _ask(self, wanted: dict[str, list[int]]) -> list[int]:
-        """Ask each holder for copies, all at the same time; give what is asked for in vain."""
+        """Ask each holder for copies, all at the same time; return what is asked for in vain."""
         now, uavs = time.monotonic(), {uav for mine in wanted.values() for uav in mine}
         with self._lock:
             self._asked_for = {uav: self._asked_for.get(uav, now) for uav in uavs}
@@ -351,7 +351,7 @@ class Claiming:
         self._news.set()
 
     def _news_to_tell(self) -> bool:
-        """Tell whether more or other aircraft are written for than was announced."""
+        """Return whether more or other aircraft are written for than was announced."""
         claim = self.claim()
         return (claim.held, claim.bare) != self._told
 

@@ -91,7 +91,7 @@ class Claims:
             del self.peers[worker], self._silence[worker]
 
     def heard(self, worker: str, held: Mapping[int, int], leaving: bool = False) -> list[int]:
-        """Take an announcement: epochs by UAV id; give what is lost to a higher claim."""
+        """Take an announcement: epochs by UAV id; return what is lost to a higher claim."""
         peer = self.peers.get(worker)
         if peer is not None:
             self.peers[worker] = peer._replace(leaving=leaving)
@@ -127,11 +127,11 @@ class Claims:
             self._silence = {worker: silence + step for worker, silence in self._silence.items()}
 
     def lives(self, worker: str) -> bool:
-        """Tell whether another worker has a token and speaks."""
+        """Return whether another worker has a token and speaks."""
         return self._silence.get(worker, float("inf")) <= SILENT_S
 
     def may_write(self, now: float) -> bool:
-        """Tell whether results may be published now."""
+        """Return whether results may be published now."""
         return not self.unsure and now - self._ticked <= PAUSE_S
 
     def synced(self, wall_ms: int) -> None:
@@ -142,7 +142,7 @@ class Claims:
                 self.take(uav, wall_ms)
 
     def timely(self, latest_ms: int, wall_ms: int) -> dict[int, int]:
-        """Forget claims above the latest epoch there may be; give what is held under one, with its new epoch."""
+        """Forget claims above the latest epoch there may be; return what is held under one, with its new epoch."""
         if any(rank.epoch > latest_ms for rank in self.seen.values()):
             self.seen = {uav: rank for uav, rank in self.seen.items() if rank.epoch <= latest_ms}
         return {uav: self.take(uav, wall_ms) for uav in [uav for uav in self.held if uav not in self.seen]}
@@ -150,7 +150,7 @@ class Claims:
     # --- what to do --------------------------------------------------------------------------------------------------
 
     def plan(self, now: float) -> Plan:
-        """Give what this worker should hold and does not."""
+        """Return what this worker should hold and does not."""
         plan = Plan()
         if not self._ready(now):
             return plan
@@ -173,7 +173,7 @@ class Claims:
         return not self.leaving and self.may_write(now) and now >= self._settled
 
     def _outdone(self, uav: int, epoch: int) -> bool:
-        """Tell whether readers believe one that is no more, which took what is held here before it said so."""
+        """Return whether readers believe one that is no more, which took what is held here before it said so."""
         rank = self.seen[uav]
         return rank > Rank(epoch, self.me) and not self.lives(rank.worker)
 
@@ -181,16 +181,16 @@ class Claims:
         return {self.me: self.ids} | self.heirs()
 
     def heirs(self) -> dict[str, range]:
-        """Give what the other workers that live and stay may hold."""
+        """Return what the other workers that live and stay may hold."""
         return {name: peer.ids for name, peer in self.peers.items() if self.lives(name) and not peer.leaving}
 
     def _holder(self, uav: int) -> str | None:
-        """Give the live worker that is known to hold an aircraft; None where it is free."""
+        """Return the live worker that is known to hold an aircraft; None where it is free."""
         rank = self.seen.get(uav)
         return rank.worker if rank is not None and self.lives(rank.worker) else None
 
     def take(self, uav: int, wall_ms: int) -> int:
-        """Hold an aircraft from now on; give the epoch, which is above every one seen and not below the clock's."""
+        """Hold an aircraft from now on; return the epoch, which is above every one seen and not below the clock's."""
         self.known.add(uav)
         before = self.seen[uav].epoch if uav in self.seen else 0
         epoch = self.held[uav] = max(before + 1, wall_ms)

@@ -11,7 +11,7 @@ _S30, _S27, _S31 = np.uint64(30), np.uint64(27), np.uint64(31)
 
 
 def owners(uavs: Iterable[int], workers: Mapping[str, range]) -> dict[int, str]:
-    """Give the owner of each aircraft; one outside every range has none.
+    """Return the owner of each aircraft; one outside every range has none.
 
     When a worker goes only its own aircraft move, when one comes it only takes: no other pair is weighed anew.
 
@@ -34,7 +34,7 @@ def owners(uavs: Iterable[int], workers: Mapping[str, range]) -> dict[int, str]:
 
 
 def owner(uav: int, workers: Mapping[str, range]) -> str | None:
-    """Give the owner of one aircraft; None outside every range."""
+    """Return the owner of one aircraft; None outside every range."""
     return owners([uav], workers).get(uav)
 
 

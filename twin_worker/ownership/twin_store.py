@@ -56,10 +56,10 @@ class Extras(Protocol):
         """Keep what came with a twin."""
 
     def show(self, uav: int) -> tuple[Ledger, Mismatch | None]:
-        """Give it: open conflicts, and the mismatch found last."""
+        """Return it: open conflicts, and the mismatch found last."""
 
     def forget(self, uav: int) -> None:
-        """Give it up."""
+        """Return it up."""
 
 
 class Twins:
@@ -110,7 +110,7 @@ class Twins:
         return True
 
     def ready(self) -> list[Held]:
-        """Give those whose twins are here, by UAV id."""
+        """Return those whose twins are here, by UAV id."""
         with self.lock:
             return [held for _, held in sorted(self.held.items()) if held.ready]
 

@@ -31,7 +31,7 @@ Known = Mapping[str, type | tuple[type, Special]]
 
 
 def pack(thing: Any, known: Known) -> bytes:
-    """Give the bytes of an object.
+    """Return the bytes of an object.
 
     Raises:
         TypeError: when there is something of an unknown class in it; name it in `known`.
@@ -40,7 +40,7 @@ def pack(thing: Any, known: Known) -> bytes:
 
 
 def unpack(data: bytes, known: Known) -> Any:
-    """Give the object back.
+    """Return the object back.
 
     Raises:
         ValueError: when the bytes are no object of these classes; the sender runs another version, or is hostile.

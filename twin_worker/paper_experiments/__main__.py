@@ -72,7 +72,7 @@ def _steps(pair: np.ndarray) -> dict[str, Any]:
 
 
 def text(first: str, rows: dict[str, dict[str, Any]]) -> str:
-    """Give the rows as lines to read."""
+    """Return the rows as lines to read."""
     lines = [f"first step: {first}; fit over unseen seconds, median [%]"]
     for mode, row in rows.items():
         step = row["fit"]

@@ -19,7 +19,7 @@ _UNITS = {"u": "m/s", "v": "m/s", "w": "m/s", "p": "rad/s", "q": "rad/s", "r": "
 
 
 def draw(folder: Path, first: str, done: "Sequence[Experiment]", names: Sequence[str]) -> list[Path]:
-    """Draw figure 7 for every mode and figure 8, over unseen and seen data, into a folder; give the files.
+    """Draw figure 7 for every mode and figure 8, over unseen and seen data, into a folder; return the files.
 
     Args:
         folder: made where it is missing

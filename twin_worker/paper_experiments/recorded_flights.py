@@ -42,7 +42,7 @@ class Flown:
         return replace(part, x=np.hstack([air, part.x[:, 3:]]))
 
     def starts(self, seen_s: float, unseen_s: float, every_s: float) -> Iterator[int]:
-        """Give the rows at which unseen stretches may begin; the stretch itself is whole."""
+        """Return the rows at which unseen stretches may begin; the stretch itself is whole."""
         dt = self.whole.dt
         seen, unseen, every = (round(s / dt) for s in (seen_s, unseen_s, every_s))
         for start in range(round(_SETTLE_S / dt) + seen, len(self.whole) - unseen + 1, every):

@@ -125,7 +125,7 @@ def _values(learnt: Learnt, law: str, absent: tuple[str, ...], now: Situation, s
 
 
 def _cruise(learnt: Learnt, now: Situation, seen: Heard, name: str) -> float:
-    """Give the airspeed aimed at on a leg that names none, else what was learnt or is flown [m/s]."""
+    """Return the airspeed aimed at on a leg that names none, else what was learnt or is flown [m/s]."""
     at = np.flatnonzero(seen.legs[:, SEQ] == seen.seq[-1])
     told = aimed_at(now.history, learnt.t)
     if len(at) and seen.legs[at[0], VA_C] <= 0 and isfinite(told):
@@ -135,7 +135,7 @@ def _cruise(learnt: Learnt, now: Situation, seen: Heard, name: str) -> float:
 
 
 def _switches(seen: Heard) -> dict[int, float]:
-    """Give the waypoint radius that each switch between two lines tells [m], by its time: distance over turn share."""
+    """Return waypoint radius that each switch between two lines tells [m], by its time: distance over turn share."""
     found: dict[int, float] = {}
     dt = float(seen.t[1] - seen.t[0])
     for k in np.flatnonzero(np.diff(seen.seq)).tolist():
@@ -170,7 +170,7 @@ def _replay(
 
 
 def _least(tried: list[tuple[float, float]]) -> float:
-    """Give the value of least cost, by the parabola through it and its neighbours."""
+    """Return the value of least cost, by the parabola through it and its neighbours."""
     x, y = (np.array(column) for column in zip(*tried, strict=True))
     k = int(np.argmin(y))
     if not 0 < k < len(x) - 1:
@@ -180,7 +180,7 @@ def _least(tried: list[tuple[float, float]]) -> float:
 
 
 def _rms(law: str, flown: tuple[Situation, Heard], values: Mapping[str, float]) -> float:
-    """Replay; give how far the banks of the law are from those asked for [rad]."""
+    """Replay; return how far the banks of the law are from those asked for [rad]."""
     now, seen = flown
     control = on_wings(now.onboard.params, values, law=law)
     par = laws.blown(control.par(seen.altitude_m), *known_wind(now, seen.good))

@@ -61,21 +61,21 @@ class Control:
     name: str = "arduplane"
 
     def par(self, altitude_m: float) -> np.ndarray:
-        """Give the vector the law's kernels read, at a height above mean sea level [m]."""
+        """Return the vector the law's kernels read, at a height above mean sea level [m]."""
         return laws.vector(self.name, self._found, altitude_m)
 
     @cached_property
     def _found(self) -> dict[str, float]:
-        """Give what the law reads of the values: they do not change, and every flight begins with them."""
+        """Return what the law reads of the values: they do not change, and every flight begins with them."""
         return laws.read(self.name, self.values)[0]
 
     @property
     def absent(self) -> tuple[str, ...]:
-        """Give the names of those at their defaults."""
+        """Return the names of those at their defaults."""
         return tuple(name for name, how in self.known.items() if how == DEFAULT)
 
     def wire(self) -> Controller:
-        """Give it as it is published."""
+        """Return it as it is published."""
         parts: dict[str, dict[str, float]] = {RECEIVED: {}, IDENTIFIED: {}, DEFAULT: {}, ASKED: {}}
         for name in self.told:
             parts[self.known[name]][name] = round(float(self.values[name]), 4)
@@ -89,7 +89,7 @@ def on_wings(
     law: str = "arduplane",
     sentence: str = "",
 ) -> Control:
-    """Give the controller twin of a fixed wing.
+    """Return the controller twin of a fixed wing.
 
     Args:
         received: parameters as the autopilot names and scales them, current or older names
@@ -104,7 +104,7 @@ def on_wings(
 
 @lru_cache(maxsize=_CONTROLS)
 def _on_wings(given: _Given, identified: _Given, wished: _Given, law: str, sentence: str) -> Control:
-    """Give the same; parameters hardly ever change, and to read them takes as long as to fly a minute."""
+    """Return the same; parameters hardly ever change, and to read them takes as long as to fly a minute."""
     received, asked = dict(given), dict(wished)
     _, missing = laws.read(law, {**received, **asked})
     learnt = {name: value for name, value in identified if name in missing}
@@ -119,7 +119,7 @@ def _on_wings(given: _Given, identified: _Given, wished: _Given, law: str, sente
 def on_rotors(
     received: Mapping[str, float], prefix: str, limit: copter.Limits, asked: Mapping[str, float] | None = None
 ) -> Control:
-    """Give the controller twin of what hovers.
+    """Return the controller twin of what hovers.
 
     Args:
         received: parameters as the autopilot names and scales them

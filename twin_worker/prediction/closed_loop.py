@@ -111,22 +111,22 @@ class Heard:
 
     @property
     def t(self) -> np.ndarray:
-        """Give times from the first, (n,) [s]."""
+        """Return times from the first, (n,) [s]."""
         return self.rows[0]
 
     @property
     def p(self) -> np.ndarray:
-        """Give positions, NED, (n, 3) [m]."""
+        """Return positions, NED, (n, 3) [m]."""
         return self.rows[1]
 
     @property
     def Va(self) -> np.ndarray:
-        """Give reported airspeeds, (n,) [m/s]."""
+        """Return reported airspeeds, (n,) [m/s]."""
         return self.rows[5]
 
     @property
     def phi_c(self) -> np.ndarray:
-        """Give the banks asked for, (n,) [rad]."""
+        """Return the banks asked for, (n,) [rad]."""
         return self.rows[6]
 
 
@@ -171,7 +171,7 @@ def _hold(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float, out: np.
 
 
 def _reported(history: History, name: str, at: np.ndarray, longest: float) -> np.ndarray:
-    """Give what was reported last at each time, nan after `longest` seconds, (len(at), k)."""
+    """Return what was reported last at each time, nan after `longest` seconds, (len(at), k)."""
     return held(*history.look(name, at[0] - longest - 1.0), at, longest)
 
 
@@ -210,7 +210,7 @@ def heard(now: Situation) -> Heard | Flown:
 
 
 def unrolled(items: tuple[Item, ...], seq: int, origin: Origin, params: Mapping[str, float], first: int) -> Route:
-    """Give the legs from item `seq` on, that nobody changes; as `route`."""
+    """Return the legs from item `seq` on, that nobody changes; as `route`."""
     return _unrolled(items, seq, origin, tuple((name, params[name]) for name in READ if name in params), first)
 
 
@@ -222,14 +222,14 @@ def _unrolled(
 
 
 def known_wind(now: Situation, good: Window) -> tuple[float, float]:
-    """Give the wind the autopilot believes in: its own where it tells it, else the twin's, NED [m/s]."""
+    """Return the wind the autopilot believes in: its own where it tells it, else the twin's, NED [m/s]."""
     reported = _reported(now.history, "wind", good.t[-1:], _WIND_S)[0]
     w_n, w_e = reported if np.isfinite(reported).all() else now.wind.wind[:2]
     return float(w_n), float(w_e)
 
 
 def set_out(now: Situation) -> Start | Flown:
-    """Synchronise the controller twin on what was flown; give where any model starts, or why none can."""
+    """Synchronise the controller twin on what was flown; return where any model starts, or why none can."""
     seen, board = heard(now), now.onboard
     if isinstance(seen, Flown):
         return seen
@@ -249,7 +249,7 @@ def set_out(now: Situation) -> Start | Flown:
 
 
 def _aimed(now: Situation, t: float, cruise: float) -> float:
-    """Give the airspeed aimed at: as told, else the one of the mission's that is held; nan unknown [m/s]."""
+    """Return the airspeed aimed at: as told, else the one of the mission's that is held; nan unknown [m/s]."""
     told = aimed_at(now.history, t)
     if np.isfinite(told):
         return told
@@ -308,7 +308,7 @@ def fly_from(start: Start, plant: Plant, ahead: np.ndarray) -> Flown:
 
 
 def at_times(p: np.ndarray, step: float, start: Start, ctl: np.ndarray, ahead: np.ndarray) -> Flown:
-    """Give a flight at the look-aheads wanted: nan beyond its end, held in place beyond its touch-down.
+    """Return a flight at the look-aheads wanted: nan beyond its end, held in place beyond its touch-down.
 
     Args:
         p: positions every `step` [s] until the twin left its envelope, NED, (n, 3) [m], changed
@@ -346,7 +346,7 @@ def _on_this_route(window: Window, since: float) -> Window:
 
 
 def _telemetry(good: Window, every: slice, history: History) -> tuple[np.ndarray, ...]:
-    """Give what the controller twin is synchronised on at some rows: t p v euler rates Va phi_c theta_c delta."""
+    """Return what the controller twin is synchronised on at some rows: t p v euler rates Va phi_c theta_c delta."""
     at = good.t[every]
     command, Va = _reported(history, "command", at, 1.0), _reported(history, "air", at, 1.0)[:, 0]
     euler, rates = good.x[every, 6:9].copy(), good.x[every, 3:6]
@@ -356,7 +356,7 @@ def _telemetry(good: Window, every: slice, history: History) -> tuple[np.ndarray
 
 
 def _start(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give state (12,), commands and inputs in force (6,) and air (4,) at the end of the window."""
+    """Return state (12,), commands and inputs in force (6,) and air (4,) at the end of the window."""
     state = np.concatenate([good.p[-1], good.x[-3:, :6].mean(axis=0), good.x[-1, 6:]])
     command = _reported(now.history, "command", good.t[-1:], 1.0)[0, :2]
     command = np.where(np.isfinite(command), command, good.x[-1, 6:8])
@@ -365,7 +365,7 @@ def _start(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _gust(now: Situation, good: Window) -> float:
-    """Give the airspeed beyond what the mean wind explains [m/s]; 0 without an airspeed sensor."""
+    """Return the airspeed beyond what the mean wind explains [m/s]; 0 without an airspeed sensor."""
     t, air = now.history.look("air", good.t[-1] - 1.0)
     recent = air[t <= good.t[-1], 0]
     if not len(recent) or recent.min() < 3.0:

@@ -45,7 +45,7 @@ class Grey:
 
     @property
     def identified(self) -> dict[str, float]:
-        """Give what flight has told, by the autopilot's names."""
+        """Return what flight has told, by the autopilot's names."""
         return {"NAVL1_PERIOD": self.period} if self.period > 0 else {}
 
 
@@ -73,7 +73,7 @@ class Ahead:
 
 
 def air_of(track: Track, wind: np.ndarray | None) -> tuple[np.ndarray, float]:
-    """Give wind (2,) and mean true airspeed [m/s].
+    """Return wind (2,) and mean true airspeed [m/s].
 
     Without a wind, |v - w|^2 = V^2 is linear in w and V^2 - w^2: |v|^2 = 2 v.w + (V^2 - |w|^2).
     """
@@ -180,7 +180,7 @@ def _synchronised(seen: Track, seq: np.ndarray, way: tuple[np.ndarray, ...], w: 
 
 
 def _banks(seen: Track, air: np.ndarray) -> np.ndarray:
-    """Give the bank at each row: as sent, else as the turn of the track asks for [rad]."""
+    """Return the bank at each row: as sent, else as the turn of the track asks for [rad]."""
     course = np.unwrap(np.arctan2(air[:, 1], air[:, 0]))
     rate = np.gradient(course, STEP)
     smooth = np.convolve(np.pad(rate, 5, mode="edge"), np.ones(11) / 11, mode="valid")
@@ -197,7 +197,7 @@ def _state(seen: Track, w: np.ndarray) -> np.ndarray:
 def _lags(
     seen: Track, leg: np.ndarray, par: np.ndarray, absent: tuple[str, ...], told: tuple[Grey, float]
 ) -> np.ndarray:
-    """Give the numbers of the law: lags, and the speeds that were flown of late."""
+    """Return the numbers of the law: lags, and the speeds that were flown of late."""
     grey, V = told
     known = CRUISE not in absent
     commanded = leg[VA_C] if leg[VA_C] > 0 else par[P.VA_CRUISE] if known else 0.0

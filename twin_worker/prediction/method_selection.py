@@ -34,7 +34,7 @@ class Contest:
     count: dict[str, int] = field(default_factory=dict)
 
     def due(self, t: float) -> bool:
-        """Tell whether the paths made at `t` are to be compared, so that every method must fly."""
+        """Return whether the paths made at `t` are to be compared, so that every method must fly."""
         return not self.waiting or not self.waiting[-1][0] <= t < self.waiting[-1][0] + EVERY_S
 
     def keep(self, t: float, speed: float, ahead: np.ndarray, paths: dict[str, np.ndarray]) -> None:

@@ -38,7 +38,7 @@ class Instead:
         return route(self.items, seq=self.seq, origin=origin, params={**received, **self.asked}, first=self.first)
 
     def at_speed(self, velocity: np.ndarray, psi: float = 0.0) -> np.ndarray:
-        """Give a velocity (3,) [m/s] the speed asked for; of one who stands the nose tells the direction [rad]."""
+        """Return a velocity (3,) [m/s] the speed asked for; of one who stands the nose tells the direction [rad]."""
         if self.speed is None:
             return velocity
         now = float(np.linalg.norm(velocity))
@@ -49,7 +49,7 @@ class Instead:
 def gone_over(
     ctl: np.ndarray, was: np.ndarray, par: np.ndarray, legs: np.ndarray, begin: tuple[bool, np.ndarray]
 ) -> np.ndarray:
-    """Give the controller's state on another route: filters and integrators stay, and the leg where it is the same one.
+    """Return controller's state on another route: filters and integrators stay, and the leg where it is the same one.
 
     Args:
         ctl, was: synchronised state, and the legs it is on

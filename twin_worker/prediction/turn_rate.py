@@ -19,7 +19,7 @@ _STAY = np.array([[0.97, 0.015, 0.015], [0.06, 0.93, 0.01], [0.06, 0.01, 0.93]])
 
 
 def _transition(rate: float) -> np.ndarray:
-    """Give the step of p_n, v_n, p_e, v_e at one turn rate [rad/s]."""
+    """Return the step of p_n, v_n, p_e, v_e at one turn rate [rad/s]."""
     if rate == 0.0:
         block = np.array([[1.0, STEP], [0.0, 1.0]])
         return np.kron(np.eye(2), block)
@@ -92,7 +92,7 @@ def imm(p: np.ndarray, v: np.ndarray, ahead: np.ndarray) -> np.ndarray:
 
 
 def _run_forward(estimator: IMMEstimator, steps: int) -> np.ndarray:
-    """Mix and step the models without data; give the mean p_n, p_e, (steps + 1, 2) [m]."""
+    """Mix and step the models without data; return the mean p_n, p_e, (steps + 1, 2) [m]."""
     mu = estimator.mu.copy()
     x = np.stack([filt.x for filt in estimator.filters])
     F = np.stack([filt.F for filt in estimator.filters])

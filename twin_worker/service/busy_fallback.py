@@ -47,7 +47,7 @@ def stand_in_for(holding: list[Held], publish: Callable[[Message, Held], None]) 
 
 
 def lacks_prediction(held: Held, now: float) -> bool:
-    """Tell whether an aircraft has been without a prediction, even a renewed one, up to `now`, monotonic [s]."""
+    """Return whether an aircraft has been without a prediction, even a renewed one, up to `now`, monotonic [s]."""
     return now - held.published > _LACKING * _due_s(held)
 
 
@@ -57,14 +57,14 @@ def _due_s(held: Held) -> float:
 
 
 def said_already(result: Message, held: Held) -> bool:
-    """Tell whether a prediction, come late, is older than what was said meanwhile."""
+    """Return whether a prediction, come late, is older than what was said meanwhile."""
     if not isinstance(result, Prediction) or not held.stood - OVERDUE_S < result.t <= held.stood:
         return False
     return result.t > held.stood - LATEST_S or held.placed is None or _newest(held) > held.stood - _BACK_S
 
 
 def _newest(held: Held) -> float:
-    """Give the time of the newest position received [s since 1970]."""
+    """Return the time of the newest position received [s since 1970]."""
     try:
         t = held.placed.t.numpy() if held.placed is not None else np.empty(0)
     except ValueError:

@@ -24,7 +24,7 @@ class Beside:
         self.share = max(0.5 * self.share, LEAST) if late else self.share
 
     def owed(self, worked: float) -> float:
-        """Give how much the others are to have after so much work [s]."""
+        """Return how much the others are to have after so much work [s]."""
         return worked * (1.0 / self.share - 1.0)
 
     def do(self, work: Callable[[], None], stop: threading.Event | None = None) -> None:

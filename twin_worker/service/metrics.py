@@ -23,7 +23,7 @@ class Bussed(Protocol):
 
 
 def counters(state: Callable[[], FleetState], bus: Bussed) -> Families:
-    """Give what Prometheus is told."""
+    """Return what Prometheus is told."""
     return lambda: _counters(state(), bus)
 
 

@@ -32,7 +32,7 @@ class Answers:
         self._writer, self._holding = writer, holding
 
     def predictions(self, uav: int | None, asked: dict[str, str], payload: bytes) -> Stamped:
-        """Give the newest prediction of one aircraft or all, on the grid that is asked for, or what one supposes.
+        """Return the newest prediction of one aircraft or all, on the grid that is asked for, or what one supposes.
 
         Raises:
             ValueError: when grid or question are absurd, or cannot be answered; the sentence says why.
@@ -47,13 +47,13 @@ class Answers:
         return self.stamped((held, made and resample(made.message(), grid)) for held, made in found)
 
     def at_once(self) -> Predictions:
-        """Give the newest prediction of every aircraft held."""
+        """Return the newest prediction of every aircraft held."""
         found = [(Raw(made.payload), held.epoch) for held in self._holding() if (made := told(held)) is not None]
         predictions, epochs = (tuple(each) for each in zip(*found, strict=True)) if found else ((), ())
         return Predictions(t=time.time(), predictions=predictions, epochs=epochs)
 
     def of(self, uav: int | None) -> list[Held]:
-        """Give the aircraft asked for, all for None, if it is held."""
+        """Return the aircraft asked for, all for None, if it is held."""
         return [held for held in self._holding() if uav in (None, held.twin.uav)]
 
     def stamped(self, pairs: Iterable[tuple[Held, Any]]) -> Stamped:
@@ -89,7 +89,7 @@ def suppose(held: Held, asked: WhatIf) -> Prediction:
 
 
 def told(held: Held) -> Wire | None:
-    """Give the newest prediction with the law and parameters it was flown by, packed once; None before any."""
+    """Return the newest prediction with the law and parameters it was flown by, packed once; None before any."""
     made, control = held.twin.prediction, held.twin.control
     if made is None:
         return None

@@ -24,7 +24,7 @@ class Rates:
         self.total[work] += times
 
     def period(self, work: Work, aircraft: int, now: float) -> float:
-        """Give how often each of so many aircraft got it [s]; 0: not known yet, inf: never."""
+        """Return how often each of so many aircraft got it [s]; 0: not known yet, inf: never."""
         if self._since is None or now - self._since < OVER_S:
             return 0.0
         done = self._done[work]

@@ -109,12 +109,12 @@ class Worker:
         return Twin(uav, omega=self.omega, method=self.method, airframe=self.airframe, pace=self.pace, quota=self.quota)
 
     def _wants(self, uav: int) -> bool:
-        """Tell whether an aircraft is held, or about to be; one never heard of may be claimed."""
+        """Return whether an aircraft is held, or about to be; one never heard of may be claimed."""
         self.claiming.hear_of(uav)
         return uav in self._held
 
     def _may_want(self, uav: int) -> bool:
-        """Tell whether an aircraft may ever be held."""
+        """Return whether an aircraft may ever be held."""
         self.claiming.hear_of(uav)
         return uav in self.uavs
 
@@ -148,7 +148,7 @@ class Worker:
             self.diagnosis.watch(uav).told = load.mismatch
 
     def show(self, uav: int) -> tuple[Ledger, Mismatch | None]:
-        """Give what goes with a twin to another worker."""
+        """Return what goes with a twin to another worker."""
         watch = self.diagnosis.watches.get(uav) if self.diagnosis is not None else None
         return self.traffic.show(uav), watch.told if watch is not None else None
 
@@ -159,19 +159,19 @@ class Worker:
             self.diagnosis.watches.pop(uav, None)
 
     def active(self, held: Held) -> list[Alert]:
-        """Give the alerts of one aircraft that are in force."""
+        """Return the alerts of one aircraft that are in force."""
         return held.twin.ledger.active + self.traffic.active(held.twin.uav)
 
     def holding(self) -> list[Held]:
-        """Give what this worker holds, by UAV id."""
+        """Return what this worker holds, by UAV id."""
         return self._twins.ready()
 
     def _whole(self) -> list[Held]:
-        """Give those held that have heard what was said before."""
+        """Return those held that have heard what was said before."""
         return [held for held in self.holding() if not held.bare]
 
     def turn(self) -> int:
-        """Advance every twin once; give how many messages were taken in."""
+        """Advance every twin once; return how many messages were taken in."""
         taken, begun = 0, time.monotonic()
         for held in self._in_turn():
             with self._renewing:
@@ -195,7 +195,7 @@ class Worker:
         return taken
 
     def _in_turn(self) -> list[Held]:
-        """Give all, those without a prediction first, then those whose last is old, then each sweep another.
+        """Return all, those without a prediction first, then those whose last is old, then each sweep another.
 
         Heavy work may go to the first alone, and who could not be renewed has nothing but a flight ahead to wait for.
         """
@@ -250,7 +250,7 @@ class Worker:
         return watch.told if watch else None
 
     def state(self) -> FleetState:
-        """Give the fleet table of this worker."""
+        """Return the fleet table of this worker."""
         writer = f"{self.bus.writer:016x}"
         rows = [
             fleet_row(h.twin, data_time(h), self.active(h), worker=writer, epoch=h.epoch, mismatch=word(self._found(h)))
@@ -312,7 +312,7 @@ class Worker:
 
 
 def data_time(held: Held) -> float:
-    """Give the UAV's data time now: its newest sample, and the wall time since where it has fallen silent [s]."""
+    """Return the UAV's data time now: its newest sample, and the wall time since where it has fallen silent [s]."""
     silent = time.monotonic() - held.arrived
     newest = held.twin.history.newest
     return newest + silent if silent > _SILENT_S else newest

@@ -25,7 +25,7 @@ class Delay:
 
     @property
     def now(self) -> float:
-        """Give the delay of the newest sample [s]; 0 where it is a usual one."""
+        """Return the delay of the newest sample [s]; 0 where it is a usual one."""
         return _unusual(max(self.known, self.bound))
 
     def take_sample(self, newest: float, leapt: bool) -> None:
@@ -35,7 +35,7 @@ class Delay:
         self.known = 0.0 if leapt else self.known
 
     def of_status(self, t: float, newest: float) -> float:
-        """Give the delay at a status of time `t`, before it is taken; the first one is taken to come with a sample."""
+        """Return delay at a status of time `t`, before it is taken; the first one is taken to come with a sample."""
         if self.gateway_t == float("-inf"):
             return _unusual(t - newest)
         return self.known if self.bound == float("-inf") else _unusual(self.bound)

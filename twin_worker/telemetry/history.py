@@ -24,7 +24,7 @@ class History:
         self._kept: dict[str, Kept] = {}
 
     def add(self, sample: Sample) -> int:
-        """Take one message; give how many of its kinds did not fit the contract."""
+        """Take one message; return how many of its kinds did not fit the contract."""
         bad, latest = 0, sample.t + _AHEAD_S
         for name, width in _WIDTHS:
             rows: Rows | None = getattr(sample, name)
@@ -52,7 +52,7 @@ class History:
         return not timed.all()
 
     def _of(self, name: str, newest: float) -> Kept:
-        """Give what is kept of a kind of which rows up to `newest` came."""
+        """Return what is kept of a kind of which rows up to `newest` came."""
         if newest > self.newest:
             self.newest = newest
         kept = self._kept.get(name)
@@ -61,12 +61,12 @@ class History:
         return kept
 
     def rows(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
-        """Give times (n,) and values (n, k) of one kind from `since` on, rising in time, believable, once each."""
+        """Return times (n,) and values (n, k) of one kind from `since` on, rising in time, believable, once each."""
         t, x = self.look(name, since)
         return t.copy(), x.copy()
 
     def look(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
-        """Give the same where it lies: only to read, and not beyond the next message."""
+        """Return the same where it lies: only to read, and not beyond the next message."""
         kept = self._kept.get(name)
         if kept is None:
             return np.empty(0), np.empty((0, len(COLUMNS[name])))
@@ -88,7 +88,7 @@ class History:
         self.newest = max((float(kept.t[: kept.n].max()) for kept in self._kept.values() if kept.n), default=-np.inf)
 
     def sound(self) -> bool:
-        """Tell whether every kind has its columns: compiled code does not look."""
+        """Return whether every kind has its columns: compiled code does not look."""
         widths = dict(_WIDTHS)
         kinds = self._kept.items() if isinstance(self._kept, dict) else [("", None)]
         return all(isinstance(kept, Kept) and kept.x.shape[1] == widths.get(name) for name, kept in kinds)
@@ -100,7 +100,7 @@ class History:
 
 
 def _newest(t: Array, x: Array, width: int, latest: float) -> float:
-    """Give the newest time of rows as they mostly are: few, sound, none later than `latest`; 0 where they are not."""
+    """Return the newest time of rows as they mostly are: few, sound, none later than `latest`; 0 where they are not."""
     n = len(t.data) >> 3
     if not 0 < n < len(_TIMES) or t.dtype != "<f8" or t.shape != (n,) or x.shape != (n, width):
         return 0.0

@@ -13,7 +13,7 @@ _SERVOS = 8
 
 
 def lift_channels(params: Mapping[str, float]) -> list[tuple[int, float]]:
-    """Give the servo outputs of the lift motors: (column, pulse above which it turns [us])."""
+    """Return the servo outputs of the lift motors: (column, pulse above which it turns [us])."""
     found = []
     for n in range(1, _SERVOS + 1):
         if params.get(f"SERVO{n}_FUNCTION") in _MOTORS:

@@ -9,7 +9,7 @@ _OVER_S = 20.0  # rates are taken over as much [s]
 
 
 def rate_hz(history: History, kind: str) -> float:
-    """Give the rate of one kind of row of late [Hz]; 0 where none came."""
+    """Return the rate of one kind of row of late [Hz]; 0 where none came."""
     t, _ = history.look(kind, history.newest - _OVER_S)
     if not len(t):
         return 0.0

@@ -120,7 +120,7 @@ class Grid:
     def window(
         self, history: History, origin: Origin, servos: ServoMap, wind: np.ndarray, *, until: float, seconds: float
     ) -> Window | None:
-        """Lay what is new, and give the newest `seconds` before `until`.
+        """Lay what is new, and return the newest `seconds` before `until`.
 
         Args:
             history: telemetry as it came
@@ -222,7 +222,7 @@ def _seen(laid: np.ndarray, wind: np.ndarray, x: np.ndarray, u: np.ndarray, p: n
 def _lay(
     rows: dict[str, tuple[np.ndarray, np.ndarray]], grid: np.ndarray, origin: Origin
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lay every kind on grid times; give columns as in `Grid`, what is measured or filled, and what is filled."""
+    """Lay every kind on grid times; return columns as in `Grid`, what is measured or filled, and what is filled."""
     t, attitude = rows["attitude"]
     unwrapped = np.hstack([np.unwrap(attitude[:, :3], axis=0), attitude[:, 3:]])
     t_p, place = rows["position"]

@@ -76,7 +76,7 @@ class Kept:
         self.settled = 0  # what came since may lie among them
 
     def whole(self) -> tuple[np.ndarray, np.ndarray]:
-        """Give all rows as they came, (n,) and (n, k)."""
+        """Return all rows as they came, (n,) and (n, k)."""
         self.lay()
         return self.t[: self.n], self.x[: self.n]
 

@@ -49,7 +49,7 @@ class Track:
         return self.part(max(int(bad[-1]) + 1 if len(bad) else 0, int(np.searchsorted(self.t, since))), len(self))
 
     def turned(self, history: History) -> "Track":
-        """Give the same with its attitude."""
+        """Return the same with its attitude."""
         return replace(self, euler=_attitude(history, self.t))
 
 
@@ -98,7 +98,7 @@ def _slope(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def _attitude(history: History, grid: np.ndarray) -> np.ndarray:
-    """Give phi theta psi on the grid; nan where the nearest row is too far."""
+    """Return phi theta psi on the grid; nan where the nearest row is too far."""
     t, x = history.look("attitude", grid[0] - 2.0)
     if len(t) < 2 or t[-1] < grid[-1] - _OLD_S:
         return np.full((len(grid), 3), np.nan)

@@ -80,7 +80,7 @@ def catch_up(twin: Twin, messages: Iterable[Message]) -> list[Message]:
 
 
 def silence(twin: Twin, message: Message) -> Iterator[float]:
-    """Give the instants at which the loop turns before `message`, where the data were silent [s since 1970].
+    """Return the instants at which the loop turns before `message`, where the data were silent [s since 1970].
 
     Once a second; a longer silence than any prediction is worth is leapt over.
     """
@@ -134,7 +134,7 @@ def _take_other(twin: Twin, message: Message) -> None:
 
 
 def _delay(twin: Twin, message: Message) -> float:
-    """Give how far telemetry is behind the clock of a message that is no telemetry [s]."""
+    """Return how far telemetry is behind the clock of a message that is no telemetry [s]."""
     newest = twin.history.newest
     if not isinstance(message, Status) or not isfinite(newest) or not isfinite(_heard(message)):
         return twin.delay.now
@@ -175,7 +175,7 @@ def _turn(twin: Twin, now: float) -> list[Message]:
 
 
 def _renew_s(twin: Twin, now: float) -> float:
-    """Give the period of renewals [s]; a flight ahead that has to wait for CPU time is replaced by them."""
+    """Return the period of renewals [s]; a flight ahead that has to wait for CPU time is replaced by them."""
     pace = twin.pace
     return min(pace.renew, max(pace.predict, _TICK_S)) if overdue(twin, now) else pace.renew
 
@@ -186,7 +186,7 @@ def _again(twin: Twin, now: float) -> None:
 
 
 def identify_due(twin: Twin) -> bool:
-    """Tell whether an identification is due at the data time of the last turn."""
+    """Return whether an identification is due at the data time of the last turn."""
     ready = twin.origin is not None and isfinite(twin.history.newest) and isfinite(twin.turned_t)
     return ready and not twin.lost and _due(twin.turned_t, twin.identify_t, twin.pace.identify)
 
@@ -240,7 +240,7 @@ def _score(twin: Twin) -> None:
 
 
 def fleet_row(twin: Twin, now: float, alerts: Iterable[Alert] = (), **claim: object) -> FleetRow:
-    """Give the aircraft's line of the fleet table.
+    """Return the aircraft's line of the fleet table.
 
     Args:
         twin: the aircraft's twin

@@ -56,11 +56,11 @@ class Earned:
             self.g[knot] += weight * np.einsum("aknj,knj->ja", z, flown) / power[:, None]
 
     def copy(self) -> "Earned":
-        """Give one that may learn apart."""
+        """Return one that may learn apart."""
         return Earned(self.H.copy(), self.g.copy(), self.usual.copy())
 
     def shares(self) -> np.ndarray:
-        """Give kappa and hold at each knot, (knots, 9, 2), each within 0..1, as is their sum."""
+        """Return kappa and hold at each knot, (knots, 9, 2), each within 0..1, as is their sum."""
         ridge = _WEIGHT * np.eye(2)
         out = np.empty(self.g.shape)
         out[0] = 1.0, 0.0
@@ -71,7 +71,7 @@ class Earned:
         return out
 
     def at(self, ahead_s: float) -> dict[str, float]:
-        """Give kappa of every state at a look-ahead."""
+        """Return kappa of every state at a look-ahead."""
         kappa = self.shares()[..., 0]
         return {name: float(np.interp(ahead_s, KNOTS_S, kappa[:, j])) for j, name in enumerate(STATES)}
 
@@ -94,7 +94,7 @@ class Earned:
 def runs_and_flown(
     eye: Observer, y: np.ndarray, delta: np.ndarray, begins: np.ndarray, seconds: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Give free runs from rows of a flight, and what was flown meanwhile, nan where it is not known, (k, n, 9) each.
+    """Return free runs from rows of a flight, and what was flown meanwhile, nan where it is not known, (k, n, 9) each.
 
     Args:
         eye: filter of the model
@@ -112,7 +112,7 @@ def runs_and_flown(
 
 
 def _mean(m: np.ndarray, y0: np.ndarray) -> np.ndarray:
-    """Give the mean each start falls back to, (..., 9): its own heading, for no heading is usual."""
+    """Return the mean each start falls back to, (..., 9): its own heading, for no heading is usual."""
     out = np.broadcast_to(m, y0.shape).copy()
     out[..., _PSI] = y0[..., _PSI]
     return out

@@ -33,7 +33,7 @@ class Observer:
 
     @property
     def left(self) -> np.ndarray:
-        """Give how much of each gust is left after one sample, (6,) [-]."""
+        """Return how much of each gust is left after one sample, (6,) [-]."""
         return np.exp(-self.dt / TAU)
 
     def track(self, y: np.ndarray, delta: np.ndarray) -> np.ndarray:
@@ -54,7 +54,7 @@ class Observer:
         return foretold
 
     def fly(self, tracked: np.ndarray, begins: np.ndarray, length: int, delta: np.ndarray) -> np.ndarray:
-        """Run free from tracked rows, (m, 15), at `begins`, (m,), with fading gusts; give them, (m, length, 9)."""
+        """Run free from tracked rows, (m, 15), at `begins`, (m,), with fading gusts; return them, (m, length, 9)."""
         out = np.empty((len(begins), length, N_X))
         _fly(tracked, begins, delta, self.model.par, self.model.at, self.dt, self.left, out)
         return out

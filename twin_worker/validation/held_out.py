@@ -52,7 +52,7 @@ class Unseen:
         return np.where(self.ok[:, None], out, np.nan)
 
     def lesson(self, seconds: float, every: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Give a coupled model's free runs, what was flown meanwhile, and the mean before; None for two linear axes.
+        """Return a coupled model's free runs, what was flown meanwhile, and the mean before; None for two linear axes.
 
         Args:
             seconds, every: length of a run, and time between their starts [s]

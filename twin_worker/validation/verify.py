@@ -30,7 +30,7 @@ def hold(y: np.ndarray, ok: np.ndarray, length: int) -> np.ndarray:
 
 @nb.njit(cache=True, nogil=True)
 def fit_percent(y: np.ndarray, y_hat: np.ndarray) -> np.ndarray:
-    """Give the fit of each column over the rows both have, (n,) [%]; -100 where nothing is left or it diverged."""
+    """Return the fit of each column over the rows both have, (n,) [%]; -100 where nothing is left or it diverged."""
     rows, columns = y.shape
     good = np.ones(rows, np.bool_)
     for i in range(rows):
@@ -53,19 +53,19 @@ def fit_percent(y: np.ndarray, y_hat: np.ndarray) -> np.ndarray:
 
 
 def fits_at(unseen: Unseen, horizon_s: float) -> tuple[dict[str, float], dict[str, float]]:
-    """Give the fit of the model's free runs, and of holding the last value, per state [%]; an odd end is left out."""
+    """Return the fit of the model's free runs, and of holding the last value, per state [%]; an odd end is left out."""
     y, ok, length = _whole(unseen, horizon_s)
     return fit_at(unseen, horizon_s), _named(fit_percent(y, hold(y, ok, length)))
 
 
 def fit_at(unseen: Unseen, horizon_s: float) -> dict[str, float]:
-    """Give the first of both alone."""
+    """Return the first of both alone."""
     y, ok, length = _whole(unseen, horizon_s)
     return _named(fit_percent(y, np.where(ok[:, None], unseen.runs(length)[: len(y)], np.nan)))
 
 
 def _whole(unseen: Unseen, horizon_s: float) -> tuple[np.ndarray, np.ndarray, int]:
-    """Give states and mask without the odd end, and the length of a run in rows."""
+    """Return states and mask without the odd end, and the length of a run in rows."""
     length = max(int(horizon_s / unseen.dt), 2)
     n = max(len(unseen.y) // length, 1) * length
     return unseen.y[:n], unseen.ok[:n], length
@@ -76,12 +76,12 @@ def _named(fit: np.ndarray) -> dict[str, float]:
 
 
 def mean(fit: dict[str, float], states: tuple[str, ...] = STATES) -> float:
-    """Give the mean fit over states, the paper's Fit_value [%]."""
+    """Return the mean fit over states, the paper's Fit_value [%]."""
     return float(np.add.reduce([fit[name] for name in states])) / len(states)
 
 
 def by_axis(fit: dict[str, float], horizon_s: float) -> dict[str, float]:
-    """Give the mean fit of both axes at a horizon, e.g. `lon16` and `lat16` [%]."""
+    """Return the mean fit of both axes at a horizon, e.g. `lon16` and `lat16` [%]."""
     return {f"{axis}{horizon_s:.0f}": mean(fit, states) for axis, states in AXES.items()}
 
 

@@ -10,7 +10,7 @@ _BOUND = 1.96  # of white noise, 95 %, over the root of its count
 
 
 def whiteness(y: np.ndarray, y_hat: np.ndarray) -> np.ndarray:
-    """Give the share of autocorrelations of y - y_hat within white noise's 95 % band, per column, 0..1.
+    """Return the share of autocorrelations of y - y_hat within white noise's 95 % band, per column, 0..1.
 
     Args:
         y, y_hat: measured and predicted, (n, k); rows with nan, as every fresh start, are left out

@@ -137,7 +137,7 @@ def _at_speed(item: Item, speed: float) -> Item:
 
 
 def _first(items: tuple[Item, ...], twin: Twin) -> int:
-    """Give the first item to fly."""
+    """Return the first item to fly."""
     first = twin.first_item
     return min((item.seq for item in items if item.seq >= first), default=first)
 

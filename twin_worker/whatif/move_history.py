@@ -50,7 +50,7 @@ def moved(history: History, origin: Origin, how: Motion) -> None:
 
 
 def _heading(attitude: np.ndarray, air: np.ndarray) -> float:
-    """Give where the nose points: as sent, else along the flight through the air [rad]."""
+    """Return where the nose points: as sent, else along the flight through the air [rad]."""
     if len(attitude):
         return float(attitude[-1, 2])
     return float(np.arctan2(air[-1, 1], air[-1, 0])) if len(air) else 0.0

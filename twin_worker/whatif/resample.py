@@ -28,7 +28,7 @@ def wanted(asked: dict[str, str]) -> np.ndarray | None:
 
 
 def resample(prediction: Prediction, grid: np.ndarray | None) -> Prediction:
-    """Give the prediction on other look-ahead times, (n,) [s], as far as it reaches; the whole of it for None."""
+    """Return the prediction on other look-ahead times, (n,) [s], as far as it reaches; the whole of it for None."""
     if grid is None:
         return prediction
     ahead = prediction.ahead.numpy().astype(float)

@@ -17,7 +17,7 @@ class Browser:
 
     @property
     def palette(self) -> Palette:
-        """Give the colours to draw in: those this browser chose, else those the viewer was started with."""
+        """Return the colours to draw in: those this browser chose, else those the viewer was started with."""
         light = self.remembered.light
         return self._usual if light is None else LIGHT if light else DARK
 

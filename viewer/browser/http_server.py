@@ -92,7 +92,7 @@ def quiet() -> contextlib.redirect_stdout:
 
 
 def _is_any(host: str) -> bool:
-    """Tell whether an address means every interface: then we cannot know by what name we are called."""
+    """Return whether an address means every interface: then we cannot know by what name we are called."""
     return host in ("", "0.0.0.0", "::", "[::]")
 
 
@@ -144,7 +144,7 @@ def doorman(inner: Answering, names: set[str], *, anyone: bool) -> Answering:
 
 
 def _is_own(origin: str, request: Request, *, proxied: bool) -> bool:
-    """Tell whether an origin is that of the page asked for.
+    """Return whether an origin is that of the page asked for.
 
     Args:
         origin: scheme://host[:port] of the page that asks
@@ -159,7 +159,7 @@ def _is_own(origin: str, request: Request, *, proxied: bool) -> bool:
 
 
 def _with_port(address: str, scheme: str) -> tuple[str, str]:
-    """Give host and port; the port of the scheme where there is none."""
+    """Return host and port; the port of the scheme where there is none."""
     rest = address.rpartition("]")[2]  # of an IPv6 address in brackets
     return _name(address), rest.partition(":")[2] or PORTS[scheme]
 
@@ -211,7 +211,7 @@ def _name(address: str) -> str:
 
 
 def _page() -> bytes:
-    """Give the library's page, gzipped, with our title and with words for a browser that cannot draw."""
+    """Return the library's page, gzipped, with our title and with words for a browser that cannot draw."""
     source = Path(viser.__file__).with_name("client") / "build" / "index.html"
     text, first = source.read_text(encoding="utf-8"), Path(__file__).with_name("first.html").read_text(encoding="utf-8")
     at = text.index("<body")

@@ -92,7 +92,7 @@ def scale(y: np.ndarray) -> tuple[float, float]:
 
 
 def band(vehicle: Vehicle | None, off: np.ndarray) -> tuple[np.ndarray, ...] | None:
-    """Give the measured error and the band's widest half-axis against look-ahead, and an upright line at the horizon.
+    """Return the measured error and the band's widest half-axis against look-ahead, and an upright line at the horizon.
 
     Args:
         vehicle: whose
@@ -119,7 +119,7 @@ def band(vehicle: Vehicle | None, off: np.ndarray) -> tuple[np.ndarray, ...] | N
 
 
 def over_time(made: np.ndarray, off: np.ndarray, vehicle: Vehicle) -> tuple[np.ndarray, ...] | None:
-    """Give the error at one look-ahead against seconds ago, and once more where a mismatch was located."""
+    """Return the error at one look-ahead against seconds ago, and once more where a mismatch was located."""
     at = int(AHEAD_S - AHEADS_S[0])
     known = np.isfinite(off[:, at])
     if known.sum() < 2:
@@ -130,7 +130,7 @@ def over_time(made: np.ndarray, off: np.ndarray, vehicle: Vehicle) -> tuple[np.n
 
 
 def _history(rows: np.ndarray, column: int) -> tuple[np.ndarray, ...] | None:
-    """Give the last minute of one column against seconds ago: (x, y); None where there are fewer than two points."""
+    """Return the last minute of one column against seconds ago: (x, y); None where there are fewer than two points."""
     if len(rows) < 2:
         return None
     x = rows[:, 0] - rows[-1, 0]

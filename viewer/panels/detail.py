@@ -82,7 +82,7 @@ def why(vehicle: Vehicle, now: float) -> list[str]:
 
 
 def _known_s(vehicle: Vehicle, now: float) -> float:
-    """Give for how long its flight has been heard, in data time [s]."""
+    """Return for how long its flight has been heard, in data time [s]."""
     rows = vehicle.track.rows()
     return vehicle.clock(now) - float(rows[0, 0]) if len(rows) else 0.0
 

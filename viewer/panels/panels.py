@@ -156,7 +156,7 @@ class Panels:
         return all(word in text for word in wanted)
 
     def _handler(self) -> str:
-        """Give the handler of a table row: it sets the hidden input, as if someone had typed the id there."""
+        """Return the handler of a table row: it sets the hidden input, as if someone had typed the id there."""
         message = f"{{{{type:'GuiUpdateMessage',uuid:'{self._picked._impl.uuid}',updates:{{{{value:'{{}}'}}}}}}}}"
         return f"var m=window.__viserMutable;m&&m.sendMessage({message})"
 

@@ -67,12 +67,12 @@ class Camera:
 
     @property
     def aspect(self) -> float:
-        """Give width over height of the picture [-]."""
+        """Return width over height of the picture [-]."""
         camera = self._client.camera
         return camera.image_width / max(camera.image_height, 1) or 1.0
 
     def sight(self) -> Sight:
-        """Give what it sees now."""
+        """Return what it sees now."""
         camera = self._client.camera
         return Sight(np.array(camera.position), np.array(camera.look_at), float(camera.fov), self.aspect)
 

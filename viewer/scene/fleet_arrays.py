@@ -61,17 +61,17 @@ class Flock:
 
     @property
     def crowd(self) -> bool:
-        """Tell whether there are too many to draw everything of each: exceptions alone keep predicted paths."""
+        """Return whether there are too many to draw everything of each: exceptions alone keep predicted paths."""
         return len(self.uavs) > CROWD
 
     @property
     def stride(self) -> int:
-        """Give the seconds between the drawn points of a trail."""
+        """Return the seconds between the drawn points of a trail."""
         return next((step for most, step in COARSE if len(self.uavs) <= most), 4)
 
     @property
     def chunks(self) -> int:
-        """Give how many closed chunks of trail are drawn."""
+        """Return how many closed chunks of trail are drawn."""
         return CHUNKS if len(self.uavs) <= COARSE[0][0] else 2 if self.crowd else 3
 
     @property
@@ -81,11 +81,11 @@ class Flock:
 
     @property
     def needy(self) -> list[tuple[Vehicle, int]]:
-        """Give who needs an eye, with their rows."""
+        """Return who needs an eye, with their rows."""
         return [(self._shown[i], i) for i in np.flatnonzero(self.exceptions).tolist()]
 
     def index(self, uav: int | None) -> int | None:
-        """Give the row of a UAV; None where it is not drawn."""
+        """Return the row of a UAV; None where it is not drawn."""
         return self._rows.get(uav) if uav is not None else None
 
     def meet(self, fleet: list[Vehicle], now: float) -> None:
@@ -177,12 +177,12 @@ class Flock:
         self.changes += bool(leapt.any() or played)
 
     def chunk(self, age: int) -> np.ndarray:
-        """Give the points of one closed chunk of trail, (n, k, 3); `age` 0 is the newest."""
+        """Return the points of one closed chunk of trail, (n, k, 3); `age` 0 is the newest."""
         last = len(MINUTE) - 1 - self.beats % STEPS - age * STEPS
         return self.ring[:, last - STEPS : last + 1 : self.stride]
 
     def head(self) -> np.ndarray:
-        """Give the newest stretch of trail up to where each is now, (n, k, 3): an array of fixed size."""
+        """Return the newest stretch of trail up to where each is now, (n, k, 3): an array of fixed size."""
         run = self.beats % STEPS
         points = self.ring[:, len(MINUTE) - 1 - run :: self.stride]
         missing = STEPS // self.stride + 2 - points.shape[1]

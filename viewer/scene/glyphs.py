@@ -68,7 +68,7 @@ class Glyphs:
                 batch.batched_colors = mesh_colour(colours[rows] * 0.85)
 
     def colours(self, flock: Flock) -> np.ndarray:
-        """Give the colour of each, (n, 3) [0..255]: in a crowd those who are well stand back."""
+        """Return the colour of each, (n, 3) [0..255]: in a crowd those who are well stand back."""
         colours = self._colours[flock.looks]
         if not flock.crowd:
             return colours

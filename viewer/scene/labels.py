@@ -64,7 +64,7 @@ class Sight(NamedTuple):
         return flat / (2 * np.tan(self.fov / 2) * np.maximum(depth, 1e-3)[:, None]), depth
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Give the directions right and up in the picture, two (3,)."""
+        """Return the directions right and up in the picture, two (3,)."""
         ahead = (self.look_at - self.eye) / (np.linalg.norm(self.look_at - self.eye) or 1.0)
         right = np.cross(ahead, [0.0, 0.0, 1.0])
         right = right / (np.linalg.norm(right) or 1.0)
@@ -93,7 +93,7 @@ def fitting(tags: list[Tag], sight: Sight) -> list[Tag]:
 
 
 def _box(tag: Tag, spot: np.ndarray) -> np.ndarray:
-    """Give the corners of a label in the picture, (2, 2) [heights of it]."""
+    """Return the corners of a label in the picture, (2, 2) [heights of it]."""
     size = np.array([LETTER * len(tag.text), LINE])
     low = spot + np.array(_SHIFT[tag.anchor]) * size
     return np.stack([low, low + size])

@@ -13,7 +13,7 @@ MOST_POINTS = 200  # points of a segment
 
 
 def lines(found: Mismatch | None, track: np.ndarray) -> np.ndarray:
-    """Give the stretches of the flown path where it was located, as segments (n, 2, 3) [10 m].
+    """Return the stretches of the flown path where it was located, as segments (n, 2, 3) [10 m].
 
     Args:
         found: what was said last
@@ -31,7 +31,7 @@ def lines(found: Mismatch | None, track: np.ndarray) -> np.ndarray:
 
 
 def place(found: Mismatch | None, track: np.ndarray) -> np.ndarray | None:
-    """Give where on the flown path the first cause began, (3,) [10 m]; None where that is not known."""
+    """Return where on the flown path the first cause began, (3,) [10 m]; None where that is not known."""
     if found is None or found.outcome is Found.NONE or found.onset is None or not isfinite(found.onset):
         return None
     (spot,) = placed(track, np.array([found.onset]))

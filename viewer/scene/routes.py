@@ -55,7 +55,7 @@ NOTHING = Route(_NO_LINES, _NO_LINES, _NO_LINES, np.zeros((0, 3)), _NO_ITEMS, _N
 
 
 def home_alt_m(mission: Mission | None) -> float | None:
-    """Give home's altitude [m above mean sea level]: item 0 of an ArduPilot mission; None where there is none."""
+    """Return home's altitude [m above mean sea level]: item 0 of an ArduPilot mission; None where there is none."""
     if mission is None or len(mission.items) < 2:
         return None
     first, rest = mission.items[0], mission.items[1:]

@@ -116,7 +116,7 @@ def _bare(flock: Flock, points: np.ndarray, selected: int | None) -> np.ndarray:
 
 
 def _parts(flock: Flock) -> int:
-    """Give into how many parts a stretch of trail is cut."""
+    """Return into how many parts a stretch of trail is cut."""
     return PARTS if len(flock.uavs) <= FEW else 1
 
 

@@ -101,5 +101,5 @@ class Sheaf:
         self._colours.append(np.broadcast_to(colour, (len(self._lines[-1]), 3)))
 
     def all(self) -> tuple[np.ndarray, np.ndarray]:
-        """Give what was added, for `Strokes.draw`."""
+        """Return what was added, for `Strokes.draw`."""
         return np.concatenate(self._lines), np.concatenate(self._colours)

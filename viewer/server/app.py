@@ -171,13 +171,13 @@ class App:
             start_at(self._server, self._cloud)
 
     def _off_beat(self, fleet: list[Vehicle]) -> list[tuple[Vehicle, np.ndarray]]:
-        """Give the paths of those whose seconds are not ours, or whose past has just come."""
+        """Return the paths of those whose seconds are not ours, or whose past has just come."""
         early, few = self._bygone.news(), len(fleet) <= FEW
         found = [v for v in fleet if not v.recorded and (v.uav in early or (few and v.time.pace != 1.0))]
         return [(v, rows) for v in found if len(rows := self.feed.track(v))]
 
     def _news(self) -> tuple:
-        """Give what makes another picture of the fleet, whatever its extent."""
+        """Return what makes another picture of the fleet, whatever its extent."""
         fleet, place = self.flock.fleet, self.feed.place
         told = sum(v.forecast is not None for v in fleet)
         return place.origin if place else None, len(self.flock.uavs), told, sum(v.ended for v in fleet)

@@ -84,7 +84,7 @@ class View:
         self._wake()
 
     def _actions(self) -> dict[str, Callable[[], None]]:
-        """Give what the command palette does beside selecting."""
+        """Return what the command palette does beside selecting."""
         return {
             "Show the whole fleet": self.show_all,
             "Next that needs an eye": self.next_exception,
@@ -108,7 +108,7 @@ class View:
         self.panels.follow.value = not self.panels.follow.value
 
     def chosen(self) -> Vehicle | None:
-        """Give the selected UAV as it is shown; None where none is, or it is not there."""
+        """Return the selected UAV as it is shown; None where none is, or it is not there."""
         return self.timeline.one(self.selected) if self.selected is not None else None
 
     def choose(self, uav: int) -> None:
@@ -253,6 +253,6 @@ class View:
 
 
 def outgrown(cloud: np.ndarray, framed: np.ndarray) -> bool:
-    """Tell whether points (n, 3) have left a framed box (2, 3), its corners, by more than what was left free."""
+    """Return whether points (n, 3) have left a framed box (2, 3), its corners, by more than what was left free."""
     spare = 0.4 * (ROOM - 1) * max(float(np.linalg.norm(framed[1] - framed[0])), 10.0)
     return bool(((framed[0] - cloud.min(axis=0)) > spare).any() or ((cloud.max(axis=0) - framed[1]) > spare).any())

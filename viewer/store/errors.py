@@ -31,7 +31,7 @@ def errors(past: list[Kept], trail: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def by_ahead(off: np.ndarray) -> np.ndarray:
-    """Give the root mean square over predictions at each look-ahead, (30,) [m]; not a number where few answered."""
+    """Return the root mean square over predictions at each look-ahead, (30,) [m]; not a number where few answered."""
     n = np.isfinite(off).sum(axis=0)
     mean = np.nansum(off**2, axis=0) / np.maximum(n, 1)
     return np.where(n >= LEAST, np.sqrt(mean), np.nan)

@@ -24,23 +24,23 @@ class Forecast:
 
     @cached_property
     def until(self) -> float:
-        """Give the look-ahead up to which anything is claimed: the horizon, within what was sent [s]."""
+        """Return the look-ahead up to which anything is claimed: the horizon, within what was sent [s]."""
         horizon, last = self.message.horizon_s, float(self.message.ahead.numpy()[-1])
         return float(min(max(horizon if np.isfinite(horizon) else 0.0, 0.0), last))
 
     @property
     def ahead(self) -> np.ndarray:
-        """Give the look-ahead of each point, rising, (n,) [s]."""
+        """Return the look-ahead of each point, rising, (n,) [s]."""
         return self._laid[0]
 
     @property
     def path(self) -> np.ndarray:
-        """Give the mean positions, scene ENU, (n, 3) [10 m]."""
+        """Return the mean positions, scene ENU, (n, 3) [10 m]."""
         return self._laid[1]
 
     @property
     def tube(self) -> np.ndarray:
-        """Give the half-axes along, cross, vertical, (n, 3) [10 m]."""
+        """Return the half-axes along, cross, vertical, (n, 3) [10 m]."""
         return self._laid[2]
 
     @cached_property
@@ -59,7 +59,7 @@ class Forecast:
         return np.stack([np.interp(ahead, self.ahead, self.tube[:, i]) for i in range(3)], axis=-1)
 
     def kept(self, before: "Kept | None" = None) -> "Kept":
-        """Give what is kept of it when newer ones have come; `before` is what was kept before it."""
+        """Return what is kept of it when newer ones have come; `before` is what was kept before it."""
         path, ahead = self.message.path.numpy(), self.message.ahead.numpy()
         ahead = ahead[: int(np.searchsorted(ahead, KEPT_S, side="right"))]
         same = before is not None and np.array_equal(before.ahead, ahead)

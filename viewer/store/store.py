@@ -77,7 +77,7 @@ class Feed:
 
     @property
     def vehicles(self) -> dict[int, Vehicle]:
-        """Give everyone heard of, up to date."""
+        """Return everyone heard of, up to date."""
         with self.lock:
             self._read()
             return self._vehicles
@@ -90,7 +90,7 @@ class Feed:
 
     @property
     def place(self) -> Place | None:
-        """Give the frame of the scene; None before anybody was anywhere."""
+        """Return the frame of the scene; None before anybody was anywhere."""
         with self.lock:
             if self._place is None or not self.inbox.crowd:
                 self._read()
@@ -98,7 +98,7 @@ class Feed:
 
     @property
     def counts(self) -> Counter[str]:
-        """Give how many messages came of each class, and how many were strange or outdated."""
+        """Return how many messages came of each class, and how many were strange or outdated."""
         with self.lock:
             self._read()
             return self._counts
@@ -134,7 +134,7 @@ class Feed:
         return came
 
     def _may_wait(self, kind: type, uav: int) -> bool:
-        """Tell whether one of a crowd is not looked at closely, and such a message of it is known already."""
+        """Return whether one of a crowd is not looked at closely, and such a message of it is known already."""
         if not self.inbox.crowd or uav in self.close:
             return False
         vehicle = self._vehicles.get(uav)
@@ -167,7 +167,7 @@ class Feed:
 
     @property
     def router(self) -> bool:
-        """Tell whether a router is there to hear anything through."""
+        """Return whether a router is there to hear anything through."""
         return bool(self._bus.router)
 
     @property
@@ -184,7 +184,7 @@ class Feed:
                     hear(message, stamp)
 
     def _is_known(self, message: Any) -> bool:
-        """Tell whether something as new came by itself while we asked."""
+        """Return whether something as new came by itself while we asked."""
         with self.lock:
             held = getattr(self._vehicles.get(getattr(message, "uav", -1)), message.topic, None)
         return held is not None and held.t >= message.t
@@ -196,7 +196,7 @@ class Feed:
             return [self._vehicles[uav].still(self._clock()) for uav in sorted(self._vehicles)]
 
     def poses(self, uavs: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Give where some UAVs are, how they are turned, and when that was heard; of others nothing is read.
+        """Return where some UAVs are, how they are turned, and when that was heard; of others nothing is read.
 
         Returns:
             scene ENU (n, 3) [10 m], not a number where nobody told; phi theta psi (n, 3) [rad]; monotonic (n,) [s]
@@ -304,7 +304,7 @@ class Feed:
         return hear
 
     def _believe(self, vehicle: Vehicle, stamp: Stamp | None, now: float) -> bool:
-        """Tell whether a worker may speak for a UAV: not below the highest claim that still speaks."""
+        """Return whether a worker may speak for a UAV: not below the highest claim that still speaks."""
         if not self._fence.believes(vehicle.uav, stamp):
             self._counts["outdated"] += 1
             return False
@@ -381,7 +381,7 @@ class Feed:
                 vehicle.row = row
 
     def alerts(self) -> list[tuple[Vehicle, AlertKind, Alert]]:
-        """Give the alerts in force, newest first."""
+        """Return the alerts in force, newest first."""
         with self.lock:
             now = self._clock()
             copies = [vehicle.still(now) for vehicle in self._vehicles.values() if vehicle.alerts]
@@ -390,6 +390,6 @@ class Feed:
 
 
 def _stamp_of(row: FleetRow) -> Stamp:
-    """Give the claim of a row of the fleet table; the writer is a stranger's text."""
+    """Return the claim of a row of the fleet table; the writer is a stranger's text."""
     hexadecimal = len(row.worker) == 16 and all(letter in "0123456789abcdef" for letter in row.worker)
     return Stamp(row.epoch, int(row.worker, 16) if hexadecimal else 0)

@@ -87,7 +87,7 @@ class Trail:
 
 
 def _before(rows: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Give the rows whose time is before the first one held."""
+    """Return the rows whose time is before the first one held."""
     return rows[rows[:, 0] < held[0, 0]] if len(held) else rows
 
 

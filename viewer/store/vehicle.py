@@ -102,7 +102,7 @@ class Vehicle:
         return State.WAITING
 
     def still(self, now: float) -> "Vehicle":
-        """Give a copy that nobody changes any more; the histories stay shared, read them through the feed.
+        """Return a copy that nobody changes any more; the histories stay shared, read them through the feed.
 
         A recording that is over stands still at its end: what a worker says after that is of no flight.
         """
@@ -120,15 +120,15 @@ class Vehicle:
 
     @property
     def recorded(self) -> bool:
-        """Tell whether it is played from a recording."""
+        """Return whether it is played from a recording."""
         return self.player > -np.inf
 
     def age(self, now: float) -> float:
-        """Give the data time since the last sample [s]; infinite before any."""
+        """Return the data time since the last sample [s]; infinite before any."""
         return max(self.clock(now) - self.t, 0.0) if np.isfinite(self.t) else np.inf
 
     def late(self, now: float) -> float:
-        """Give how far the newest prediction lies behind data time [s]; 0 while its worker keeps up."""
+        """Return how far the newest prediction lies behind data time [s]; 0 while its worker keeps up."""
         behind = self.clock(now) - self.forecast.t if self.forecast is not None else 0.0
         return behind if behind > LATE_S * max(self.time.pace, 1.0) else 0.0
 
@@ -151,12 +151,12 @@ class Vehicle:
             self.events = merged(self.events, fresh)
 
     def _no_news(self, sample: Head) -> bool:
-        """Tell whether a sample names the mission item in force, or none: most do."""
+        """Return whether a sample names the mission item in force, or none: most do."""
         leg = sample.leg
         return leg is None or (leg.x.shape == (1, 1) and leg.t.shape == (1,) and last(leg.x) == (self.known.seq,))
 
     def where(self, now: float) -> np.ndarray | None:
-        """Give the place to draw it, (3,) [10 m]: the last sample's, or, link lost, the predicted ghost's."""
+        """Return the place to draw it, (3,) [10 m]: the last sample's, or, link lost, the predicted ghost's."""
         if self.ended and self.at is not None:
             return self.at
         if self.forecast is not None and (self.at is None or self.state(now) is State.LINK_LOST):

@@ -14,7 +14,7 @@ _WORD = {Found.NAMED: "named", Found.SUSPECTED: "suspected", Found.UNKNOWN: "unk
 
 
 def in_force(found: Mismatch | None) -> bool:
-    """Tell whether a mismatch stands that an operator must know of: named, or unknown; a suspicion is none yet."""
+    """Return whether a mismatch stands that an operator must know of: named, or unknown; a suspicion is none yet."""
     return found is not None and found.outcome in (Found.NAMED, Found.UNKNOWN)
 
 
@@ -31,7 +31,7 @@ def _where(name: str, surface: str) -> str:
 
 
 def spans(found: Mismatch | None, newest: float) -> list[tuple[float, float]]:
-    """Give when it was located, (begin, end) on the fleet clock [s]; the last one goes on to `newest`."""
+    """Return when it was located, (begin, end) on the fleet clock [s]; the last one goes on to `newest`."""
     if found is None or found.outcome is Found.NONE:
         return []
     pairs = [pair for one in found.causes[:MOST] for pair in one.segments[:MOST]][:MOST]

@@ -47,12 +47,12 @@ def severity(vehicle: Vehicle, now: float) -> tuple[bool, int, float, int]:
 
 
 def horizon_s(vehicle: Vehicle) -> float:
-    """Give the horizon in force [s]; 0 where nothing is predicted."""
+    """Return the horizon in force [s]; 0 where nothing is predicted."""
     return vehicle.forecast.until if vehicle.forecast is not None else 0.0
 
 
 def fit(vehicle: Vehicle) -> float | None:
-    """Give the mean fit over the states of the model in force [%]; None before any."""
+    """Return the mean fit over the states of the model in force [%]; None before any."""
     source = (
         (vehicle.model.in_force or vehicle.model.verdict).fit
         if vehicle.model is not None

@@ -32,7 +32,7 @@ class Palette:
     sky: tuple[str, str]
 
     def state(self, state: State) -> str:
-        """Give the colour of a state."""
+        """Return the colour of a state."""
         return {
             State.PREDICTING: self.predicting,
             State.VERIFIED: self.verified,
@@ -41,11 +41,11 @@ class Palette:
         }.get(state, self.muted)
 
     def looks(self) -> tuple[str, ...]:
-        """Give the colours of `flock.LOOKS`, in their order."""
+        """Return the colours of `flock.LOOKS`, in their order."""
         return self.muted, self.predicting, self.verified, self.identifying, self.lost, self.mismatch
 
     def event(self, kind: Kind) -> str:
-        """Give the colour of an event; none but a verified model has that of "verified"."""
+        """Return the colour of an event; none but a verified model has that of "verified"."""
         return {
             Kind.MODE: self.predicting,
             Kind.ITEM: self.route,
@@ -167,7 +167,7 @@ def mix(colour: str, other: str, share: float) -> np.ndarray:
 
 
 def line_colour(wanted: np.ndarray) -> np.ndarray:
-    """Give the vertex colour that the renderer shows as `wanted`: (..., 3) sRGB [0..255] -> (..., 3) uint8.
+    """Return the vertex colour that the renderer shows as `wanted`: (..., 3) sRGB [0..255] -> (..., 3) uint8.
 
     Vertex colours are taken as linear and then tone-mapped; this is the inverse of both, clipped to what is reachable.
     """
@@ -185,7 +185,7 @@ def shown_line(vertex: np.ndarray) -> np.ndarray:
 
 
 def mesh_colour(wanted: np.ndarray) -> np.ndarray:
-    """Give instance colours of a lit mesh, which are taken as linear too: (n, 3) sRGB [0..255] -> uint8."""
+    """Return instance colours of a lit mesh, which are taken as linear too: (n, 3) sRGB [0..255] -> uint8."""
     return np.rint(255 * _linear(np.clip(np.asarray(wanted, float), 0, 255) / 255)).astype(np.uint8)
 
 

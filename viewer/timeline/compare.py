@@ -22,7 +22,7 @@ class Miss(NamedTuple):
 
 
 def answered(told: Forecast, flown: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give the predicted and the flown places at some times.
+    """Return the predicted and the flown places at some times.
 
     Args:
         told: the prediction
@@ -36,7 +36,7 @@ def answered(told: Forecast, flown: np.ndarray, at: np.ndarray) -> tuple[np.ndar
 
 
 def until(told: Forecast, flown: np.ndarray) -> float:
-    """Give how far a prediction can be answered: to its horizon, or to the newest row [s since 1970]."""
+    """Return how far a prediction can be answered: to its horizon, or to the newest row [s since 1970]."""
     return min(told.t + told.until, float(flown[-1, 0])) if len(flown) else told.t
 
 

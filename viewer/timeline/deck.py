@@ -41,7 +41,7 @@ class Timeline:
     # --- what is shown ---
 
     def flock(self, flock: Flock, selected: int | None, now: float) -> Flock:
-        """Give the fleet to draw: the one given, which is now, or, at another time, as it was."""
+        """Return the fleet to draw: the one given, which is now, or, at another time, as it was."""
         passed = now - self._drawn_at[0]
         with self._lock:
             if flock.now != self._measured or not self.player.live:
@@ -57,7 +57,7 @@ class Timeline:
         return self._then
 
     def one(self, uav: int) -> Vehicle | None:
-        """Give one UAV as it is shown; None where it is not there."""
+        """Return one UAV as it is shown; None where it is not there."""
         vehicle, t = self._feed.one(uav), self.player.t
         if vehicle is None or t is None or uav not in self._tapes.of:
             return vehicle if t is None else None
@@ -84,11 +84,11 @@ class Timeline:
     # --- being asked ---
 
     def tab(self, label: str, icon: Any) -> Any:
-        """Give another tab beside the timeline, to be filled in a `with` statement."""
+        """Return another tab beside the timeline, to be filled in a `with` statement."""
         return self._panel.window.add_tab(label, icon)
 
     def sender(self) -> str:
-        """Give the page's code that shows the time in its place `{}`."""
+        """Return the page's code that shows the time in its place `{}`."""
         return self._panel.sender("at:")
 
     def asked(self, what: str) -> None:

@@ -41,7 +41,7 @@ class Panel:
         return f'<div class="uav time buttons">{"".join(made)}</div>'
 
     def sender(self, tag: str) -> str:
-        """Give the page's code that asks for `tag` and a value in its place `{}`."""
+        """Return the page's code that asks for `tag` and a value in its place `{}`."""
         return SEND.replace("UUID", str(self._asked._impl.uuid)).replace("TAG", tag)
 
     def draw(self, bar: str, head: str, words: str, banner: str) -> None:

@@ -28,7 +28,7 @@ class Flown:
         self._rows = rows
 
     def rows(self) -> np.ndarray:
-        """Give all points, (n, 4) or (n, 5): t [s], scene ENU [10 m], and of a trail Va [m/s]."""
+        """Return all points, (n, 4) or (n, 5): t [s], scene ENU [10 m], and of a trail Va [m/s]."""
         return self._rows
 
 
@@ -40,19 +40,19 @@ class Past(Vehicle):
     stood: Stood
 
     def clock(self, now: float) -> float:
-        """Give the data time shown [s], whatever the time is now."""
+        """Return the data time shown [s], whatever the time is now."""
         return self.then
 
     def state(self, now: float) -> State:
-        """Give the state it had then."""
+        """Return the state it had then."""
         return self.stood.state
 
     def late(self, now: float) -> float:
-        """Give nothing: what was late then may have come since."""
+        """Return nothing: what was late then may have come since."""
         return 0.0
 
     def still(self, now: float) -> "Past":
-        """Give itself: nobody changes it."""
+        """Return itself: nobody changes it."""
         return self
 
     @property
@@ -62,27 +62,27 @@ class Past(Vehicle):
 
     @property
     def trail(self) -> Flown:  # type: ignore[override]
-        """Give the fine trail until then: rows of time [s], scene ENU [10 m], Va [m/s]."""
+        """Return the fine trail until then: rows of time [s], scene ENU [10 m], Va [m/s]."""
         return Flown(self.tape.flown(self.then - TRAIL_S, self.t))
 
     @property
     def track(self) -> Flown:  # type: ignore[override]
-        """Give all the path that is kept until then."""
+        """Return all the path that is kept until then."""
         return Flown(self.tape.path(-np.inf, self.t))
 
     @property
     def past(self) -> list[Forecast]:  # type: ignore[override]
-        """Give the predictions of the minute before, oldest first."""
+        """Return the predictions of the minute before, oldest first."""
         return [one for one in self.tape.told if self.then - PAST_S <= one.t <= self.then]
 
     @property
     def fits(self) -> list[tuple[float, float]]:  # type: ignore[override]
-        """Give the fits until then: time [s], mean over the states [%]."""
+        """Return the fits until then: time [s], mean over the states [%]."""
         return [(one.t, one.fit) for one in self.tape.stood if one.fit is not None and one.t <= self.then]
 
     @property
     def events(self) -> tuple[Event, ...]:  # type: ignore[override]
-        """Give what had happened by then."""
+        """Return what had happened by then."""
         return tuple(event for event in self.tape.events if event.t <= self.then)
 
 
@@ -114,7 +114,7 @@ _OWN = ("trail", "track", "past", "fits", "events")
 
 
 def _figures(vehicle: Vehicle, row: np.ndarray, how: Stood, told: Forecast | None) -> dict[str, Any]:
-    """Give what of a UAV was another then."""
+    """Return what of a UAV was another then."""
     status = vehicle.status
     if status is not None:
         status = msgspec.structs.replace(status, mode=how.mode, armed=how.armed, link=how.link, sentence=how.sentence)

@@ -15,7 +15,7 @@ class Span(NamedTuple):
         return min(max(t, self.begin), self.end)
 
     def share(self, t: float) -> float:
-        """Give where in the span a time lies, 0 to 1."""
+        """Return where in the span a time lies, 0 to 1."""
         return (self.clip(t) - self.begin) / max(self.end - self.begin, 1e-9)
 
 
@@ -28,7 +28,7 @@ class Player:
 
     @property
     def live(self) -> bool:
-        """Tell whether what is shown is now."""
+        """Return whether what is shown is now."""
         return self.t is None
 
     def go_live(self) -> None:

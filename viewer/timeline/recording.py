@@ -42,12 +42,12 @@ class Tape:
 
     @property
     def t(self) -> np.ndarray:
-        """Give the times of the rows, rising, (n,) [s since 1970]."""
+        """Return the times of the rows, rising, (n,) [s since 1970]."""
         return self._t[: self._n]
 
     @property
     def x(self) -> np.ndarray:
-        """Give the rows, (n, 7): scene ENU [10 m], phi theta psi [rad], Va [m/s]."""
+        """Return the rows, (n, 7): scene ENU [10 m], phi theta psi [rad], Va [m/s]."""
         return self._x[: self._n]
 
     def nbytes(self) -> int:
@@ -147,7 +147,7 @@ class Tape:
         return a + step * float(np.clip((t - t0) / (t1 - t0), 0.0, 1.0))
 
     def path(self, begin: float, end: float) -> np.ndarray:
-        """Give the flown path between two times, both ends interpolated: (n, 4) time [s], scene ENU [10 m]."""
+        """Return the flown path between two times, both ends interpolated: (n, 4) time [s], scene ENU [10 m]."""
         end, begin = min(end, float(self.t[-1])), max(begin, float(self.t[0]))
         if end <= begin:
             return np.zeros((0, 4))
@@ -156,12 +156,12 @@ class Tape:
         return np.column_stack([at, *(np.interp(at, self.t, self.x[:, k]) for k in range(3))])
 
     def flown(self, begin: float, end: float) -> np.ndarray:
-        """Give the last rows between two times as a trail has them: (n, 5) time, scene ENU [10 m], Va [m/s]."""
+        """Return the last rows between two times as a trail has them: (n, 5) time, scene ENU [10 m], Va [m/s]."""
         path = self.path(begin, end)[-TRAIL_ROWS:]
         return np.column_stack([path, np.interp(path[:, 0], self.t, self.x[:, 6])]) if len(path) else np.zeros((0, 5))
 
     def told_by(self, t: float) -> Forecast | None:
-        """Give the newest prediction there was at a time; of those asked for before, the laid out path is let go."""
+        """Return the newest prediction there was at a time; of those asked for before, the laid out path is let go."""
         found = next((one for one in reversed(self.told) if one.t <= t + 0.5), None)
         if self._asked is not None and self._asked is not found:
             vars(self._asked).pop("_laid", None)

@@ -56,7 +56,7 @@ def _ticks(span: Span) -> list[float]:
 
 
 def touched(send: str) -> str:
-    """Give the attributes of whatever wraps the bar: a press or a drag sends the share of its width.
+    """Return the attributes of whatever wraps the bar: a press or a drag sends the share of its width.
 
     Args:
         send: the page's code that asks for a value in its place `{}`

@@ -22,7 +22,7 @@ _P, _I, _D, _IMAX, _FLTT, _FLTD = 1, 2, 3, 4, 5, 6  # gains behind FF in `par`, 
 
 @kernel
 def scaler(par: np.ndarray, Va: float) -> float:
-    """Give the gain for dynamic pressure, SCALING_SPEED / Va, limited [-]; nan airspeed counts as cruise."""
+    """Return the gain for dynamic pressure, SCALING_SPEED / Va, limited [-]; nan airspeed counts as cruise."""
     V = Va if np.isfinite(Va) else par[P.VA_CRUISE]
     low = min(0.5, par[P.VA_SCALING] / (2.0 * par[P.VA_MAX]))
     high = max(2.0, par[P.VA_SCALING] / (0.7 * par[P.VA_MIN]))
@@ -31,7 +31,7 @@ def scaler(par: np.ndarray, Va: float) -> float:
 
 @kernel
 def _share(hertz: float, dt: float) -> float:
-    """Give a low-pass filter's share of the new value; 0 Hz: no filter."""
+    """Return a low-pass filter's share of the new value; 0 Hz: no filter."""
     return dt / (dt + 1.0 / (2 * pi * hertz)) if hertz > 0.0 else 1.0
 
 
@@ -62,7 +62,7 @@ def _limited(rate: float, down: float, up: float) -> float:
 
 @kernel
 def rate_demands(par: np.ndarray, phi_c: float, theta_c: float, euler: np.ndarray, Va: float) -> tuple[float, float]:
-    """Give the roll and pitch rates wanted, the pitch rate of the turn included [rad/s]."""
+    """Return the roll and pitch rates wanted, the pitch rate of the turn included [rad/s]."""
     V = max(Va if np.isfinite(Va) else par[P.VA_CRUISE], par[P.VA_MIN]) * par[P.EAS2TAS]
     phi = clip(euler[0], -1.396, 1.396)
     p_d = _limited((phi_c - euler[0]) / par[P.ROLL_TC], par[P.ROLL_RMAX], par[P.ROLL_RMAX])
@@ -82,7 +82,7 @@ def stabilise(
     Va: float,
     dt: float,
 ) -> tuple[float, float, float]:
-    """Give the surfaces for a commanded attitude. Made for 50 Hz.
+    """Return the surfaces for a commanded attitude. Made for 50 Hz.
 
     Args:
         ctl, par: controller state, parameters

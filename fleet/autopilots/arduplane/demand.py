@@ -72,13 +72,13 @@ def filter_speed(ctl: np.ndarray, tas: float, otherwise: float, dt: float) -> No
 
 @kernel
 def slowest(par: np.ndarray, phi: float) -> float:
-    """Give the least true airspeed, raised with the load factor of the bank [m/s]."""
+    """Return the least true airspeed, raised with the load factor of the bank [m/s]."""
     return par[P.VA_MIN] * par[P.EAS2TAS] / sqrt(max(cos(phi), 0.2))
 
 
 @kernel
 def demand_speed(ctl: np.ndarray, par: np.ndarray, va_c: float, phi: float, dt: float) -> float:
-    """Move the speed demand as power and drag allow; give its rate above its slow part [m/s2].
+    """Move the speed demand as power and drag allow; return its rate above its slow part [m/s2].
 
     Up with half the climb power, down with 0.9 of the drag, which is SINK_MIN at cruise and grows with V^2.
     """
@@ -101,7 +101,7 @@ def demand_speed(ctl: np.ndarray, par: np.ndarray, va_c: float, phi: float, dt: 
 
 @kernel
 def demand_height(ctl: np.ndarray, par: np.ndarray, h_sp: float, dt: float) -> float:
-    """Rate-limit and lag the height demand; give the climb rate demand [m/s]."""
+    """Rate-limit and lag the height demand; return the climb rate demand [m/s]."""
     mean = 0.5 * (h_sp + ctl[S.H_IN])
     ctl[S.H_IN] = h_sp
     down, up = par[P.SINK_MAX] * ctl[S.DOWN] * dt, par[P.CLIMB_MAX] * ctl[S.UP] * dt

@@ -51,7 +51,7 @@ def init(
 
 @kernel
 def speed(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray) -> float:
-    """Give the airspeed commanded on the current leg, equivalent [m/s]."""
+    """Return the airspeed commanded on the current leg, equivalent [m/s]."""
     i = leg_rules.current(ctl, legs)
     return legs[i, VA_C] if i >= 0 and legs[i, VA_C] > 0.0 else par[P.VA_CRUISE]
 

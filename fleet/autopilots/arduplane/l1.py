@@ -32,7 +32,7 @@ def ground_track(v: np.ndarray, psi: float) -> tuple[float, float, float]:
 
 @kernel
 def distance(par: np.ndarray, speed: float) -> float:
-    """Give the L1 distance for a ground speed [m]."""
+    """Return the L1 distance for a ground speed [m]."""
     return max(par[P.DAMPING] * par[P.PERIOD] * speed / pi, 0.1)
 
 

@@ -40,13 +40,13 @@ _LEVEL = 5.0  # altitude error that ends LOITER_TO_ALT [m]
 
 @kernel
 def current(ctl: np.ndarray, legs: np.ndarray) -> int:
-    """Give the index of the leg in force; -1 when the route is empty."""
+    """Return the index of the leg in force; -1 when the route is empty."""
     return min(max(int(ctl[S.LEG]), 0), legs.shape[0] - 1)
 
 
 @kernel
 def along_line(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> tuple[float, float]:
-    """Give the way made along the current line, and the line's length [m]."""
+    """Return the way made along the current line, and the line's length [m]."""
     t_n, t_e = leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]
     length = hypot(t_n, t_e)
     if length < 0.1:
@@ -178,7 +178,7 @@ def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.nda
 
 @kernel
 def ready(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> bool:
-    """Tell whether turns, time or height of a circle are flown; p: NED, (3,) [m]."""
+    """Return whether turns, time or height of a circle are flown; p: NED, (3,) [m]."""
     kind = int(leg[KIND])
     if kind == LOITER_TURNS:
         return ctl[S.ANGLE] >= 2 * pi * leg[TURNS]
@@ -189,7 +189,7 @@ def ready(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> bool:
 
 @kernel
 def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray) -> float:
-    """Give the height to be at, up positive above the origin [m]: linear along a sloped leg, at once on a flat one.
+    """Return the height to be at, up positive above the origin [m]: linear along a sloped leg, at once on a flat one.
 
     Args:
         ctl, par, legs: controller state, parameters, route

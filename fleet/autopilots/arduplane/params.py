@@ -104,7 +104,7 @@ def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np
 
 
 def read(values: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Give every parameter of the law under its current name, in the autopilot's units, and which are defaults."""
+    """Return every parameter of the law under its current name, in the autopilot's units, and which are defaults."""
     given = {**_old_gains(values), **{k: float(v) for k, v in values.items()}}
     found, absent = {}, []
     for row in TABLE:

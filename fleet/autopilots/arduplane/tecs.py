@@ -19,7 +19,7 @@ from fleet.frames import G
 
 @kernel
 def pitch_limits(par: np.ndarray) -> tuple[float, float]:
-    """Give the lowest and highest pitch demand [rad]; a TECS limit of zero defers to the general one."""
+    """Return the lowest and highest pitch demand [rad]; a TECS limit of zero defers to the general one."""
     low = max(par[P.TECS_LOW], par[P.PITCH_LOW]) if par[P.TECS_LOW] < 0.0 else par[P.PITCH_LOW]
     high = min(par[P.TECS_HIGH], par[P.PITCH_HIGH]) if par[P.TECS_HIGH] > 0.0 else par[P.PITCH_HIGH]
     return low, high
@@ -27,7 +27,7 @@ def pitch_limits(par: np.ndarray) -> tuple[float, float]:
 
 @kernel
 def energy_rates(ctl: np.ndarray, par: np.ndarray) -> tuple[float, float]:
-    """Give the specific total energy rates of idle and full throttle [m2/s3]."""
+    """Return the specific total energy rates of idle and full throttle [m2/s3]."""
     return -par[P.SINK_MIN] * G, max(par[P.CLIMB_MAX] * ctl[S.UP], 0.1) * G
 
 
@@ -43,7 +43,7 @@ def _flags(ctl: np.ndarray, par: np.ndarray, h: float, phi: float, error: float,
 
 @kernel
 def _throttle(ctl: np.ndarray, par: np.ndarray, h: float, h_dot: float, v_rate: float, phi: float, dt: float) -> float:
-    """Close the loop on total energy; give the throttle 0..1."""
+    """Close the loop on total energy; return the throttle 0..1."""
     idle, full = energy_rates(ctl, par)
     V, tc, span = ctl[S.V_HAT], par[P.TIME_CONST], par[P.THR_MAX] - par[P.THR_MIN]
     ske, low, high = 0.5 * V * V, par[P.VA_MIN] * par[P.EAS2TAS], par[P.VA_MAX] * par[P.EAS2TAS]
@@ -91,14 +91,14 @@ def _throttle_blind(ctl: np.ndarray, par: np.ndarray, phi: float, dt: float) -> 
 
 @kernel
 def _weights(ctl: np.ndarray, par: np.ndarray, blind: bool) -> tuple[float, float]:
-    """Give the weights of height and speed in the pitch loop."""
+    """Return the weights of height and speed in the pitch loop."""
     weight = 0.0 if blind else (2.0 if ctl[S.SLOW] > 0.0 else clip(par[P.SPEED_WEIGHT], 0.0, 2.0))
     return min(2.0 - weight, 1.0), min(weight, 1.0)
 
 
 @kernel
 def _pitch(ctl: np.ndarray, par: np.ndarray, h: float, h_dot: float, h_dot_c: float, blind: bool, dt: float) -> float:
-    """Close the loop on the energy balance; give the pitch demand [rad]."""
+    """Close the loop on the energy balance; return the pitch demand [rad]."""
     w_p, w_k = _weights(ctl, par, blind)
     V, tc = ctl[S.V_HAT], par[P.TIME_CONST]
     low, high = pitch_limits(par)
@@ -151,7 +151,7 @@ def update(
     blind: bool,
     dt: float,
 ) -> tuple[float, float]:
-    """Give pitch and throttle for a height and a speed; call `demand.update_speed` first.
+    """Return pitch and throttle for a height and a speed; call `demand.update_speed` first.
 
     Args:
         ctl, par: controller state, parameters

@@ -18,7 +18,7 @@ __all__ = ["ARDUPLANE", "LAW", "N_CTL", "N_PAR", "PX4", "TEXTBOOK", "W_E", "W_N"
 
 
 def padded(own: np.ndarray, law: float) -> np.ndarray:
-    """Give a law's own numbers (k,) as a parameter vector in calm air, (N_PAR,)."""
+    """Return a law's own numbers (k,) as a parameter vector in calm air, (N_PAR,)."""
     par = np.zeros(N_PAR)
     par[: len(own)] = own
     par[LAW] = law

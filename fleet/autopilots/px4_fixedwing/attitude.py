@@ -24,13 +24,13 @@ _P, _I, _IMAX = 1, 2, 3  # gains behind FF in `par`, the same order for each axi
 
 @kernel
 def _known(par: np.ndarray, Va: float) -> float:
-    """Give the airspeed within its limits; nan counts as cruise [m/s]."""
+    """Return the airspeed within its limits; nan counts as cruise [m/s]."""
     return clip(Va, par[P.VA_MIN], par[P.VA_MAX]) if np.isfinite(Va) else par[P.VA_CRUISE]
 
 
 @kernel
 def scaler(par: np.ndarray, Va: float) -> float:
-    """Give the gain for dynamic pressure [-]."""
+    """Return the gain for dynamic pressure [-]."""
     return par[P.VA_CRUISE] / _known(par, Va) if par[P.SCALED] > 0.0 else 1.0
 
 
@@ -38,7 +38,7 @@ def scaler(par: np.ndarray, Va: float) -> float:
 def rate_demands(
     par: np.ndarray, phi_c: float, theta_c: float, euler: np.ndarray, Va: float
 ) -> tuple[float, float, float]:
-    """Give the body rates wanted [rad/s]."""
+    """Return the body rates wanted [rad/s]."""
     phi, theta = clip(euler[0], -_STEEPEST, _STEEPEST), clip(euler[1], -_STEEPEST, _STEEPEST)
     phi_dot, theta_dot = (phi_c - euler[0]) / par[P.ROLL_TC], (theta_c - euler[1]) / par[P.PITCH_TC]
     psi_dot = G * tan(phi) * cos(theta) / (_known(par, Va) * par[P.EAS2TAS])
@@ -77,7 +77,7 @@ def stabilise(
     Va: float,
     dt: float,
 ) -> tuple[float, float, float]:
-    """Give the surfaces for a commanded attitude; arguments and signs as for ArduPlane's `stabilise`."""
+    """Return the surfaces for a commanded attitude; arguments and signs as for ArduPlane's `stabilise`."""
     dt = max(dt, 1e-4)
     s = scaler(par, Va)
     p_d, q_d, r_d = rate_demands(par, phi_c, theta_c, euler, Va)

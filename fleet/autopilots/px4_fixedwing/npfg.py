@@ -24,27 +24,27 @@ _SLOWEST = 3.0  # least airspeed reckoned with [m/s]
 
 @kernel
 def period(par: np.ndarray) -> float:
-    """Give the period in force: as set, but no faster than the roll loop can follow [s]."""
+    """Return the period in force: as set, but no faster than the roll loop can follow [s]."""
     least = pi * par[P.NPFG_TC] / par[P.DAMPING] * par[P.PERIOD_SF]
     return max(par[P.PERIOD], least) if par[P.LB_PERIOD] > 0.0 else par[P.PERIOD]
 
 
 @kernel
 def error_bound(par: np.ndarray, speed: float) -> float:
-    """Give the distance from which the path is flown at squarely, for a ground speed [m]."""
+    """Return the distance from which the path is flown at squarely, for a ground speed [m]."""
     tau = period(par) * par[P.DAMPING]
     return speed * tau if speed > 1.0 else 0.5 * tau * (speed * speed + 1.0)
 
 
 @kernel
 def switch_distance(par: np.ndarray, speed: float) -> float:
-    """Give the distance at which a waypoint is left for the next [m]."""
+    """Return the distance at which a waypoint is left for the next [m]."""
     return max(min(par[P.SWITCH] * error_bound(par, speed), _FARTHEST), par[P.ACC_RAD])
 
 
 @kernel
 def _air_course(par: np.ndarray, b_n: float, b_e: float, V: float) -> tuple[float, float, bool]:
-    """Give the air velocity that makes good the bearing b in the wind; into the wind where none does."""
+    """Return the air velocity that makes good the bearing b in the wind; into the wind where none does."""
     across = par[W_N] * b_e - par[W_E] * b_n
     if abs(across) < V:
         ahead = sqrt(V * V - across * across)
@@ -55,7 +55,7 @@ def _air_course(par: np.ndarray, b_n: float, b_e: float, V: float) -> tuple[floa
 
 @kernel
 def _turn_with(par: np.ndarray, t_n: float, t_e: float, v: np.ndarray, V: float, e: float, kappa: float) -> float:
-    """Give the lateral acceleration through the air that the path's own curvature `kappa` [1/m] asks for [m/s2]."""
+    """Return the lateral acceleration through the air that the path's own curvature `kappa` [1/m] asks for [m/s2]."""
     w_t, w_c = par[W_N] * t_n + par[W_E] * t_e, par[W_N] * t_e - par[W_E] * t_n
     ratio = 1.0 + w_t / sqrt(max(V * V - w_c * w_c, 1.0))
     along = max(v[0] * t_n + v[1] * t_e, 0.0)

@@ -32,7 +32,7 @@ def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndar
 
 @kernel
 def _to_point(n: float, e: float, p: np.ndarray) -> tuple[float, float, float]:
-    """Give the straight way to a point: direction, no error."""
+    """Return the straight way to a point: direction, no error."""
     d_n, d_e = n - p[0], e - p[1]
     far = max(hypot(d_n, d_e), 0.1)
     return d_n / far, d_e / far, 0.0
@@ -40,7 +40,7 @@ def _to_point(n: float, e: float, p: np.ndarray) -> tuple[float, float, float]:
 
 @kernel
 def _line(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, reach: float) -> tuple[float, float, float]:
-    """Give direction and error of the line; before its begin the way there, past its end the way back."""
+    """Return direction and error of the line; before its begin the way there, past its end the way back."""
     a_n, a_e = ctl[S.PREV_N], ctl[S.PREV_E]
     along, length = leg_rules.along_line(ctl, leg, p)
     if length < 1.0 or along > length:
@@ -53,7 +53,7 @@ def _line(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, reach: float) -> tupl
 
 @kernel
 def _circle(leg: np.ndarray, p: np.ndarray, radius: float) -> tuple[float, float, float, float]:
-    """Give direction, error and curvature of a circle at its nearest point; radius positive clockwise [m]."""
+    """Return direction, error and curvature of a circle at its nearest point; radius positive clockwise [m]."""
     out_n, out_e = p[0] - leg[P_N], p[1] - leg[P_E]
     r = hypot(out_n, out_e)
     if r < 0.1:
@@ -150,7 +150,7 @@ def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.nda
 
 @kernel
 def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, speed: float) -> float:
-    """Give the height to be at, up positive [m]: linear in the way left to the switch distance, else at once.
+    """Return the height to be at, up positive [m]: linear in the way left to the switch distance, else at once.
 
     Args:
         ctl, par, legs: controller state, parameters, route

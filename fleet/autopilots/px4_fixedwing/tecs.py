@@ -34,7 +34,7 @@ def _reference(ctl: np.ndarray, par: np.ndarray, h_sp: float, dt: float) -> None
 
 @kernel
 def _underspeed(ctl: np.ndarray, par: np.ndarray, blind: bool) -> float:
-    """Give how far underspeed is, 0..1."""
+    """Return how far underspeed is, 0..1."""
     if blind:
         return 0.0
     margin = _MARGIN * par[P.VA_CRUISE] * par[P.EAS2TAS]
@@ -44,7 +44,7 @@ def _underspeed(ctl: np.ndarray, par: np.ndarray, blind: bool) -> float:
 
 @kernel
 def _pitch(ctl: np.ndarray, par: np.ndarray, h_dot: float, wanted: tuple[float, float], w_k: float, dt: float) -> float:
-    """Close the loop on the energy balance; give the pitch demand [rad]."""
+    """Close the loop on the energy balance; return the pitch demand [rad]."""
     V, w_p = ctl[S.V_HAT], min(2.0 - w_k, 1.0)
     w_k = min(w_k, 1.0)
     balance_c = G * wanted[0] * w_p - V * wanted[1] * w_k
@@ -64,7 +64,7 @@ def _pitch(ctl: np.ndarray, par: np.ndarray, h_dot: float, wanted: tuple[float, 
 
 @kernel
 def trim_throttle(par: np.ndarray, ste_dot: float) -> float:
-    """Give the throttle that a total energy rate [m2/s3] is known to take: linear between idle, trim and full."""
+    """Return the throttle that a total energy rate [m2/s3] is known to take: linear between idle, trim and full."""
     if ste_dot >= 0.0:
         return par[P.THR_TRIM] + ste_dot / (par[P.CLIMB_MAX] * G) * (par[P.THR_MAX] - par[P.THR_TRIM])
     return par[P.THR_TRIM] - ste_dot / (par[P.SINK_MIN] * G) * (par[P.THR_MIN] - par[P.THR_TRIM])
@@ -74,7 +74,7 @@ def trim_throttle(par: np.ndarray, ste_dot: float) -> float:
 def _throttle(
     ctl: np.ndarray, par: np.ndarray, h_dot: float, wanted: tuple[float, float], phi: float, blind: bool, dt: float
 ) -> float:
-    """Close the loop on the total energy rate; give the throttle 0..1."""
+    """Close the loop on the total energy rate; return the throttle 0..1."""
     V, idle, full = ctl[S.V_HAT], -par[P.SINK_MIN] * G, par[P.CLIMB_MAX] * G
     rate = G * h_dot + V * (0.0 if blind else ctl[S.ACCEL])
     ctl[X.STE_DOT] += dt / (dt + par[P.STE_TC]) * (rate - ctl[X.STE_DOT])
@@ -109,7 +109,7 @@ def update(
     blind: bool,
     dt: float,
 ) -> tuple[float, float]:
-    """Give pitch and throttle for a height and a speed; arguments as for ArduPlane's `tecs.update`.
+    """Return pitch and throttle for a height and a speed; arguments as for ArduPlane's `tecs.update`.
 
     Call `demand.sense` and `demand.filter_speed` first.
     """

@@ -86,7 +86,7 @@ def _climb(
     sensed: bool,
     dt: float,
 ) -> tuple[float, float]:
-    """Close the loops on height and airspeed; give pitch [rad] and throttle 0..1."""
+    """Close the loops on height and airspeed; return pitch [rad] and throttle 0..1."""
     i, V = leg_rules.current(ctl, legs), ctl[S.V_HAT]
     va_c = (legs[i, VA_C] if i >= 0 and legs[i, VA_C] > 0.0 else par[P.CRUISE]) * par[P.EAS2TAS]
     off = path.height_demand(ctl, legs, p) + p[2]
@@ -116,7 +116,7 @@ def stabilise(
     Va: float,
     dt: float,
 ) -> tuple[float, float, float]:
-    """Give the surfaces for a commanded attitude; arguments and signs as for ArduPlane's `stabilise`."""
+    """Return the surfaces for a commanded attitude; arguments and signs as for ArduPlane's `stabilise`."""
     delta_a = clip(par[P.K_P_PHI] * (phi_c - euler[0]) - par[P.K_D_PHI] * rates[0] + ctl[X.I_A], -1.0, 1.0)
     free = par[P.K_P_THETA] * (theta_c - euler[1]) - par[P.K_D_THETA] * rates[1] + ctl[X.I_E]
     delta_e = clip(free, -1.0, 1.0)

@@ -21,7 +21,7 @@ _SHARPEST = 2.6  # turn that a fillet is reckoned for [rad]
 
 @kernel
 def _turn(ctl: np.ndarray, leg: np.ndarray, after: np.ndarray) -> tuple[float, float, float, float, float]:
-    """Give the direction of this line and of the next, and the turn between them, right positive [rad]."""
+    """Return the direction of this line and of the next, and the turn between them, right positive [rad]."""
     here = atan2(leg[P_E] - ctl[S.PREV_E], leg[P_N] - ctl[S.PREV_N])
     there = atan2(after[P_E] - leg[P_E], after[P_N] - leg[P_N])
     return cos(here), sin(here), cos(there), sin(there), wrap(there - here)
@@ -29,7 +29,7 @@ def _turn(ctl: np.ndarray, leg: np.ndarray, after: np.ndarray) -> tuple[float, f
 
 @kernel
 def _cut(par: np.ndarray, turn: float) -> float:
-    """Give how far from the corner the fillet touches the lines [m]."""
+    """Return how far from the corner the fillet touches the lines [m]."""
     return par[P.FILLET] * tan(min(abs(turn), _SHARPEST) / 2)
 
 
@@ -52,7 +52,7 @@ def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndar
 
 @kernel
 def _to_line(ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, chi: float) -> float:
-    """Give the course to a line. Source: Beard & McLain eq. 10.8."""
+    """Return the course to a line. Source: Beard & McLain eq. 10.8."""
     q_n, q_e = leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]
     if hypot(q_n, q_e) < 1.0:
         q_n, q_e = leg[P_N] - p[0], leg[P_E] - p[1]
@@ -63,7 +63,7 @@ def _to_line(ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, c
 
 @kernel
 def _to_orbit(par: np.ndarray, n: float, e: float, radius: float, p: np.ndarray, v: np.ndarray) -> tuple[float, float]:
-    """Give course and bank on an orbit round (n, e), radius positive clockwise [m]. Source: eq. 10.13."""
+    """Return course and bank on an orbit round (n, e), radius positive clockwise [m]. Source: eq. 10.13."""
     d, wide = 1.0 if radius > 0.0 else -1.0, max(abs(radius), 1.0)
     out_n, out_e = p[0] - n, p[1] - e
     chi = atan2(out_e, out_n) + d * (pi / 2 + atan(par[P.K_ORBIT] * (hypot(out_n, out_e) - wide) / wide))
@@ -75,7 +75,7 @@ def _to_orbit(par: np.ndarray, n: float, e: float, radius: float, p: np.ndarray,
 def course(
     ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray, chi: float, dt: float
 ) -> tuple[float, float, bool]:
-    """Give course and bank of the path, and whether the leg is over.
+    """Return course and bank of the path, and whether the leg is over.
 
     Args:
         ctl, par, legs: controller state, parameters, route
@@ -121,7 +121,7 @@ def _orbited(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, radius: float, dt:
 
 @kernel
 def height_demand(ctl: np.ndarray, legs: np.ndarray, p: np.ndarray) -> float:
-    """Give the height to be at, up positive: linear along a line that begins at a waypoint, at once elsewhere [m].
+    """Return the height to be at, up positive: linear along a line that begins at a waypoint, at once elsewhere [m].
 
     Args:
         ctl, legs: controller state, route

@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def faults_of(args: argparse.Namespace, uavs: range) -> "dict[int, tuple[Fault, ...]]":
-    """Give the faults of the one aircraft that has any.
+    """Return the faults of the one aircraft that has any.
 
     Raises:
         ValueError: when a fault is none that such an aircraft can carry, or the aircraft is none of them.

@@ -88,6 +88,6 @@ def check(args: argparse.Namespace) -> None:
 
 
 def link(name: str, args: argparse.Namespace) -> str:
-    """Give the gateway's `--link` for one recording, by its name and --speed, --copies and --results."""
+    """Return the gateway's `--link` for one recording, by its name and --speed, --copies and --results."""
     path = quote(str(Path(name).resolve()), safe="/ ")
     return f"replay:{path}?speed={args.speed}&copies={args.copies}&results={int(args.results)}"

@@ -86,7 +86,7 @@ def machines(found: list[tuple[str, str, str, str]]) -> Table:
 
 
 def as_objects(rows: list[FleetRow]) -> list[dict[str, object]]:
-    """Give the rows as plain objects for JSON."""
+    """Return the rows as plain objects for JSON."""
     return [msgspec.to_builtins(row) for row in rows]
 
 

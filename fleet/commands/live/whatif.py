@@ -114,7 +114,7 @@ def ask(bus: Bus, uav: int, asked: WhatIf) -> Prediction | None:
 
 
 def as_object(made: Prediction) -> dict[str, object]:
-    """Give a prediction for JSON: places instead of arrays."""
+    """Return a prediction for JSON: places instead of arrays."""
     out = msgspec.to_builtins(made, builtin_types=(bytes,))
     places = to_geodetic(made.ned_origin(), made.path.numpy())
     for name in ("ahead", "path", "tube"):
@@ -141,7 +141,7 @@ def text(made: Prediction, usual: Prediction | None) -> str:
 
 
 def _apart(made: Prediction, usual: Prediction | None) -> np.ndarray | None:
-    """Give the distance to the usual prediction at the same times, (n,) [m]; nan where that does not reach."""
+    """Return the distance to the usual prediction at the same times, (n,) [m]; nan where that does not reach."""
     if usual is None or not usual.path.shape[0]:
         return None
     t = made.t + made.ahead.numpy().astype(float)

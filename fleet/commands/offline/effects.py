@@ -56,7 +56,7 @@ def _found(known: dict[str, Effect], name: str) -> Effect:
 
 
 def as_rows(effect: Effect) -> list[str]:
-    """Give the lines of one effect in the table, each cell wrapped in its own column."""
+    """Return the lines of one effect in the table, each cell wrapped in its own column."""
     cells = (
         [effect.name],
         [f"{effect.stage}, {effect.channel}"],
@@ -100,7 +100,7 @@ def _wrapped(head: str, text: str) -> list[str]:
 
 
 def summary(effect: Effect) -> str:
-    """Give the first sentence of the effect's file."""
+    """Return the first sentence of the effect's file."""
     own = [m for name, m in list(sys.modules.items()) if name.endswith(effect.name)]
     said = next((m.__doc__ for m in own if getattr(m, "EFFECT", None) is effect), None)
     return (said or "").strip().partition("\n")[0]

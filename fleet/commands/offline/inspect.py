@@ -140,7 +140,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _twin(path: Path) -> dict[str, Any]:
-    """Let a twin fly the recording in a process of its own; give its figures by UAV id, or a sentence."""
+    """Let a twin fly the recording in a process of its own; return its figures by UAV id, or a sentence."""
     with _folder() as folder:
         answer = folder / "twin.json"
         code, errors = run_to_end("twin_worker.evaluation.replay", str(path), "--json", str(answer))

@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 @contextlib.contextmanager
 def _recordings(args: argparse.Namespace, stop: Event) -> Iterator[list[Path]]:
-    """Give the recordings named, or fly some into a folder that is gone afterwards."""
+    """Return the recordings named, or fly some into a folder that is gone afterwards."""
     if args.file:
         yield args.file
         return

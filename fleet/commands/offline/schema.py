@@ -45,17 +45,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def topic_of(kind: type) -> str:
-    """Give the topic of a message class."""
+    """Return the topic of a message class."""
     return next(topic for topic, found in TOPICS.items() if found is kind)
 
 
 def wire_key(kind: type) -> str:
-    """Give the key with its variable chunk in braces."""
+    """Return the key with its variable chunk in braces."""
     return key(kind, "{uav}" if kind in PER_UAV else "{writer}")
 
 
 def summary(kind: type) -> str:
-    """Give the first sentence of a class."""
+    """Return the first sentence of a class."""
     return (kind.__doc__ or "").strip().splitlines()[0]
 
 
@@ -96,7 +96,7 @@ def as_text(kind: type) -> str:
 
 
 def fields_of(kind: type) -> list[str]:
-    """Give one line a field: name, type, default, meaning with unit."""
+    """Return one line a field: name, type, default, meaning with unit."""
     hints, lines = get_type_hints(kind, include_extras=True), []
     for field in msgspec.structs.fields(kind):
         hint = hints[field.name]

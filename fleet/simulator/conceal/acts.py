@@ -95,7 +95,7 @@ def _at_once(planned: Planned, fault: Fault, there: np.ndarray) -> tuple[float, 
 
 
 def _changed(uav: PretendUav, fault: Fault) -> np.ndarray:
-    """Give what one fault changes at this instant, columns as in `_AT_ONCE`."""
+    """Return what one fault changes at this instant, columns as in `_AT_ONCE`."""
     t, carried = uav.tick * DT, uav.carried
     assert carried is not None
     felt, blown = np.zeros(6), np.zeros(3)

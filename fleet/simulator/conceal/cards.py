@@ -19,7 +19,7 @@ _PROPELLER_M = {"c172p": 1.905, "small": 0.508}
 
 
 def card(airframe: str) -> dict[str, object]:
-    """Give the operator's card of an airframe in SI; throws in degrees."""
+    """Return the operator's card of an airframe in SI; throws in degrees."""
     kind = altered(airframe)
     aircraft = Aircraft(FIELD, 0, kind=kind)
     aircraft[f"inertia/pointmass-weight-lbs{kind.varied}"] = sum(kind.payload_kg) / 2 * KG_TO_LB

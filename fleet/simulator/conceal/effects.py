@@ -122,7 +122,7 @@ UNKNOWN: dict[str, Hidden] = {
 
 
 def told(name: str, airframe: str, values: Mapping[str, float]) -> Values:
-    """Give what a report should say, as far as the draw knows; a servo's lag is told with the healthy one's."""
+    """Return what a report should say, as far as the draw knows; a servo's lag is told with the healthy one's."""
     if name == "thrust_loss" and airframe == "small":
         return dict(values)
     if name == "actuator_lag":

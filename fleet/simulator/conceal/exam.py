@@ -27,7 +27,7 @@ Labels = dict[str, Label]
 def exam(
     seed: int, flights: int, out: Path, progress: Callable[[str, int, int], None] = lambda *_: None, jobs: int = 2
 ) -> Labels:
-    """Fly an examination into a folder and give its labels.
+    """Fly an examination into a folder and return its labels.
 
     Args:
         seed: draws everything

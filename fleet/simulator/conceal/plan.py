@@ -63,7 +63,7 @@ class Planned(NamedTuple):
 
 
 def quiet(airframe: str) -> Type:
-    """Give the type with knobs, and with everything off that may be hidden."""
+    """Return the type with knobs, and with everything off that may be hidden."""
     kind = altered(airframe)
     return kind._replace(settings=_QUIET) if kind.shipped else kind
 

@@ -77,7 +77,7 @@ def _laid(rows: list[_Row]) -> Log:
 
 
 def first_attitude(frames: Iterable[bytes]) -> float:
-    """Give the time stamp of the first ATTITUDE among MAVLink 2 frames, since boot [s]."""
+    """Return the time stamp of the first ATTITUDE among MAVLink 2 frames, since boot [s]."""
     stamps = (struct.unpack_from("<I", frame, 10)[0] for frame in frames if frame[7:10] == _ATTITUDE)
     return next(stamps) * 1e-3
 

@@ -61,7 +61,7 @@ def compounds(rng: np.random.Generator, airframe: str, n: int) -> list[Wanted]:
 
 
 def go_together(a: str, b: str) -> bool:
-    """Tell whether two effects can both be seen in one flight."""
+    """Return whether two effects can both be seen in one flight."""
     if {a, b} & _ALIKE:
         return False
     channels = {HIDDEN[a].channel, HIDDEN[b].channel}

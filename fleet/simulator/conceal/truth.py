@@ -50,21 +50,21 @@ def _measured(planned: Planned, fault: Fault, log: Log) -> dict[str, float]:
 
 
 def density_ratio(log: Log) -> float:
-    """Give air density over that of the standard day at the same height, mean over a flight."""
+    """Return air density over that of the standard day at the same height, mean over a flight."""
     height = log.height + FIELD.alt_mm * 1e-3
     standard = [pressure_at(h) / (_R * (_SEA_LEVEL_K - _LAPSE_K * h)) for h in height]
     return float(np.mean(log.rho / np.array(standard)))
 
 
 def thrust_lost(planned: Planned, fault: Fault) -> float:
-    """Give the share of thrust lost at the same throttle and speed, mean over a few of each."""
+    """Return the share of thrust lost at the same throttle and speed, mean over a few of each."""
     aircraft = Aircraft(FIELD, planned.seed, kind=quiet(planned.job.airframe))
     lost = [1 - _thrust(aircraft, v, u, fault) / _thrust(aircraft, v, u, None) for v in _SPEEDS for u in _THROTTLES]
     return float(np.mean(lost))
 
 
 def _thrust(aircraft: Aircraft, Va: float, delta_t: float, fault: Fault | None) -> float:
-    """Hold the engine at one throttle and about one speed until it turns steadily; give its thrust [lbf]."""
+    """Hold the engine at one throttle and about one speed until it turns steadily; return its thrust [lbf]."""
     name = aircraft.kind.strength
     usual = aircraft[name]
     aircraft.start(np.array([0.0, 0.0, -200.0]), 0.0, Va, (0.0, 0.0))

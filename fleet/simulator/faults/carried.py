@@ -17,7 +17,7 @@ class Carried:
     """The faults one aircraft carries."""
 
     def __init__(self, faults: Sequence[Fault], aircraft: Aircraft, tick_s: float, sense_s: float):
-        """Give every fault its place.
+        """Return every fault its place.
 
         Args:
             faults: what is wrong
@@ -43,18 +43,18 @@ class Carried:
             press(t, 0.0 if fault is without else fault.share(t))
 
     def wind(self, t: float, height: float) -> np.ndarray:
-        """Give the wind added, NED, (3,) [m/s]."""
+        """Return the wind added, NED, (3,) [m/s]."""
         return self._world.wind(t, height)
 
     def sense(self, t: float, e: Estimate) -> Estimate:
-        """Give what the autopilot believes."""
+        """Return what the autopilot believes."""
         for fault, spoil in self._spoils:
             good, e = e, spoil(e, fault.share(t))
             self.spoilt[fault] = numbers(e) - numbers(good)
         return e
 
     def move(self, t: float, commands: Commands) -> Commands:
-        """Give where surfaces and motor go."""
+        """Return where surfaces and motor go."""
         for fault, move in self._moves:
             told, commands = commands, move(t, fault.share(t), commands)
             self.moved[fault] = np.subtract(commands, told)

@@ -20,7 +20,7 @@ class Fault(NamedTuple):
         return id(self)
 
     def share(self, t: float) -> float:
-        """Give how much of it is there at `t` [s]: 0 nothing, 1 all.
+        """Return how much of it is there at `t` [s]: 0 nothing, 1 all.
 
         It steps or grows in a straight line; what passes rises and falls as (1 - cos) / 2.
         """

@@ -28,11 +28,11 @@ class Oddity:
         """Change the physics at `t` [s]."""
 
     def sense(self, e: Estimate, share: float) -> Estimate:
-        """Give what the autopilot believes."""
+        """Return what the autopilot believes."""
         return e
 
     def move(self, t: float, share: float, commands: Commands) -> Commands:
-        """Give where surfaces and motor go."""
+        """Return where surfaces and motor go."""
         return commands
 
 

@@ -111,6 +111,6 @@ class World:
                 self._aircraft[name] = value
 
     def wind(self, t: float, height: float) -> np.ndarray:
-        """Give the wind added at `t` [s] and `height` above home [m], NED, (3,) [m/s]."""
+        """Return the wind added at `t` [s] and `height` above home [m], NED, (3,) [m/s]."""
         blowing = [fault.share(t) * WINDS[fault.name](fault.values, height) for fault in self._winds]
         return np.sum([np.zeros(3), *blowing], axis=0)

@@ -35,7 +35,7 @@ def _gps_latency(fault: Fault, dt: float) -> Spoil:
 
 
 def _imu_misalignment(fault: Fault, dt: float) -> Spoil:
-    """Give rates and forces in the axes of a unit turned against the body by a rotation vector."""
+    """Return rates and forces in the axes of a unit turned against the body by a rotation vector."""
     turn = np.radians([fault.values.get(name, 0.0) for name in ("roll_deg", "pitch_deg", "yaw_deg")])
 
     def spoil(e: Estimate, share: float) -> Estimate:
@@ -46,7 +46,7 @@ def _imu_misalignment(fault: Fault, dt: float) -> Spoil:
 
 
 def _rotation(turn: np.ndarray) -> np.ndarray:
-    """Give the matrix that rotates by a rotation vector [rad], (3, 3): exp of its cross product matrix."""
+    """Return the matrix that rotates by a rotation vector [rad], (3, 3): exp of its cross product matrix."""
     angle = float(np.linalg.norm(turn))
     x, y, z = turn / angle if angle > 0 else turn
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

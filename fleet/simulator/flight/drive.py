@@ -61,7 +61,7 @@ def to_tlog(
 
 
 def _second(uav: PretendUav, link: Link, until: float) -> list[tuple[float, bytes]]:
-    """Fly to `until` [s] tick by tick and give what arrived on the ground."""
+    """Fly to `until` [s] tick by tick and return what arrived on the ground."""
     t = uav.tick * TICK_S
     while t < until - TICK_S / 2:
         t += TICK_S
@@ -70,7 +70,7 @@ def _second(uav: PretendUav, link: Link, until: float) -> list[tuple[float, byte
 
 
 def write(file: BinaryIO, pairs: list[tuple[float, bytes]]) -> int:
-    """Append frames to a .tlog, each with its time [s]; give how many."""
+    """Append frames to a .tlog, each with its time [s]; return how many."""
     for t, frame in sorted(pairs, key=lambda pair: pair[0]):
         file.write(struct.pack(">Q", EPOCH_US + round(t * 1e6)) + frame)
     return len(pairs)
@@ -137,11 +137,11 @@ class _Pace:
         self._told = False
 
     def due(self, now: float) -> float:
-        """Give the simulated time that is due at `now` [s, monotonic]."""
+        """Return the simulated time that is due at `now` [s, monotonic]."""
         return now - self._begun
 
     def next(self, now: float) -> float:
-        """Give the simulated time to go on to at `now` [s, monotonic]."""
+        """Return the simulated time to go on to at `now` [s, monotonic]."""
         late = self.due(now) - self.t - _LATE_S
         if late > 0:
             self._begun += late

@@ -42,7 +42,7 @@ class Link:
         return t >= self._fade[0]
 
     def receive(self, t: float) -> list[tuple[float, bytes]]:
-        """Give what has arrived by time `t`: arrival time [s] and frame, in order."""
+        """Return what has arrived by time `t`: arrival time [s] and frame, in order."""
         arrived = []
         while self._queue and self._queue[0][0] <= t:
             arrived.append(self._queue.popleft())

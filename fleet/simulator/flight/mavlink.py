@@ -58,7 +58,7 @@ class Voice:
         return packed
 
     def telemetry(self, tick: int, flight: Callable[[], Flight]) -> list[bytes]:
-        """Give the frames due at this tick of 10 ms; `flight` is asked only when one is."""
+        """Return the frames due at this tick of 10 ms; `flight` is asked only when one is."""
         due = [make for rate, phase, make in self._dialect.telemetry if (tick - phase) % round(TICK_HZ / rate) == 0]
         now = flight() if due else None
         frames = [self._frame(make(now)) for make in due if now is not None]
@@ -70,7 +70,7 @@ class Voice:
         return [self._frame(self._param(self._waiting.popleft())) for _ in range(count)]
 
     def hear(self, data: bytes, t: float) -> list[bytes]:
-        """Listen to bytes from the ground at `t` since boot [s] and give the answers; noise is passed over."""
+        """Listen to bytes from the ground at `t` since boot [s] and return the answers; noise is passed over."""
         try:
             messages: Iterable[Any] = self._in.parse_buffer(data) or ()
         except (mav.MAVError, ValueError):  # a wrong checksum, or text that is no text

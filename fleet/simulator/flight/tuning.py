@@ -178,7 +178,7 @@ _FUNCTIONS = {1: 4, 2: 19, 3: 70, 4: 21}  # SERVOn_FUNCTION: aileron, elevator, 
 
 
 def tuned(seed: int, autopilot: str = "ardupilot", aircraft: str = "small") -> dict[str, float]:
-    """Give the parameters of one aircraft in its autopilot's names and units.
+    """Return the parameters of one aircraft in its autopilot's names and units.
 
     Args:
         seed: draws what differs from one aircraft to the next

@@ -112,24 +112,24 @@ class PretendUav:
         self._ctl = laws.init(self._par, self._legs, 0, start, e.p, e.v, e.euler, e.Va, self._theta_c, self._delta_t)
 
     def _route(self, seq: int) -> tuple[np.ndarray, np.ndarray]:
-        """Unroll the mission from item `seq`; give its legs and where the first begins."""
+        """Unroll the mission from item `seq`; return its legs and where the first begins."""
         more = {"params": self.params, "limit": _LEGS_AHEAD, "first": self._first}
         way = legs_of.route(self.items, seq=seq, origin=self.origin, **more)  # type: ignore[arg-type]
         return way.legs, way.start
 
     def step(self, t: float) -> list[bytes]:
-        """Fly on to `t` [s] since the start and give the frames sent on the way."""
+        """Fly on to `t` [s] since the start and return the frames sent on the way."""
         frames: list[bytes] = []
         while self.tick < round(t * TICK_HZ) and not self.down:
             frames += self._tick()
         return frames
 
     def hear(self, data: bytes) -> list[bytes]:
-        """Listen to bytes from the ground; give the answers."""
+        """Listen to bytes from the ground; return the answers."""
         return self._voice.hear(data, self.boot_s + self.tick * DT)
 
     def introduce(self) -> list[bytes]:
-        """Give every frame a recording should begin with: version, mission, parameters."""
+        """Return every frame a recording should begin with: version, mission, parameters."""
         questions = Ground(self.uav_id + 1).questions(len(self.items))
         answers = [frame for question in questions for frame in self.hear(question)]
         return answers + self._voice.stream(len(self.params))
@@ -163,7 +163,7 @@ class PretendUav:
         self.aircraft.blow(*blowing)
 
     def _measure(self) -> Estimate:
-        """Give what the autopilot believes, faults and all."""
+        """Return what the autopilot believes, faults and all."""
         truth = self.aircraft.truth()
         e = self._sensors.measure(truth)
         if self._heights is not None:
@@ -223,7 +223,7 @@ class PretendUav:
         )
 
     def _xtrack(self) -> float:
-        """Give the distance right of the leg's line, or outside the circle [m]."""
+        """Return the distance right of the leg's line, or outside the circle [m]."""
         e, leg, ctl = self.now, self.leg, self._ctl
         centre = leg[legs_of.P_N : legs_of.P_D]
         if leg[legs_of.KIND] != legs_of.WAYPOINT:

@@ -30,7 +30,7 @@ _P_FACTOR = {"z": ("-1", "aero/alpha-rad"), "y": ("1", "aero/beta-rad")}  # thru
 
 
 def altered(name: str) -> Type:
-    """Give the type `name` of `types.TYPES` with knobs on it."""
+    """Return the type `name` of `types.TYPES` with knobs on it."""
     return TYPES[name]._replace(file=_file(name))
 
 

@@ -69,7 +69,7 @@ class _Walk:
         self.h = float(np.clip(self.h + climb, LOW_M * self._field.height, HIGH_M * self._field.height))
 
     def spot(self) -> tuple[float, float, float]:
-        """Give the current spot, NED from home [m]."""
+        """Return the current spot, NED from home [m]."""
         return self.n, self.e, -self.h
 
 

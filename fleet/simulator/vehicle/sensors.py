@@ -92,12 +92,12 @@ class Heights:
 
 
 def pressure_height(pressure: float) -> float:
-    """Give the height of a pressure [Pa] in the standard atmosphere [m], as an altimeter does."""
+    """Return the height of a pressure [Pa] in the standard atmosphere [m], as an altimeter does."""
     return float((1 - (pressure / _SEA_LEVEL_PA) ** (1 / _POWER)) / _LAPSE)
 
 
 def pressure_at(height: float) -> float:
-    """Give the standard atmosphere's pressure at a height [m], in [Pa]."""
+    """Return the standard atmosphere's pressure at a height [m], in [Pa]."""
     return float(_SEA_LEVEL_PA * (1 - _LAPSE * height) ** _POWER)
 
 

@@ -28,7 +28,7 @@ class GaussMarkov:
         self.x = sigma * rng.standard_normal(len(sigma))
 
     def step(self) -> np.ndarray:
-        """Advance by dt; give the new values (n,)."""
+        """Advance by dt; return the new values (n,)."""
         self.x = self._decay * self.x + self._kick * self._rng.standard_normal(len(self._kick))
         return self.x
 
@@ -67,7 +67,7 @@ class Wind:
         self._drift = GaussMarkov(rng, np.full(2, sigma), np.full(2, 90.0), dt)
 
     def step(self, height: float) -> tuple[float, float]:
-        """Advance by dt and give the wind, NED north and east, at `height` above ground [m/s]."""
+        """Advance by dt and return the wind, NED north and east, at `height` above ground [m/s]."""
         speed = self._mean * (max(height, 5.0) / REFERENCE_M) ** self._exponent
         d_n, d_e = self._drift.step()
         return speed * cos(self._towards) + d_n, speed * sin(self._towards) + d_e
@@ -87,7 +87,7 @@ def turbulence_level(text: str) -> int:
 
 
 def wind_at_20ft(level: int) -> float:
-    """Give the MIL-F-8785C wind at 20 ft for a severity [ft/s]: light 15 kt, moderate 30 kt, severe 45 kt.
+    """Return the MIL-F-8785C wind at 20 ft for a severity [ft/s]: light 15 kt, moderate 30 kt, severe 45 kt.
 
     Below 1000 ft it alone sets the intensity, sigma_w = 0.1 w_20. Source: MIL-F-8785C sec. 3.7.3.4.
     """

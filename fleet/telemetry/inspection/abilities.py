@@ -82,7 +82,7 @@ def _unidentified(axes: tuple[Ability, Ability]) -> str:
 
 
 def whole_spans(known: Survey) -> list[Span]:
-    """Give the stretches in which no needed kind of row has an interval too wide to fill."""
+    """Return the stretches in which no needed kind of row has an interval too wide to fill."""
     whole = [Span(-np.inf, np.inf)]
     for name in NEEDED:
         whole = overlap(whole, known.rows[name].stretches())
@@ -90,7 +90,7 @@ def whole_spans(known: Survey) -> list[Span]:
 
 
 def swings(known: Survey, spans: list[Span]) -> dict[str, float]:
-    """Give how much each input varies there, one standard deviation, share of its throw [-]."""
+    """Return how much each input varies there, one standard deviation, share of its throw [-]."""
     t, pulses = known.rows["servo"].rows()
     there = inside(t, spans)
     if there.sum() < 2:
@@ -100,7 +100,7 @@ def swings(known: Survey, spans: list[Span]) -> dict[str, float]:
 
 
 def most_within(spans: list[Span], length: float) -> float:
-    """Give the most that any `length` seconds hold of the spans [s]."""
+    """Return the most that any `length` seconds hold of the spans [s]."""
     best = 0.0
     for last in spans:
         start = last.stop - length
@@ -266,7 +266,7 @@ def _diagnose(known: Survey, flown: list[Span]) -> Ability:
 
 
 def _without_gaps(known: Survey, flown: list[Span]) -> list[Span]:
-    """Give the stretches in the air, without gaps of any needed kind, and without what begins and ends the rows."""
+    """Return the stretches in the air, without gaps of any needed kind, and without what begins and ends the rows."""
     ends = [known.rows[kind].rows()[0][[0, -1]] for kind in NEEDED]
     parts = overlap(flown, [Span(max(a for a, _ in ends) + _BEGIN_S, min(b for _, b in ends) - _END_S)])
     for kind in NEEDED:

@@ -188,7 +188,7 @@ def findings(known: Survey, facts: Facts) -> Findings:
 
 
 def happened(known: Survey, facts: Facts) -> list[Event]:
-    """Give the events in time order, the severe texts among them; a text that was also a sentence comes once."""
+    """Return the events in time order, the severe texts among them; a text that was also a sentence comes once."""
     texts = {text.strip(): t for t, severity, text in reversed(facts.texts) if severity <= _SEVERE}
     kept = [event for event in known.events if event.kind != "text" or event.text.strip() not in texts]
     severe = [Event(t, "text", text.strip()) for t, severity, text in facts.texts if severity <= _SEVERE]
@@ -200,7 +200,7 @@ def _since(known: Survey, t: float) -> float:
 
 
 def _in_air(known: Survey, name: str) -> np.ndarray:
-    """Give the rows of one kind flown in the air; all of them where it never was."""
+    """Return the rows of one kind flown in the air; all of them where it never was."""
     t, x = known.rows[name].rows()
     there = inside(t, airborne(known))
     return x[there] if there.any() else x
@@ -269,7 +269,7 @@ def _servos(known: Survey) -> tuple[Servo, ...]:
 
 
 def _sensor(known: Survey) -> tuple[str, str]:
-    """Tell whether there is an airspeed sensor, and what tells so."""
+    """Return whether there is an airspeed sensor, and what tells so."""
     for name in _SENSOR:
         if name in known.values:
             return "yes" if known.values[name] > 0 else "no", f"{name} is {known.values[name]:g}"

@@ -75,21 +75,21 @@ class Survey:
 
     @property
     def vehicle(self) -> str:
-        """Give the kind of vehicle, e.g. fixed_wing."""
+        """Return the kind of vehicle, e.g. fixed_wing."""
         return self.status.vehicle if self.status else "unknown"
 
     @property
     def items(self) -> tuple[Item, ...]:
-        """Give the mission items last on board."""
+        """Return the mission items last on board."""
         return self.mission.items if self.mission else ()
 
     @property
     def values(self) -> dict[str, float]:
-        """Give the autopilot parameters by name."""
+        """Return the autopilot parameters by name."""
         return self.params.values if self.params else {}
 
     def origin(self) -> Origin | None:
-        """Give the first place it was, as the origin of a local frame; None before any."""
+        """Return the first place it was, as the origin of a local frame; None before any."""
         _, x = self.rows["position"].rows()
         return Origin(*(int(v) for v in x[0])) if len(x) else None
 
@@ -142,12 +142,12 @@ def hear(known: Survey, message: Message) -> None:
 
 
 def _course(mission: Mission | None) -> list[tuple[int, int, int, float]]:
-    """Give what is flown: not home, which moves, nor frames and spare numbers, which autopilots send back changed."""
+    """Return what is flown: not home, which moves, nor frames and spare numbers, which autopilots send back changed."""
     return [(i.command, i.lat_e7, i.lon_e7, i.alt_m) for i in (mission.items[1:] if mission else ())]
 
 
 def _share(found: dict[int, Survey]) -> None:
-    """Give every aircraft its share of the rows kept."""
+    """Return every aircraft its share of the rows kept."""
     most = max(min(MOST, BUDGET // (len(COLUMNS) * len(found))), 1_000)
     for each in found.values():
         for kind in each.rows.values():
@@ -212,7 +212,7 @@ def _hear_params(known: Survey, params: Params) -> None:
 
 
 def armed_spans(known: Survey) -> list[Span]:
-    """Give the stretches it was armed; the whole recording where nothing is said of it."""
+    """Return the stretches it was armed; the whole recording where nothing is said of it."""
     if not any(armed for _, armed in known.armings):
         return [Span(known.begun, known.newest)]
     ends = [*(t for t, _ in known.armings[1:]), known.newest]
@@ -220,7 +220,7 @@ def armed_spans(known: Survey) -> list[Span]:
 
 
 def airborne(known: Survey) -> list[Span]:
-    """Give the stretches it was in the air, as speed and height tell."""
+    """Return the stretches it was in the air, as speed and height tell."""
     t_v, v = known.rows["velocity"].rows()
     t_p, p = known.rows["position"].rows()
     if not len(t_v) or not len(t_p):
@@ -251,7 +251,7 @@ def _bridged(t: np.ndarray, on: np.ndarray) -> list[Span]:
 
 
 def spells(known: Survey) -> list[tuple[Span, str]]:
-    """Give the modes with the stretch each was in force."""
+    """Return the modes with the stretch each was in force."""
     if not known.modes:
         return []
     ends = [*(t for t, _ in known.modes[1:]), known.newest]

@@ -20,7 +20,7 @@ class Span(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """Give the length [s]."""
+        """Return the length [s]."""
         return self.stop - self.start
 
 
@@ -52,7 +52,7 @@ class Thinned:
             self._settle()
 
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Give the kept rows, (m,) and (m, k)."""
+        """Return the kept rows, (m,) and (m, k)."""
         self._settle()
         if not self._kept:
             return np.zeros(0), np.zeros((0, 0), self.dtype)
@@ -62,26 +62,26 @@ class Thinned:
 
     @property
     def count(self) -> int:
-        """Give how many rows came, kept or not."""
+        """Return how many rows came, kept or not."""
         self._settle()
         return self._count
 
     @property
     def stride(self) -> int:
-        """Give of how many rows one is kept."""
+        """Return of how many rows one is kept."""
         self._settle()
         return self._stride
 
     @property
     def rate_hz(self) -> float:
-        """Give rows per second outside gaps; 0 while there are fewer than two."""
+        """Return rows per second outside gaps; 0 while there are fewer than two."""
         self._settle()
         usual = _edges() <= self._gap_s()
         seconds = float(self._seconds[usual].sum())
         return float(self._intervals[usual].sum()) / seconds if seconds else 0.0
 
     def gaps(self) -> list[Span]:
-        """Give the intervals that are gaps in time order, at most 1,000: wide for this kind, and three times the usual.
+        """Return intervals that are gaps in time order, at most 1,000: wide for this kind, and three times the usual.
 
         Wide for a kind is what breaks its stretches.
         """
@@ -90,13 +90,13 @@ class Thinned:
         return sorted(Span(start, start + length) for length, start in self._wide if length > limit)
 
     def stretches(self) -> list[Span]:
-        """Give the stretches of at least a second that no interval wider than `longest` breaks."""
+        """Return the stretches of at least a second that no interval wider than `longest` breaks."""
         self._settle()
         last = Span(float(self._open), float(self._last))
         return [*self._stretches, last] if last.seconds >= _SHORTEST_S else list(self._stretches)
 
     def _gap_s(self) -> float:
-        """Give the interval above which one is a gap [s]."""
+        """Return the interval above which one is a gap [s]."""
         n = self._intervals.sum()
         usual = _edges()[np.searchsorted(np.cumsum(self._intervals), 0.5 * n)] if n else 0.0
         return float(max(self.longest, 3 * usual))
@@ -146,12 +146,12 @@ class Thinned:
 
 
 def _edges() -> np.ndarray:
-    """Give the upper edge of each bin of intervals, (n,) [s]."""
+    """Return the upper edge of each bin of intervals, (n,) [s]."""
     return 10.0 ** (_LOWEST + (np.arange(_BINS) + 1) / _PER_DECADE)
 
 
 def overlap(one: list[Span], other: list[Span]) -> list[Span]:
-    """Give the stretches that lie in both, each list in time order."""
+    """Return the stretches that lie in both, each list in time order."""
     out, i, j = [], 0, 0
     while i < len(one) and j < len(other):
         both = Span(max(one[i].start, other[j].start), min(one[i].stop, other[j].stop))

@@ -20,7 +20,7 @@ _GIVEN = np.array([FIELDS.index(row.given) if row.given else NO_FIELD for row in
 
 
 def lay(frames: Frames, owner: np.ndarray, crafts: Sequence[Craft], flock: Flock) -> None:
-    """Give every aircraft its rows.
+    """Return every aircraft its rows.
 
     Args:
         frames: what was heard

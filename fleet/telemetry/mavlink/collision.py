@@ -23,7 +23,7 @@ class Collision:
         self._last, self._senders = arrival, (holder, second)
 
     def take(self, now: float) -> list[Alert]:
-        """Give what changed up to `now` [s since 1970]: the alarm, or its end."""
+        """Return what changed up to `now` [s since 1970]: the alarm, or its end."""
         on = self._since <= now <= self._last + QUIET_S
         if on == self._raised or now < self._since:
             return []

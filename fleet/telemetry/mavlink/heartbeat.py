@@ -34,7 +34,7 @@ _VEHICLE = {
 
 
 def is_aircraft(heartbeat: Any) -> bool:
-    """Tell whether this heartbeat comes from the autopilot of an aircraft."""
+    """Return whether this heartbeat comes from the autopilot of an aircraft."""
     return heartbeat.type in _VEHICLE and heartbeat.autopilot != dialect.MAV_AUTOPILOT_INVALID
 
 
@@ -54,7 +54,7 @@ def mode(heartbeat: Any) -> str:
 
 
 def armed(heartbeat: Any) -> bool:
-    """Tell whether the motors may turn."""
+    """Return whether the motors may turn."""
     return bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
 
 
@@ -71,5 +71,5 @@ def board(version: Any) -> str:
 
 
 def names_firmware(words: str) -> bool:
-    """Tell whether a text names autopilot and version, e.g. ArduPlane V4.7.0-dev (d55cb382)."""
+    """Return whether a text names autopilot and version, e.g. ArduPlane V4.7.0-dev (d55cb382)."""
     return words.startswith(("ArduPlane V", "ArduCopter V", "APM:", "PX4 v", "Blimp V", "ArduRover V"))

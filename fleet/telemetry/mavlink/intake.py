@@ -97,7 +97,7 @@ class Intake:
         return self._take(now)
 
     def sort(self, keep: bool = True) -> Frames | None:
-        """Find the frames in what was heard since the last time and give those admitted; None where there are none.
+        """Find the frames in what was heard since the last time and return those admitted; None where there are none.
 
         Args:
             keep: digest them at the next `flush`
@@ -221,7 +221,7 @@ class Intake:
         return owner
 
     def counters(self) -> Counter[str]:
-        """Give messages, bad_bytes and bad_frames over all senders."""
+        """Return messages, bad_bytes and bad_frames over all senders."""
         return self.decoder.counters()
 
     def _speaker(self, frames: Frames, which: np.ndarray) -> Craft | None:
@@ -291,7 +291,7 @@ class Intake:
         return True
 
     def _may_speak(self, craft: Craft, source: Hashable, arrival: float, count: int = 1) -> bool:
-        """Tell whether this is the one sender of its id; another takes over once that one is silent."""
+        """Return whether this is the one sender of its id; another takes over once that one is silent."""
         holder = self._claims.get(craft.uav, craft)
         if holder is craft and craft.source == source:
             return True
@@ -340,7 +340,7 @@ class Intake:
 
 
 def unpacked(news: list[News | Wire]) -> list[News]:
-    """Give what was packed as messages again."""
+    """Return what was packed as messages again."""
     return [one.message() if isinstance(one, Wire) else one for one in news]
 
 

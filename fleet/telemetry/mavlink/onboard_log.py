@@ -18,7 +18,7 @@ class Said(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """A stretch of a log; chunks follow each other in time, give or take a second."""
+    """A stretch of a log; chunks follow each other in time, return or take a second."""
 
     rows: Table
     said: list[Said]  # rising in time
@@ -37,4 +37,4 @@ class OnboardLog(Protocol):
     skipped: list[str]  # what could not be read and where, filled while reading
 
     def chunks(self) -> Iterator[Chunk]:
-        """Give the log from its beginning; may be called again."""
+        """Return the log from its beginning; may be called again."""

@@ -26,7 +26,7 @@ class Steps:
         self.gaps = 0  # silences longer than `SILENT_STEPS`
 
     def upto(self, arrival: np.ndarray) -> Iterator[tuple[float, list]]:
-        """Give the steps that are complete once these have arrived: (end of the step [s since 1970], news).
+        """Return the steps that are complete once these have arrived: (end of the step [s since 1970], news).
 
         Args:
             arrival: of everything new, never falling, (n,) [s since 1970]
@@ -48,7 +48,7 @@ class Steps:
             self._number = max(number, self._number)
 
     def last(self) -> Iterator[tuple[float, list]]:
-        """Give what is left at the end."""
+        """Return what is left at the end."""
         if self._first is not None:
             now = self._first + (self._number + 1) * STEP_S
             yield now, self._take(now)

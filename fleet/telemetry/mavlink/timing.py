@@ -52,7 +52,7 @@ class Timing:
             self._trips.append(back - sent)
 
     def told(self, now: float) -> dict[str, Any]:
-        """Give the fields of `Status` that tell of time; `now` is fleet time [s since 1970]."""
+        """Return the fields of `Status` that tell of time; `now` is fleet time [s since 1970]."""
         boot = self._clocks()[c.BOOT]
         self._look(boot, now)
         worst, boot[c.WORST] = float(boot[c.WORST]), 0.0
@@ -67,7 +67,7 @@ class Timing:
 
     @property
     def drift(self) -> float | None:
-        """Give what the clock loses on the fleet's [s/s]; None as long as that is not known well."""
+        """Return what the clock loses on the fleet's [s/s]; None as long as that is not known well."""
         if self._filter is None or sqrt(self._filter.P[1, 1]) > KNOWN:
             return None
         return float(self._filter.x[1, 0])
@@ -98,7 +98,7 @@ def _anchored(offset_s: float) -> KalmanFilter:
 
 
 def time(frames: Frames, owner: np.ndarray, timings: Sequence[Timing]) -> None:
-    """Give every aircraft what SYSTEM_TIME and the answers to TIMESYNC say.
+    """Return every aircraft what SYSTEM_TIME and the answers to TIMESYNC say.
 
     Args:
         frames: what was heard

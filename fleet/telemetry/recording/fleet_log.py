@@ -37,7 +37,7 @@ class Record(NamedTuple):
     stamp: Stamp | None = None
 
     def pack(self) -> bytes:
-        """Give the bytes in the file."""
+        """Return the bytes in the file."""
         named = self.encoding.removeprefix(_PREFIX).encode("ascii", "replace")[:255]
         epoch, writer = self.stamp or (0, 0)
         body = _BODY.pack(self.heard, epoch, writer, len(named)) + named + self.payload
@@ -59,7 +59,7 @@ class FleetLog:
         self.tangled = False  # the rest was left unread: too much begins like a record and is none
 
     def records(self) -> Iterator[tuple[int, Record]]:
-        """Give the sound records: (place in the file [bytes], record)."""
+        """Return the sound records: (place in the file [bytes], record)."""
         rest, place, vain = b"", 0, Vain(HOPELESS)
         with self._source.open() as stream:
             while True:

@@ -65,7 +65,7 @@ class FleetNews:
         return said
 
     def steps(self, results: bool = False) -> Iterator[tuple[float, list[Any]]]:
-        """Give the messages in steps of 0.1 s of the time they were heard: (end of the step [s since 1970], messages).
+        """Return messages in steps of 0.1 s of the time they were heard: (end of the step [s since 1970], messages).
 
         Args:
             results: give also what workers said: models, predictions, mismatches, alerts, fleet tables
@@ -118,7 +118,7 @@ class FleetNews:
         self._places.setdefault(why, place)
 
     def _in_force(self, message: Any, record: Record) -> bool:
-        """Tell whether the writer held the aircraft: readers keep the highest claim and drop the rest."""
+        """Return whether the writer held the aircraft: readers keep the highest claim and drop the rest."""
         uav = getattr(message, "uav", None)
         if uav is None or record.stamp is None:
             return True
@@ -129,7 +129,7 @@ class FleetNews:
 
 
 def renumbered(message: Any, number: Any) -> Any | None:
-    """Give a message another aircraft's id, in its sentences too; None where that is no id.
+    """Return a message another aircraft's id, in its sentences too; None where that is no id.
 
     Args:
         message: of the contract

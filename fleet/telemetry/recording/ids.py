@@ -16,7 +16,7 @@ class Ids:
         self._held: set[int] = set()
 
     def give(self, who: Hashable, wanted: int) -> int:
-        """Give `who` the id it has, else the wanted one, else the next free one above, else the first free one.
+        """Return `who` the id it has, else the wanted one, else the next free one above, else the first free one.
 
         Raises:
             ValueError: when none is left.

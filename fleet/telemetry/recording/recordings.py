@@ -74,7 +74,7 @@ class Recording:
         return [f"{self.name}: {sentence.removeprefix(f'{self.name}: ')}" for sentence in found if sentence]
 
     def steps(self, results: bool = False) -> Iterator[tuple[float, list[Any]]]:
-        """Give the recording in steps of 0.1 s: (end of the step [s since 1970], news).
+        """Return the recording in steps of 0.1 s: (end of the step [s since 1970], news).
 
         Args:
             results: give also what workers said then, where it was recorded

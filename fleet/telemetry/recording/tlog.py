@@ -41,7 +41,7 @@ class Tlog:
         return LOOK * self._source.share if self._looking else LOOK + (1 - LOOK) * self._source.share
 
     def batches(self) -> Iterator[Frames]:
-        """Give the frames in the time the flight took, even where a backlog arrived in a rush."""
+        """Return the frames in the time the flight took, even where a backlog arrived in a rush."""
         offset_s = backlog_offset(self._batches(Decoder()))
         batches = self._batches(self.decoder)
         yield from batches if offset_s is None else restamped(batches, offset_s)
@@ -53,7 +53,7 @@ class Tlog:
             self.skipped.append(f"hardly anything but damage to byte {self.tangled}, the rest was left unread; cut it")
 
     def _batches(self, decoder: Decoder) -> Iterator[Frames]:
-        """Give the frames with their arrival as it stands in the file, made to never fall."""
+        """Return the frames with their arrival as it stands in the file, made to never fall."""
         counts, self._first_bad = decoder.counts, None
         rest, last_t, place, line = b"", np.nan, 0, Line()
         with self._source.open() as stream:
@@ -95,7 +95,7 @@ class Line:
         self._shift = 0.0  # what is added to the stamps [s]
 
     def straight(self, t: np.ndarray) -> np.ndarray:
-        """Give times that never fall for stamps as they stand in the file, (n,) [s]."""
+        """Return times that never fall for stamps as they stand in the file, (n,) [s]."""
         raw = despiked(np.concatenate([[t[0] if self._raw is None else self._raw], t]))
         steps = np.diff(raw)
         shifts = self._shift + np.cumsum(np.where(steps < -BACK_S, -steps, 0.0))
@@ -125,7 +125,7 @@ def boot_s(frames: Frames) -> np.ndarray:
 
 
 def backlog_offset(batches: Iterator[Frames]) -> float | None:
-    """Give fleet time minus boot time of a recording that holds a backlog [s]; None where arrival can be trusted.
+    """Return fleet time minus boot time of a recording that holds a backlog [s]; None where arrival can be trusted.
 
     A radio that catches up writes minutes of flight into seconds of file; then arrival - boot falls by more than
     radios ever delay. Only for a single aircraft whose clock never goes back: otherwise nothing can be concluded.

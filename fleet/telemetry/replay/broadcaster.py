@@ -115,7 +115,7 @@ class Airing:
             self.trouble = f"{self.name}: found no aircraft in it, expected at least one heartbeat; check the file"
 
     def _rounds(self) -> Iterator[tuple[float, list[Said]]]:
-        """Give round by round: (recorded time [s since 1970], what is said now)."""
+        """Return round by round: (recorded time [s since 1970], what is said now)."""
         past: deque[list[Cut]] = deque(maxlen=GROUPS)  # newest first
         sources: deque[list[int]] = deque(maxlen=GROUPS)
         first, now = np.nan, 0.0
@@ -135,7 +135,7 @@ class Airing:
             yield now + lag * STEP_S, list(self._said(past, sources))
 
     def _said(self, past: deque[list[Cut]], sources: deque[list[int]]) -> Iterator[Said]:
-        """Give what originals say now, and copies a few steps later."""
+        """Return what originals say now, and copies a few steps later."""
         for lag, (cuts, systems) in enumerate(zip(past, sources, strict=True)):
             for one, system in zip(cuts, systems, strict=True):
                 cast = self._systems[system][lag::GROUPS]
@@ -144,7 +144,7 @@ class Airing:
                     yield recast(one, cast, aside), one
 
     def _meet(self, frames: Frames) -> None:
-        """Learn which aircraft there are; give them and their copies system ids."""
+        """Learn which aircraft there are; return them and their copies system ids."""
         new: set[int] = set()
         for heartbeat in frames.messages(np.flatnonzero(frames.at[:, ID] == IDS["HEARTBEAT"])):
             system = heartbeat.get_srcSystem()

@@ -58,7 +58,7 @@ class Prepared:
                 self._places.append((at - len(rows.x.data), rows.x.numpy()))
 
     def copies(self, group: Group) -> list[bytes]:
-        """Give the bytes of every copy."""
+        """Return the bytes of every copy."""
         out = np.tile(self._bytes, (len(group.ids), 1))
         _write(out, self._uav, group.ids[:, None].astype(">u4"))
         _write(out, self._t, np.full((len(out), 1), self.message.t + group.lag_s, ">f8"))
@@ -97,7 +97,7 @@ class Copies:
         self._ids[uav] = np.array(ids, np.int64)
 
     def step(self, news: Sequence[Message]) -> list[Wire]:
-        """Take what the originals said in one step of 0.1 s; give what copies say now."""
+        """Take what the originals said in one step of 0.1 s; return what copies say now."""
         if self.count < 2:
             return []
         if self._origin is None:
@@ -142,7 +142,7 @@ class Copies:
         return [encode(named(message, uav, t=t, **more.get(uav, {}))) for uav in group.ids.tolist()]
 
     def _missions(self, mission: Mission, group: Group) -> dict[int, tuple[Item, ...]]:
-        """Give every copy's items, moved once and kept as long as the list stays the same."""
+        """Return every copy's items, moved once and kept as long as the list stays the same."""
         known, moved = self._items.get(mission.uav, ((), {}))
         if known != mission.items:
             moved = {}

@@ -48,7 +48,7 @@ def cut(frames: Frames, which: np.ndarray) -> Cut:
 
 
 def recast(one: Cut, systems: np.ndarray, aside: Aside | None) -> np.ndarray:
-    """Give the bytes of the same frames from every other system, (n, b) uint8.
+    """Return the bytes of the same frames from every other system, (n, b) uint8.
 
     Args:
         one: the original's frames

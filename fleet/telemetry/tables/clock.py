@@ -58,7 +58,7 @@ def new_clocks() -> np.ndarray:
 
 @nb.njit(cache=True)
 def read(clock, raw_s, arrival, latest):
-    """Give the fleet time of a message [s since 1970]; nan while a jump is suspected.
+    """Return the fleet time of a message [s since 1970]; nan while a jump is suspected.
 
     Args:
         clock: state, changed in place, (LENGTH,)
@@ -103,7 +103,7 @@ def _at(clock, own_s):
 
 @nb.njit(cache=True)
 def now(clock, arrival):
-    """Give the fleet time of a message without a time of its own: the newest, moved on by at most 0.5 s."""
+    """Return the fleet time of a message without a time of its own: the newest, moved on by at most 0.5 s."""
     if isnan(clock[NEWEST]):
         clock[LATEST] = max(clock[LATEST], arrival)
         return arrival
@@ -140,7 +140,7 @@ def _follow(clock, delay, arrival, passed):
 
 @nb.njit(cache=True)
 def tell(clocks, tick, raw_s, arrival):
-    """Give the fleet time of one message of an aircraft [s since 1970]; nan while a jump is suspected.
+    """Return the fleet time of one message of an aircraft [s since 1970]; nan while a jump is suspected.
 
     Args:
         clocks: states, changed in place, (3, LENGTH)

@@ -58,7 +58,7 @@ def believable(field: str, values: np.ndarray) -> np.ndarray:
 
 
 def euler(q: Any) -> tuple[Any, ...]:
-    """Give phi theta psi [rad] of a quaternion's columns, scalar first, body -> NED.
+    """Return phi theta psi [rad] of a quaternion's columns, scalar first, body -> NED.
 
     Source: Beard & McLain eq. B.1.
     """

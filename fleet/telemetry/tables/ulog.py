@@ -96,7 +96,7 @@ def _pulses(m: Any) -> Any:
 
 
 def _widths(m: Any, middle: float, reach: float) -> tuple[Any, ...]:
-    """Give pulse widths [us] for a control of -1..1; not finite is not driven."""
+    """Return pulse widths [us] for a control of -1..1; not finite is not driven."""
     pulses = [np.where(np.isfinite(c), middle + reach * np.clip(c, -1, 1), 0.0) for c in m.control[:8]]
     return (*pulses, *([np.zeros_like(pulses[0])] * (8 - len(pulses))))
 

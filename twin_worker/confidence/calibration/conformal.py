@@ -13,7 +13,7 @@ from twin_worker.numerics.prediction_errors import QUANTILE
 
 
 def factors_of(ratio: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, float]:
-    """Give the factors that hold `QUANTILE` of the next predictions too, (3,), and the share that one axis holds.
+    """Return the factors that hold `QUANTILE` of the next predictions too, (3,), and the share that one axis holds.
 
     That share is `QUANTILE` where all axes err at once and its cube root where they are independent; both are nan where
     nothing is known.
@@ -33,7 +33,7 @@ def factors_of(ratio: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, float
 
 
 def _rank(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Give the share of the weight that lies below each value, (n,)."""
+    """Return the share of the weight that lies below each value, (n,)."""
     order = np.argsort(x)
     out = np.empty(len(x))
     out[order] = (np.cumsum(weight[order]) - 0.5 * weight[order]) / weight.sum()

@@ -19,14 +19,14 @@ Claims = tuple[np.ndarray, np.ndarray]  # tubes (s, k, 3) [m], horizons (s,) [s]
 
 
 def claimed(table: Table, scored: Scored) -> Claims:
-    """Give what a table alone claims of predictions."""
+    """Return what a table alone claims of predictions."""
     tube = table.half_axes(scored.doubt, AHEAD)
     ratio = growth(tube, scored.predicted_length) * np.interp(QUANTILE, LEVELS, table.risks)
     return tube, np.array([first_passage(one)[0] for one in ratio])
 
 
 def adapted(tables: Tables, scored: Scored) -> Claims:
-    """Give what a record claims that learns from each flight as it goes, predictions in the order they were made."""
+    """Return what a record claims that learns from each flight as it goes, predictions in the order they were made."""
     tube, horizon = np.empty(scored.path.shape), np.empty(len(scored))
     for flight in dict.fromkeys(scored.flight.tolist()):
         rows = np.flatnonzero(scored.flight == flight)
@@ -56,7 +56,7 @@ def _flight(scored: Scored) -> tuple[np.ndarray, np.ndarray]:
 
 
 def left_out(scored: Scored, group: str) -> Claims:
-    """Give what tables fitted without each flight (or each group, of a wider one) claim of it."""
+    """Return what tables fitted without each flight (or each group, of a wider one) claim of it."""
     folds = scored.folds(group)
     tube, horizon = np.empty(scored.path.shape), np.empty(len(scored))
     for fold in np.unique(folds):

@@ -28,7 +28,7 @@ _LEAST_M = 0.02  # smallest floor [m]
 
 
 def near(knot: float) -> np.ndarray:
-    """Give the columns of the look-ahead grid that speak for a knot."""
+    """Return the columns of the look-ahead grid that speak for a knot."""
     found = np.flatnonzero(np.abs(np.log(np.maximum(AHEAD, 1e-9) / knot)) <= np.log(_NEAR))
     return found[np.unique(np.linspace(0, len(found) - 1, _SPEAKERS).round().astype(int))]
 
@@ -49,7 +49,7 @@ def fit_sigma(doubt: Doubt, error: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _likeliest(s2: np.ndarray, r2: np.ndarray, e2: np.ndarray) -> np.ndarray:
-    """Give scale, lag and floor under errors with Student's t law of `_NU` degrees of freedom, (3,)."""
+    """Return scale, lag and floor under errors with Student's t law of `_NU` degrees of freedom, (3,)."""
     typical = max(float(np.sqrt(np.median(e2))), _LEAST_M)
     usual = np.array([0.0, _USUAL_LAG, np.log(_USUAL_FLOOR * typical)])
     parts = np.stack([s2, r2, np.ones_like(e2)])
@@ -90,7 +90,7 @@ def fit(scored: Scored, group: str) -> Table:
 
 
 def _scores(table: Table, ratio: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Give how the largest error over its half-axis was distributed, over all look-aheads, (20,)."""
+    """Return how the largest error over its half-axis was distributed, over all look-aheads, (20,)."""
     score = (ratio / at_look_aheads(AHEAD, table.factor)).max(axis=2)[:, 1:]
     known = np.isfinite(score)
     loud = np.where(known, weight[:, None], 0.0).reshape(1, -1)

@@ -48,7 +48,7 @@ class Scored:
         return replace(self, doubt=doubt, **{name: getattr(self, name)[rows] for name in ("path", "flown", *_ROWS)})
 
     def errors(self) -> np.ndarray:
-        """Give errors along, cross, vertical and the distance, nan where not followed, (s, k, 4) [m]."""
+        """Return errors along, cross, vertical and the distance, nan where not followed, (s, k, 4) [m]."""
         return axes_error(self.path, self.flown)
 
     def within(self, group: str) -> np.ndarray:
@@ -57,7 +57,7 @@ class Scored:
         return np.array([named[name] for name in self.group.tolist()], bool)
 
     def several(self, group: str) -> bool:
-        """Tell whether a table of a group would span several settings (law, airframe, parameters) worth the name."""
+        """Return whether a table of a group would span several settings (law, airframe, parameters) worth the name."""
         return ANY in group and len(set(self._settings().tolist())) > 1
 
     def folds(self, group: str) -> np.ndarray:
@@ -114,7 +114,7 @@ def _read(path: Path) -> Scored:
 
 
 def revisions(t0: np.ndarray, path: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Give the revision of each of s predictions of some flights, nan where it has none, (s, k, 3) [m]."""
+    """Return the revision of each of s predictions of some flights, nan where it has none, (s, k, 3) [m]."""
     out = np.full(path.shape, np.nan)
     for name in dict.fromkeys(flight.tolist()):
         earlier = Earlier()

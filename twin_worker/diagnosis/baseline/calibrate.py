@@ -59,7 +59,7 @@ def calibrate(flights: Sequence[Flight], card: Card, say: Say = lambda word: Non
 def settled(
     base: Baseline, cases: Sequence[Case], winds: Sequence[np.ndarray], say: Say, level: bool = False
 ) -> Baseline:
-    """Give the baseline with noise, spreads, usual residuals and chance learnt from flights left out.
+    """Return the baseline with noise, spreads, usual residuals and chance learnt from flights left out.
 
     Args:
         base: fitted on all
@@ -114,13 +114,13 @@ def _alike(cases: list[Case]) -> None:
 
 
 def halves(flight: Flight) -> list[Flight]:
-    """Give a flight's halves, each trusted where the other is not."""
+    """Return a flight's halves, each trusted where the other is not."""
     middle = np.median(flight.t[flight.ok])
     return [replace(flight, ok=flight.ok & side) for side in (flight.t < middle, flight.t >= middle)]
 
 
 def replaced(case: Case, base: Baseline) -> Case:
-    """Give a case with the noise and spread of another baseline."""
+    """Return a case with the noise and spread of another baseline."""
     own = replace(
         case.base, noise=base.noise, spread=base.spread, usual=base.usual, chance=base.chance, others=base.others
     )
@@ -148,7 +148,7 @@ def _with_noise(base: Baseline, cases: Sequence[Case], winds: Sequence[np.ndarra
 
 
 def _slopes(case: Case, granted: tuple[Guess, ...], rows: np.ndarray) -> np.ndarray:
-    """Give how residuals change with each nuisance, (n, c, nuisances)."""
+    """Return how residuals change with each nuisance, (n, c, nuisances)."""
     several = nuisances(case.base.vane)
     own = np.stack([(case.residuals((*granted, n.guess(n.step))) - rows) / n.step for n in several], axis=2)
     return np.concatenate([own, wandering(own, wanders(several, case.base.vane), case.t)], axis=2)
@@ -157,7 +157,7 @@ def _slopes(case: Case, granted: tuple[Guess, ...], rows: np.ndarray) -> np.ndar
 def _spreads(
     noise: Noise, cases: Sequence[Case], rows: list[np.ndarray], slopes: list[np.ndarray]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Learn the nuisances' standard deviations by expectation and maximisation; give them and each flight's values.
+    """Learn the nuisances' standard deviations by expectation and maximisation; return them and each flight's values.
 
     A nuisance that a flight says nothing about leaves its spread where it was.  Source: Dempster, Laird & Rubin 1977.
     """

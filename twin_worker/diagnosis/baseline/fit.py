@@ -114,11 +114,11 @@ class Rows:
         self.ok, self.whole = np.concatenate(ok), np.concatenate(whole)
 
     def told(self, x: np.ndarray) -> np.ndarray:
-        """Give measured less simulated on trusted rows, (m,)."""
+        """Return measured less simulated on trusted rows, (m,)."""
         return (self.y - self.A @ x)[self.ok]
 
     def whitener(self, x: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """Give the filter that whitens the residuals of these coefficients."""
+        """Return the filter that whitens the residuals of these coefficients."""
         e = self.y - self.A @ x
         lags = np.stack([np.roll(e, k) for k in range(1, _ORDER + 1)], axis=1)
         ar = np.linalg.lstsq(lags[self.whole], e[self.whole], rcond=None)[0]
@@ -126,7 +126,7 @@ class Rows:
 
 
 def _solve(rows: Rows, whitenings: int | None = None) -> tuple[np.ndarray, float]:
-    """Solve by generalised least squares; give coefficients and the share of variance explained.
+    """Solve by generalised least squares; return coefficients and the share of variance explained.
 
     The residuals of a flight in gusts, under an autopilot that answers them, are coloured, and plain least squares
     shrinks the derivatives: both sides are filtered by the residuals' own autoregression.
@@ -141,7 +141,7 @@ def _solve(rows: Rows, whitenings: int | None = None) -> tuple[np.ndarray, float
 
 
 def _surprise(rows: Rows) -> float:
-    """Give the logarithm of the innovations' variance after the fit."""
+    """Return the logarithm of the innovations' variance after the fit."""
     x, _ = _solve(rows, 1)
     return float(np.log(np.var(rows.whitener(x)(rows.y - rows.A @ x)[rows.whole])))
 
@@ -162,7 +162,7 @@ def _held(A: np.ndarray, y: np.ndarray, of: Rows, as_one: float) -> np.ndarray:
 
 
 def loose(cases: list[Case], winds: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """Give how drag's coefficients may be wrong together where flight does not tell: one standard deviation.
+    """Return how drag's coefficients may be wrong together where flight does not tell: one standard deviation.
 
     That of the elevator, held to what is usual, moves by its own doubt; those told only together with it follow.
     """
@@ -178,7 +178,7 @@ def loose(cases: list[Case], winds: Sequence[np.ndarray]) -> dict[str, np.ndarra
 
 
 def _airspeed(cases: list[Case], made: list[Terms]) -> float:
-    """Give reported over indicated airspeed."""
+    """Return reported over indicated airspeed."""
     if any("Va" not in case.flight.readings for case in cases):
         return 1.0
     rows = zip(cases, made, strict=True)
@@ -199,7 +199,7 @@ def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
     cases = [Case(flight, base) for flight in flights]
 
     def left(timing: Timing) -> dict[str, float]:
-        """Give what pitch and yaw leave unexplained, and axial force."""
+        """Return what pitch and yaw leave unexplained, and axial force."""
         timed = _with(cases, replace(base, timing=timing))
         made = [case.terms(wind(w)) for case, w in zip(timed, winds, strict=True)]
         along = axial(timed, made)
@@ -215,10 +215,10 @@ def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
 
 
 def pitch(cases: list[Case], made: list[Terms], coef: dict[str, np.ndarray], pull: float = RIDGE) -> Rows:
-    """Give the rows of the pitching moment, thrust's own among its terms."""
+    """Return the rows of the pitching moment, thrust's own among its terms."""
     return Rows(cases, made, "M", pull, more=lambda m: (coef["T"] @ m.terms["T"])[None])
 
 
 def axial(cases: list[Case], made: list[Terms], pull: float = RIDGE) -> Rows:
-    """Give the rows of axial force, drag's terms before those of thrust."""
+    """Return the rows of axial force, drag's terms before those of thrust."""
     return Rows(cases, made, "X", pull, more=lambda m: m.terms["T"])

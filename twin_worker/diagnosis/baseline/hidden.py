@@ -35,7 +35,7 @@ def check(names: Iterable[str]) -> None:
 
 
 def concealed(flight: Flight, names: Sequence[str], usual: Flight) -> Flight:
-    """Give a flight without some channels; an unknown command stands where it usually stood in `usual`."""
+    """Return a flight without some channels; an unknown command stands where it usually stood in `usual`."""
     if not names:
         return flight
     gone = {reading for name in names for reading in _READINGS.get(name, ())}
@@ -48,5 +48,5 @@ def concealed(flight: Flight, names: Sequence[str], usual: Flight) -> Flight:
 
 
 def deaf(base: Baseline, names: Iterable[str]) -> Baseline:
-    """Give a baseline that does not judge axes whose commands are concealed: it cannot tell what they should do."""
+    """Return a baseline that does not judge axes whose commands are concealed: it cannot tell what they should do."""
     return silenced(base, [_EQUATION[name] for name in names if name in _EQUATION])

@@ -54,7 +54,7 @@ class OwnPast:
 
 
 def later(report: Report, gone: Lost | None, until: float) -> Report:
-    """Give the report without what is strange in the trusted past only, and with what was held until then and lost.
+    """Return the report without what is strange in the trusted past only, and with what was held until then and lost.
 
     An effect that would have begun in the trusted past contradicts that trust: it is suspected, and no name. Turbulence
     has no onset, and gusts of a minute say nothing about the next: it is weather here, like the wind.

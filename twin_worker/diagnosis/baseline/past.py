@@ -84,12 +84,12 @@ def calibrate_past(
 
 
 def before(flight: Flight, until: float) -> Flight:
-    """Give the part of a flight before `until` [s, on its own clock]."""
+    """Return the part of a flight before `until` [s, on its own clock]."""
     return _part(flight, slice(0, int(np.searchsorted(flight.t, until))))
 
 
 def since(flight: Flight, start: float) -> Flight:
-    """Give the part of a flight from `start` on [s, on its own clock]."""
+    """Return the part of a flight from `start` on [s, on its own clock]."""
     return _part(flight, slice(int(np.searchsorted(flight.t, start)), None))
 
 
@@ -100,14 +100,14 @@ def _part(flight: Flight, rows: slice) -> Flight:
 
 
 def split(past: Flight, pieces: int = PIECES) -> list[Flight]:
-    """Give pieces of equal trusted length, each trusted where the others are not."""
+    """Return pieces of equal trusted length, each trusted where the others are not."""
     edges = np.quantile(past.t[past.ok], np.linspace(0.0, 1.0, pieces + 1)[1:-1])
     which = np.searchsorted(edges, past.t, side="right")
     return [replace(past, ok=past.ok & (which == k)) for k in range(pieces)]
 
 
 def _rows(cases: list[Case], made: list[Terms]) -> dict[str, Rows]:
-    """Give the rows of every equation that is fitted on its own."""
+    """Return the rows of every equation that is fitted on its own."""
     coef = cases[0].base.coef
     out = {name: Rows(cases, made, name) for name in ("alpha", "beta", "L", "N")}
     return out | {"X": axial(cases, made), "M": pitch(cases, made, coef)}
@@ -118,7 +118,7 @@ def _joined(coef: dict[str, np.ndarray], name: str) -> np.ndarray:
 
 
 def _foretold(cases: list[Case], winds: list[np.ndarray]) -> dict[str, float]:
-    """Give the share of variance of every equation that the other pieces foretell."""
+    """Return the share of variance of every equation that the other pieces foretell."""
     missed: dict[str, list[np.ndarray]] = {}
     told: dict[str, list[np.ndarray]] = {}
     for case, w in zip(cases, winds, strict=True):
@@ -130,7 +130,7 @@ def _foretold(cases: list[Case], winds: list[np.ndarray]) -> dict[str, float]:
 
 
 def _doubts(flight: Flight, past: Flight, base: Baseline, weather: np.ndarray) -> tuple[dict[str, np.ndarray], ...]:
-    """Give the directions in which coefficients may be wrong by one standard deviation, those the flight makes use of.
+    """Return directions in which coefficients may be wrong by one standard deviation, those the flight makes use of.
 
     The posterior of each equation's coefficients under a prior as wide as each term alone explaining everything,
     turned to the axes along which it is felt most on the whole flight.
@@ -161,12 +161,12 @@ def _direction(base: Baseline, name: str, d: np.ndarray) -> dict[str, np.ndarray
 
 
 def _without_baro(noise: Noise) -> Noise:
-    """Give the noise, the barometer's said to be anything: it drifts over minutes, pieces of the past are too short."""
+    """Return noise, the barometer's said to be anything: it drifts over minutes, pieces of the past are too short."""
     return Noise(noise.ar, np.where(np.arange(len(CHANNELS)) == CHANNELS.index("baro"), DEAF, noise.sigma))
 
 
 def _biases(case: Case, weather: np.ndarray) -> dict[str, float]:
-    """Give spreads as wide as the biases that sensors had in the past: they are no finding later."""
+    """Return spreads as wide as the biases that sensors had in the past: they are no finding later."""
     sight = Sight(case, wind(weather))
     floors = np.array([n.floor for n in sight.nuisances])
     sensors = np.array([n.effect.stage is Stage.SENSOR for n in sight.nuisances])
@@ -179,7 +179,7 @@ def _biases(case: Case, weather: np.ndarray) -> dict[str, float]:
 
 
 def _weather(case: Case, weather: np.ndarray) -> dict[str, float]:
-    """Give spreads that leave open what the past cannot tell: wind, and airspeed's scale without turns to and fro.
+    """Return spreads that leave open what the past cannot tell: wind, and airspeed's scale without turns to and fro.
 
     Airspeed on the headings and at the heights flown tells scale, wind and its growth with height together.
     """
@@ -196,7 +196,7 @@ def _weather(case: Case, weather: np.ndarray) -> dict[str, float]:
 
 
 def _chance(base: Baseline, longer: float) -> dict[str, float]:
-    """Give what the rest of the flight may reach by chance, pieces being so many times shorter.
+    """Return what the rest of the flight may reach by chance, pieces being so many times shorter.
 
     What acts all along acted in the past: it is part of the baseline.
     """

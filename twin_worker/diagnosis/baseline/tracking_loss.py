@@ -31,7 +31,7 @@ class Lost:
 
 
 def lost(flight: Flight, until: float) -> Lost | None:
-    """Give the first signal that left for good the range it kept before `until` [s, on the flight's clock]."""
+    """Return the first signal that left for good the range it kept before `until` [s, on the flight's clock]."""
     t = flight.t
     found = [one for name, x in _signals(flight).items() if (one := _left(name, t, x, flight.ok, until)) is not None]
     return min(found, key=lambda one: one.since, default=None)

@@ -45,7 +45,7 @@ class Card:
         return np.column_stack([u, (pulses[:, 2] - 1000.0) / 1000.0])
 
     def angles(self, surface: int) -> Callable[[np.ndarray], np.ndarray]:
-        """Give the function from command [-] to angle [rad] of one surface."""
+        """Return the function from command [-] to angle [rad] of one surface."""
         low, high = self.throw[surface]
         return lambda u: np.where(u > 0, high, low) * u
 

@@ -16,7 +16,7 @@ class When:
     T: float = 0.0
 
     def gate(self, t: np.ndarray) -> np.ndarray:
-        """Give what the parameters are multiplied by, 0..1, (n,)."""
+        """Return what the parameters are multiplied by, 0..1, (n,)."""
         if self.kind is Onset.ALWAYS:
             return np.ones_like(t)
         if self.kind is Onset.STEP:
@@ -26,7 +26,7 @@ class When:
 
     @property
     def size(self) -> int:
-        """Give how many numbers it takes."""
+        """Return how many numbers it takes."""
         return {Onset.ALWAYS: 0, Onset.STEP: 1}.get(self.kind, 2)
 
     def moved(self, dt: float) -> "When":
@@ -60,16 +60,16 @@ class Guess:
 
     @property
     def label(self) -> str:
-        """Give effect and what it befalls, e.g. `actuator_lag:elevator`."""
+        """Return effect and what it befalls, e.g. `actuator_lag:elevator`."""
         return f"{self.effect.name}:{self.of}" if self.of else self.effect.name
 
     @property
     def size(self) -> int:
-        """Give how many numbers it is charged for, those of its course included."""
+        """Return how many numbers it is charged for, those of its course included."""
         return self.effect.price + self.when.size
 
     def at(self, par: np.ndarray, when: When | None = None) -> "Guess":
-        """Give the same with other parameters, kept within what is physically possible."""
+        """Return the same with other parameters, kept within what is physically possible."""
         low, high = (np.array([getattr(p, side) for p in self.effect.parameters]) for side in ("low", "high"))
         within = np.clip(np.asarray(par, float), low, high)
         return replace(self, par=tuple(float(x) for x in within), when=when or self.when)

@@ -57,7 +57,7 @@ class Flight:
 
     @property
     def seconds(self) -> float:
-        """Give the length of what is trusted [s]."""
+        """Return the length of what is trusted [s]."""
         return float(self.ok.sum() * DT)
 
 
@@ -148,7 +148,7 @@ def _on(t: np.ndarray, rows: tuple[np.ndarray, np.ndarray], zero: float) -> np.n
 def _readings(
     rows: dict[str, tuple[np.ndarray, np.ndarray]], history: History, t: np.ndarray, zero: float, lacks: list[str]
 ) -> tuple[dict[str, np.ndarray], bool]:
-    """Give the readings on the grid, and whether the accelerometer is the vane."""
+    """Return the readings on the grid, and whether the accelerometer is the vane."""
     at, attitude = rows["attitude"]
     angles = np.column_stack([attitude[:, :2], np.unwrap(attitude[:, 2]), attitude[:, 3:]])
     out = dict(zip(("phi", "theta", "psi", "p", "q", "r"), _on(t, (at, angles), zero).T, strict=True))
@@ -187,7 +187,7 @@ def _readings(
 
 
 def _ground(history: History, h: np.ndarray, t: np.ndarray, zero: float) -> float:
-    """Give the height of home above mean sea level, else the least height flown [m]."""
+    """Return the height of home above mean sea level, else the least height flown [m]."""
     at, above = history.rows("height")
     if len(at) < 50:
         return float(h.min())

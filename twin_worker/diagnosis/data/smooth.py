@@ -17,12 +17,12 @@ REACH = _HALF + 1  # grid steps on both sides that a value depends on
 
 
 def smooth(x: np.ndarray) -> np.ndarray:
-    """Give x, (n,), filtered and thinned, (n_thin,)."""
+    """Return x, (n,), filtered and thinned, (n_thin,)."""
     return _thin(_LOW, x)
 
 
 def slope(x: np.ndarray) -> np.ndarray:
-    """Give dx/dt of x, (n,), filtered and thinned, (n_thin,) [1/s]."""
+    """Return dx/dt of x, (n,), filtered and thinned, (n_thin,) [1/s]."""
     return _thin(_SLOPE, x)
 
 
@@ -34,7 +34,7 @@ def slow(x: np.ndarray) -> np.ndarray:
 
 
 def thinned(x: np.ndarray) -> np.ndarray:
-    """Give every fifth value, as `smooth` does without filtering."""
+    """Return every fifth value, as `smooth` does without filtering."""
     return x[::EVERY]
 
 

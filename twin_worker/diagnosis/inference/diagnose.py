@@ -247,7 +247,7 @@ def _outcome(
 
 
 def _much(base: Baseline, one: Finding) -> float:
-    """Give the gain that is much for an effect: as far as it goes, by what nominal flights reach by chance."""
+    """Return the gain that is much for an effect: as far as it goes, by what nominal flights reach by chance."""
     if not base.vane:
         return _MUCH
     chance = max((x for kind, x in base.chance.items() if kind.startswith(f"{one.guess.label}|")), default=0.0)
@@ -255,7 +255,7 @@ def _much(base: Baseline, one: Finding) -> float:
 
 
 def _significant(one: Finding) -> bool:
-    """Tell whether any number that counts is larger than its doubt."""
+    """Return whether any number that counts is larger than its doubt."""
     counted = zip(one.guess.effect.parameters, one.guess.par, one.doubt, strict=True)
     return any(abs(x) > _DOUBT * doubt and not p.aside for p, x, doubt in counted)
 

@@ -9,7 +9,7 @@ from twin_worker.diagnosis.inference.validation.cross_validate import HELD
 
 
 def sentence(report: Report) -> Report:
-    """Give the report with its sentence written."""
+    """Return the report with its sentence written."""
     return replace(report, sentence=_said(report))
 
 

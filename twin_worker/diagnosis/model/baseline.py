@@ -41,7 +41,7 @@ class Noise:
 
 
 def no_noise() -> Noise:
-    """Give the whitener that does nothing."""
+    """Return the whitener that does nothing."""
     n = len(CHANNELS)
     return Noise(np.zeros((n, 2)), np.ones(n))
 
@@ -81,7 +81,7 @@ class Baseline:
     flights: tuple[str, ...] = ()
 
     def varied(self, k: int) -> "Baseline":
-        """Give the baseline with its coefficients moved towards those of the k-th left out."""
+        """Return the baseline with its coefficients moved towards those of the k-th left out."""
         coef = {name: x + self.others[k][name] for name, x in self.coef.items()}
         return replace(self, coef=coef)
 
@@ -93,7 +93,7 @@ DEAF = 1e6  # noise of a channel that says nothing
 
 
 def silenced(base: Baseline, equations: Iterable[str]) -> Baseline:
-    """Give a baseline in which some equations are not judged, their residuals counting for nothing."""
+    """Return a baseline in which some equations are not judged, their residuals counting for nothing."""
     sigma, r2 = base.noise.sigma.copy(), dict(base.r2)
     for name in equations:
         sigma[CHANNELS.index(SHOWN_BY[name])] = DEAF
@@ -102,5 +102,5 @@ def silenced(base: Baseline, equations: Iterable[str]) -> Baseline:
 
 
 def is_weather(base: Baseline) -> bool:
-    """Tell whether the nominal flights had wind, so that a mean wind is nobody's finding."""
+    """Return whether the nominal flights had wind, so that a mean wind is nobody's finding."""
     return max(base.spread.get(f"wind_steady:{axis}", 0.0) for axis in ("w_n", "w_e")) > WEATHER_MPS

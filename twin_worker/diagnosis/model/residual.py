@@ -24,7 +24,7 @@ Series = dict[str, np.ndarray]
 
 
 def density(h: Any) -> Any:
-    """Give the density of the standard atmosphere at height h [m], [kg/m3]."""
+    """Return the density of the standard atmosphere at height h [m], [kg/m3]."""
     return RHO_0 * np.clip(1.0 - 2.25577e-5 * h, 0.1, 2.0) ** 4.2559  # a free flight may stray beyond the air
 
 
@@ -62,7 +62,7 @@ class Case:
         return self._agreement(self._smooth)
 
     def agreement(self, s: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Give what only a sensor fault changes: body axes (3, 3, n), dV/dt less gravity in them (3, n) [m/s2], and
+        """Return what only a sensor fault changes: body axes (3, 3, n), dV/dt less gravity in them (3, n) [m/s2], and
         how far sensors disagree, (n, 6): channels gps_x to gyro_yaw.
         """
         return self._still if s is self._smooth else self._agreement(s)
@@ -78,7 +78,7 @@ class Case:
 
     @cached_property
     def trend(self) -> np.ndarray:
-        """Give the recorded barometer's offset, sea level pressure and lapse rate being unknown, (n,) [m]."""
+        """Return the recorded barometer's offset, sea level pressure and lapse rate being unknown, (n,) [m]."""
         h = self._smooth["h"]
         A = np.column_stack([np.ones_like(h), h - h.mean()])
         off = self._smooth["baro"] - self._smooth.get("gnss", h)
@@ -95,7 +95,7 @@ class Case:
         return out
 
     def surface(self, column: int, acting: Iterable[Guess]) -> np.ndarray:
-        """Give what one input does behind servo, lag and delay: angle [rad] or throttle, on the grid."""
+        """Return what one input does behind servo, lag and delay: angle [rad] or throttle, on the grid."""
         timing = self.base.timing
         u = np.ascontiguousarray(self.flight.commands[:, column], float)
         tau = timing.engine if column == 3 else timing.servo
@@ -115,7 +115,7 @@ class Case:
         return u if column == 3 else self.base.card.angles(column)(u)
 
     def sensed(self, guesses: tuple[Guess, ...]) -> Series:
-        """Give the smooth readings, guessed sensor faults undone."""
+        """Return the smooth readings, guessed sensor faults undone."""
         faults = [guess for guess in guesses if guess.effect.stage is Stage.SENSOR]
         if not faults:
             return self._smooth
@@ -134,7 +134,7 @@ class Case:
         return {**self._smooth, **self._filtered(changed)}
 
     def inputs(self, guesses: tuple[Guess, ...]) -> np.ndarray:
-        """Give aileron, elevator, rudder angle and throttle as they act, (4, n)."""
+        """Return aileron, elevator, rudder angle and throttle as they act, (4, n)."""
         acting = [guess for guess in guesses if guess.effect.stage is Stage.DELTA]
         if not acting:
             return self._delta
@@ -215,13 +215,13 @@ class Case:
         return Terms(flow, add, terms, measured, aside, scale)
 
     def residuals(self, guesses: tuple[Guess, ...] = ()) -> np.ndarray:
-        """Give measured less simulated, (n, channels)."""
+        """Return measured less simulated, (n, channels)."""
         made = self.terms(guesses)
         return channels(self, made)
 
 
 def channels(case: Case, made: Terms) -> np.ndarray:
-    """Give every channel's residual of what was laid out, (n, channels)."""
+    """Return every channel's residual of what was laid out, (n, channels)."""
     base, flow, add, aside = case.base, made.flow, made.add, made.aside
     q_S = made.scale["X"]
     T = (base.coef["T"] @ made.terms["T"]) * (1.0 + add.get("thrust", 0.0))
@@ -259,7 +259,7 @@ def channels(case: Case, made: Terms) -> np.ndarray:
 
 
 def valued(base: Baseline, add: Series, equation: str, terms: np.ndarray) -> np.ndarray:
-    """Give an equation's value, derivatives scattered by shares where so said, (n,)."""
+    """Return an equation's value, derivatives scattered by shares where so said, (n,)."""
     coef = base.coef[equation][: len(terms)]
     out = coef @ terms
     for k, name in enumerate(eq.TERMS[equation][: len(terms)]):
@@ -269,7 +269,7 @@ def valued(base: Baseline, add: Series, equation: str, terms: np.ndarray) -> np.
 
 
 def _turning(s: Series) -> np.ndarray:
-    """Give Euler rates less what the gyros make of them, (n, 3) [rad/s]."""
+    """Return Euler rates less what the gyros make of them, (n, 3) [rad/s]."""
     sf, cf, p, q, r = np.sin(s["phi"]), np.cos(s["phi"]), s["p"], s["q"], s["r"]
     turn = (q * sf + r * cf) / np.cos(s["theta"])
     rates = (s["phi_dot"] - p - np.sin(s["theta"]) * turn, s["theta_dot"] - (q * cf - r * sf), s["psi_dot"] - turn)

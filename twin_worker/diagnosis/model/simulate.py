@@ -90,13 +90,13 @@ class Simulation:
         return Runs(states, force, commands, speed, rho)
 
     def airspeed(self, x: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Give true airspeed, (runs,) [m/s], in states (10, runs) at times (runs,) [s]: what a pilot may go by."""
+        """Return true airspeed, (runs,) [m/s], in states (10, runs) at times (runs,) [s]: what a pilot may go by."""
         flow = Flow(t, x[9], x[9] - self.ground, self.base.card.body)
         self._gate(t)
         return np.sqrt(((x[:3] - self._wind(self._increments(flow, (Stage.AIR,)))) ** 2).sum(axis=0))  # type: ignore[no-any-return]
 
     def _share(self, dt: float) -> np.ndarray:
-        """Give how far servos and engine come to what is commanded within dt, (4, runs)."""
+        """Return how far servos and engine come to what is commanded within dt, (4, runs)."""
         timing = self.base.timing
         tau = np.array([timing.servo + timing.delay] * 3 + [timing.engine])
         share = np.repeat((1.0 - np.exp(-dt / np.maximum(tau, 1e-3)))[:, None], self.runs, axis=1)
@@ -246,7 +246,7 @@ class _Group:
             self._par = self._full * np.array(gates)
 
     def act(self, flow: Flow) -> dict[str, np.ndarray]:
-        """Give the increments of the runs it is at work in."""
+        """Return the increments of the runs it is at work in."""
         part = Flow(**{name: x[self.rows] if isinstance(x, np.ndarray) else x for name, x in flow.__dict__.items()})  # type: ignore[arg-type]
         return self.effect.act(part, *self._par, **self._of)  # type: ignore[no-any-return]
 

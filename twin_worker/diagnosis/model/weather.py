@@ -17,13 +17,13 @@ _STILL = np.array([0.5, 0.5, 100.0])  # how far a flight is held to that
 
 
 def wind(w: np.ndarray) -> tuple[Guess, ...]:
-    """Give a flight's own weather as guesses: wind, (2,) [m/s], and its growth with height, (2,) [m/s per 100 m]."""
+    """Return a flight's own weather as guesses: wind, (2,) [m/s], and its growth with height, (2,) [m/s per 100 m]."""
     known = catalogue()
     return Guess(known["wind_steady"], "", tuple(w[:2].tolist())), Guess(known["wind_shear"], "", tuple(w[2:].tolist()))
 
 
 def scale(cases: list[Case]) -> float:
-    """Give reported over indicated airspeed before anything else is known: on circles wind and scale come apart.
+    """Return reported over indicated airspeed before anything else is known: on circles wind and scale come apart.
 
     Started from a scale of one, the winds would take it up, and hand it on to the sideslip.
     """
@@ -70,5 +70,5 @@ def fit_wind(case: Case, w: np.ndarray) -> np.ndarray:
 
 
 def own_weather(case: Case) -> tuple[Guess, ...]:
-    """Give the flight's own mean wind as granted, where wind is weather."""
+    """Return the flight's own mean wind as granted, where wind is weather."""
     return wind(fit_wind(case, np.zeros(4))) if is_weather(case.base) else ()

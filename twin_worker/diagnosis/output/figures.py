@@ -34,7 +34,7 @@ _INKS = 96  # a picture of so many colours is a third as large, and a page holds
 
 
 def draw(report: Report, folder: Path, stem: str = "") -> list[Path]:
-    """Draw the pictures of one flight into a folder; give the files, in the order of `KINDS`.
+    """Draw the pictures of one flight into a folder; return the files, in the order of `KINDS`.
 
     Args:
         report: of the flight
@@ -62,7 +62,7 @@ def _save(figure: Figure, path: Path) -> None:
 
 
 def stems(flights: Sequence[str]) -> list[str]:
-    """Give every flight a name for its files that cannot leave the folder, no two alike."""
+    """Return every flight a name for its files that cannot leave the folder, no two alike."""
     out: list[str] = []
     for flight in flights:
         found, number = safe(flight)[:_LETTERS], 1

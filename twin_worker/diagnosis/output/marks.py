@@ -60,14 +60,14 @@ class Mark(NamedTuple):
         return found
 
     def begins(self, span: tuple[float, float]) -> list[float]:
-        """Give when it begins within the flight [s]; not where it was there all along."""
+        """Return when it begins within the flight [s]; not where it was there all along."""
         if self.onset is not None:
             return [self.onset]
         return [start for start, _ in self.segments if start > span[0] + _EDGE_S]
 
 
 def marks(report: Report) -> list[Mark]:
-    """Give what was located: a mark for every effect, and one for what stays unknown."""
+    """Return what was located: a mark for every effect, and one for what stays unknown."""
     found = [
         (one.guess.label, one.segments, None if one.guess.when.kind is Onset.ALWAYS else one.guess.when.t0)
         for one in report.findings
@@ -88,13 +88,13 @@ def times(segments: Segments) -> str:
 
 
 def runs(t: np.ndarray, held: np.ndarray) -> list[tuple[float, float]]:
-    """Give first and last time of every stretch of true rows, (n,) bool."""
+    """Return first and last time of every stretch of true rows, (n,) bool."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(int)))
     return [(float(t[i]), float(t[j - 1])) for i, j in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def span(series: Series) -> tuple[float, float]:
-    """Give the limits of the axis of time [s]."""
+    """Return the limits of the axis of time [s]."""
     return (float(series.t[0]), max(float(series.t[-1]), float(series.t[0]) + 1.0)) if len(series.t) else (0.0, 1.0)
 
 

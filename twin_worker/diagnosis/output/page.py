@@ -33,7 +33,7 @@ _CAPTIONS = (
 
 
 def write(reports: Sequence[Report], folder: Path) -> Path:
-    """Write a page for every flight with its figures inside, and an overview of several; give what to open first.
+    """Write a page for every flight with its figures inside, and an overview of several; return what to open first.
 
     Args:
         reports: one for each flight, in the order they shall appear
@@ -160,7 +160,7 @@ def amount(value: float, sigma: float) -> str:
 
 
 def unit(name: str, effect: Effect) -> str:
-    """Give the unit of a number: its name's suffix, or what the effect says of a parameter of that name."""
+    """Return the unit of a number: its name's suffix, or what the effect says of a parameter of that name."""
     suffix = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
     own = next((p.unit for p in effect.parameters if p.name == name), "")
     return suffix or own.removeprefix("-") or "–"

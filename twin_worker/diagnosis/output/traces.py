@@ -56,7 +56,7 @@ def chosen(report: Report) -> tuple[list[str], str]:
 
 
 def _trusted(report: Report, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Give a channel before and after, nan where rows are not trusted, (n,) each."""
+    """Return a channel before and after, nan where rows are not trusted, (n,) each."""
     series, c = report.series, CHANNELS.index(name)
     before, after = (np.where(series.ok, x[:, c], np.nan) for x in (series.before, series.after))
     return before, after

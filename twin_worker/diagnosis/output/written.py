@@ -19,7 +19,7 @@ def write(reports: Sequence[Report], path: Path) -> None:
 
 
 def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
-    """Give one report as plain values; suspicion is no name: verdict `none`, and candidates under `suspects`."""
+    """Return one report as plain values; suspicion is no name: verdict `none`, and candidates under `suspects`."""
     named = report.findings if report.outcome is Outcome.NAMED else ()
     located = [_located(one.channel, one.surface, one.segments) for one in named]
     if report.outcome is Outcome.UNKNOWN:

@@ -51,12 +51,12 @@ class Now:
 
     @property
     def p(self) -> np.ndarray:
-        """Give the newest position, NED, (3,) [m]."""
+        """Return the newest position, NED, (3,) [m]."""
         return self.flown.p[-1]
 
     @property
     def v(self) -> np.ndarray:
-        """Give the velocity now, NED, (3,) [m/s]."""
+        """Return the velocity now, NED, (3,) [m/s]."""
         return self.flown.v[-round(_VELOCITY_S / STEP) :].mean(axis=0)
 
 
@@ -106,7 +106,7 @@ def on_route_in_wind(now: Now) -> np.ndarray | None:
 
 
 def _level_speed(now: Now, points: np.ndarray) -> np.ndarray:
-    """Give the speed of what hangs on rotors: as commanded, else as flown."""
+    """Return the speed of what hangs on rotors: as commanded, else as flown."""
     return np.where(points[1:, 3] > 0, points[1:, 3], np.hypot(*now.v[:2]))
 
 
@@ -135,7 +135,7 @@ def _ride(now: Now, ground_speed: Callable[[np.ndarray], np.ndarray]) -> np.ndar
 
 
 def _line(now: Now) -> np.ndarray | None:
-    """Give the route ahead as points; None where the aircraft follows none, or which part of it is not known."""
+    """Return the route ahead as points; None where the aircraft follows none, or which part of it is not known."""
     twin = now.twin
     if twin.why_no_route() or twin.mission is None or twin.origin is None:
         return None

@@ -52,7 +52,7 @@ class Ride:
 
 
 def line(way: Route, ride: Ride) -> np.ndarray:
-    """Give the route from abreast of the aircraft on, points every few metres, (n, 4)."""
+    """Return the route from abreast of the aircraft on, points every few metres, (n, 4)."""
     parts, left = [], ride.length
     at = way.start if np.isfinite(way.start).all() else ride.past[0]
     at = _abreast(at, way.legs[0, P_N : P_D + 1], ride.p)
@@ -68,14 +68,14 @@ def line(way: Route, ride: Ride) -> np.ndarray:
 
 
 def _abreast(start: np.ndarray, end: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Give the point of a straight leg nearest to the aircraft, seen from above, (3,) [m]."""
+    """Return the point of a straight leg nearest to the aircraft, seen from above, (3,) [m]."""
     way = end - start
     share = (p[:2] - start[:2]) @ way[:2] / max(float(way[:2] @ way[:2]), 1e-6)
     return start + np.clip(share, 0.0, 1.0) * way
 
 
 def _leg(leg: np.ndarray, at: np.ndarray, after: np.ndarray | None, ride: Ride, *, first: bool) -> Iterator[np.ndarray]:
-    """Give the points of one leg, (n, 3) each part: the way there, then the circle."""
+    """Return the points of one leg, (n, 3) each part: the way there, then the circle."""
     target = leg[P_N : P_D + 1]
     if int(leg[KIND]) not in _CIRCLES:
         yield _straight(at, target, ride.length)
@@ -101,7 +101,7 @@ def _leg(leg: np.ndarray, at: np.ndarray, after: np.ndarray | None, ride: Ride, 
 
 
 def _straight(start: np.ndarray, end: np.ndarray, longest: float) -> np.ndarray:
-    """Give points from start towards end, no farther than is wanted, (n, 3) [m]."""
+    """Return points from start towards end, no farther than is wanted, (n, 3) [m]."""
     length = hypot(*(end - start)[:2])
     share = min(longest / max(length, 1e-6), 1.0)
     along = np.linspace(0.0, share, int(share * length / _STEP) + 2)[:, None]
@@ -109,7 +109,7 @@ def _straight(start: np.ndarray, end: np.ndarray, longest: float) -> np.ndarray:
 
 
 def _swept(past: np.ndarray, centre: np.ndarray, within: float) -> float:
-    """Give the angle already flown around a centre, since the circle was reached [rad]."""
+    """Return the angle already flown around a centre, since the circle was reached [rad]."""
     out = past[:, :2] - centre[:2]
     near = np.hypot(*out.T) < within
     on = out[int(np.argmax(near)) :] if near.any() else out[:0]
@@ -118,7 +118,7 @@ def _swept(past: np.ndarray, centre: np.ndarray, within: float) -> float:
 
 
 def _arc(leg: np.ndarray, R: float, at: np.ndarray, ride: Ride) -> float:
-    """Give the angle to circle by the item's own measure [rad]."""
+    """Return the angle to circle by the item's own measure [rad]."""
     kind = int(leg[KIND])
     if kind == LOITER_TURNS:
         return 2 * pi * leg[TURNS]
@@ -130,7 +130,7 @@ def _arc(leg: np.ndarray, R: float, at: np.ndarray, ride: Ride) -> float:
 
 
 def _to_tangent(angle: float, centre: np.ndarray, after: np.ndarray, circle: tuple[float, float]) -> float:
-    """Give how much further to circle until the course points at the next target [rad]."""
+    """Return how much further to circle until the course points at the next target [rad]."""
     R, side = circle
     out = after - centre[:2]
     leave = atan2(out[1], out[0]) - side * acos(R / max(hypot(*out), R))

@@ -49,7 +49,7 @@ def _against(ours: Scores, other: Scores) -> dict[str, Any]:
 def _difference(
     pairs: np.ndarray, flight: np.ndarray, middle: Callable[..., Any], *, better: float
 ) -> dict[str, float | str | None]:
-    """Give the difference of two middles, ours first, its 95 % interval over flights, and the verdict.
+    """Return the difference of two middles, ours first, its 95 % interval over flights, and the verdict.
 
     Args:
         pairs: ours and the other at each start, (s, 2)

@@ -61,17 +61,17 @@ class Log:
         self.status, self._armed = status, self._armed or status.armed
 
     def until(self, t: float) -> tuple[float, str]:
-        """Give the first event after `t` or the recording's end [s since 1970], and which it is."""
+        """Return the first event after `t` or the recording's end [s since 1970], and which it is."""
         after = [(self.ended_at(), "recording ends"), *((at, why) for at, why in self.events if at > t)]
         return min(after)
 
     def ended_at(self) -> float:
-        """Give the time of the last position [s since 1970]."""
+        """Return the time of the last position [s since 1970]."""
         t, _ = self._rows()
         return float(t[-1]) if len(t) else -np.inf
 
     def flown(self, origin: Origin, at: np.ndarray) -> np.ndarray:
-        """Give where it was at times `at`, NED, straight across holes, (n, 3) [m]."""
+        """Return where it was at times `at`, NED, straight across holes, (n, 3) [m]."""
         t, place = self._rows()
         return np.column_stack([np.interp(at, t, column) for column in to_ned(origin, *place.T).T])
 

@@ -43,13 +43,13 @@ class Scores:
     horizon: np.ndarray
 
     def at(self, seconds: float) -> int | None:
-        """Give the column of a look-ahead; None where predictions do not reach so far."""
+        """Return the column of a look-ahead; None where predictions do not reach so far."""
         found = np.flatnonzero(np.abs(self.ahead - seconds) < 0.5)
         return int(found[0]) if len(found) else None
 
     @property
     def inside(self) -> np.ndarray:
-        """Tell whether the flight was inside the tube on all axes, nan unknown, (s, k)."""
+        """Return whether the flight was inside the tube on all axes, nan unknown, (s, k)."""
         known = np.isfinite(self.error).all(axis=2) & np.isfinite(self.tube).all(axis=2)
         return np.where(known, (np.abs(self.error) <= self.tube).all(axis=2), np.nan)
 
@@ -92,12 +92,12 @@ def score(cases: Sequence[Case], method: str) -> Scores:
 
 
 def _displacement(case: Case) -> np.ndarray:
-    """Give the distance from the start, at least two seconds of ground speed, (k,) [m]."""
+    """Return the distance from the start, at least two seconds of ground speed, (k,) [m]."""
     return np.fmax(np.linalg.norm(case.flown - case.flown[0], axis=1), least_length(case.asked.speed))
 
 
 def passages(relative: np.ndarray, ahead: np.ndarray, limit: float) -> np.ndarray:
-    """Give the first passage of a limit by start and whether it is censored, (s, 2) [s, 0 or 1].
+    """Return the first passage of a limit by start and whether it is censored, (s, 2) [s, 0 or 1].
 
     Args:
         relative: relative errors, nan where not known, (s, k) [-]
@@ -112,7 +112,7 @@ def passages(relative: np.ndarray, ahead: np.ndarray, limit: float) -> np.ndarra
 
 
 def quantile(found: np.ndarray, share: float) -> float:
-    """Give the time at which a share of the starts has passed, by Kaplan and Meier [s].
+    """Return the time at which a share of the starts has passed, by Kaplan and Meier [s].
 
     Args:
         found: times and whether they are censored, (s, 2) [s, 0 or 1]
@@ -130,5 +130,5 @@ def quantile(found: np.ndarray, share: float) -> float:
 
 
 def surviving(found: np.ndarray, seconds: float) -> float:
-    """Give the share still within the limit after so long, every start followed so far; nan without starts."""
+    """Return the share still within the limit after so long, every start followed so far; nan without starts."""
     return float(np.mean(found[:, 0] >= seconds - 1e-6)) if len(found) else float("nan")

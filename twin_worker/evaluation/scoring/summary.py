@@ -18,7 +18,7 @@ _HEAD = ("t10", "t5", "t3")
 
 
 def summary(cases: Sequence[Case]) -> dict[str, Any]:
-    """Give the figures of every method by its name, then how ours compares, and what was not counted.
+    """Return the figures of every method by its name, then how ours compares, and what was not counted.
 
     Keys: every method's name; `compare`, by method; `apart`, starts that do not count, by reason.
     """
@@ -34,7 +34,7 @@ def summary(cases: Sequence[Case]) -> dict[str, Any]:
 
 
 def figures(found: Scores) -> dict[str, Any]:
-    """Give the figures of one method."""
+    """Return the figures of one method."""
     look = {str(s): column for s in LOOK_S if (column := found.at(s)) is not None}
     stand_ins = Counter(found.made_by.tolist())
     out: dict[str, Any] = {}
@@ -57,7 +57,7 @@ def figures(found: Scores) -> dict[str, Any]:
 
 
 def _trust(found: Scores, look: dict[str, int]) -> dict[str, Any]:
-    """Give coverage, size of the tube, and what the horizon was worth; null where the method claims nothing."""
+    """Return coverage, size of the tube, and what the horizon was worth; null where the method claims nothing."""
     inside = found.inside
     by_flight = [inside[found.flight == name] for name in np.unique(found.flight)]
     worst = {s: min((_mean(rows[:, k]) for rows in by_flight), default=np.nan) for s, k in look.items()}
@@ -74,7 +74,7 @@ def _trust(found: Scores, look: dict[str, int]) -> dict[str, Any]:
 
 
 def _horizon(found: Scores) -> tuple[float, float]:
-    """Give the share that stayed within 10 % up to its horizon, and Spearman's correlation of horizon and passage.
+    """Return the share that stayed within 10 % up to its horizon, and Spearman's correlation of horizon and passage.
 
     A horizon beyond what was followed is judged up to there.
     """
@@ -91,7 +91,7 @@ def _horizon(found: Scores) -> tuple[float, float]:
 
 
 def _phases(found: Scores, phases: np.ndarray) -> dict[str, Any]:
-    """Give passages and errors by the phase flown next."""
+    """Return passages and errors by the phase flown next."""
     out = {}
     for phase in MODES:
         if not (rows := phases == phase).any():
@@ -110,7 +110,7 @@ def _phases(found: Scores, phases: np.ndarray) -> dict[str, Any]:
 
 
 def _apart(cases: Sequence[Case]) -> dict[str, Any]:
-    """Give how many starts do not count and how ours fared at them while it could be followed, by reason."""
+    """Return how many starts do not count and how ours fared at them while it could be followed, by reason."""
     out = {}
     for why, n in Counter(case.apart for case in cases if case.apart).most_common():
         its = score([case for case in cases if case.apart == why], "ours")
@@ -120,7 +120,7 @@ def _apart(cases: Sequence[Case]) -> dict[str, Any]:
 
 
 def _followed(found: Scores) -> float | None:
-    """Give the longest any start was followed [s]."""
+    """Return the longest any start was followed [s]."""
     known = np.isfinite(found.distance).any(axis=0)
     return _round(float(found.ahead[known][-1])) if known.any() else None
 

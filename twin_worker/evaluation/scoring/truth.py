@@ -60,6 +60,6 @@ def _phase(log: Log, asked: Asked) -> str:
 
 
 def _route(log: Log, asked: Asked) -> np.ndarray:
-    """Give the corners of the whole mission, for pictures only, (n, 3) [m]."""
+    """Return the corners of the whole mission, for pictures only, (n, 3) [m]."""
     legs = route(log.items, seq=1, origin=asked.origin, params={}).legs if len(log.items) > 1 else np.empty((0, 9))
     return legs[:, P_N : P_D + 1]

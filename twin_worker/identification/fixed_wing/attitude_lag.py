@@ -75,7 +75,7 @@ def identify(command: np.ndarray, y: np.ndarray, near: np.ndarray | None = None)
 
 
 def _cost(miss: np.ndarray, lag: np.ndarray, weight: float) -> float:
-    """Give Huber's cost of the misses and of the way from the prior."""
+    """Return Huber's cost of the misses and of the way from the prior."""
     far = _FAR * weight * _NOISE
     size = np.abs(miss)
     huber = np.where(size < far, size**2, far * (2 * size - far)).sum()

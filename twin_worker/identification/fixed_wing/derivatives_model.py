@@ -49,7 +49,7 @@ class Coupled:
 
     @property
     def covariance(self) -> np.ndarray:
-        """Give the covariance of the parameters, (37, 37)."""
+        """Return the covariance of the parameters, (37, 37)."""
         return np.linalg.inv(self.information + self.precision)
 
     def fly(self, x0: np.ndarray, delta: np.ndarray, dt: float) -> np.ndarray:
@@ -106,7 +106,7 @@ def _good(found: Found) -> bool:
 def _held(
     window: Window, wind: np.ndarray, airframe: Airframe, last: Coupled | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Give mean and precision the parameters are held by, U0 W0, and what the airframe alone says.
+    """Return mean and precision the parameters are held by, U0 W0, and what the airframe alone says.
 
     Of what the last model's data said, the share from before this window counts, and fades: none is counted twice.
     """

@@ -27,7 +27,7 @@ _SPANS = 0.3, 20.0  # believable [m]
 
 
 def prior(airframe: Airframe, at: np.ndarray, trim: np.ndarray, wind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give mean and standard deviation of the parameters of `fleet.physics.wrench`, each (37,).
+    """Return mean and standard deviation of the parameters of `fleet.physics.wrench`, each (37,).
 
     Args:
         airframe: what is known of the aircraft, or a class; one without a span is scaled as its speed suggests
@@ -58,7 +58,7 @@ def prior(airframe: Airframe, at: np.ndarray, trim: np.ndarray, wind: np.ndarray
 
 
 def _scale(name: str, k: float, l: float) -> float:
-    """Give the factor from the class's speed and span to the aircraft's."""
+    """Return the factor from the class's speed and span to the aircraft's."""
     force, per = name[0] in "XYZ", name[2:]
     if per in ("q", "p", "r"):
         return k * k / l if force else k

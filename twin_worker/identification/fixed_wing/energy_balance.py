@@ -60,18 +60,18 @@ def ridge(X: np.ndarray, y: np.ndarray, prior: tuple[np.ndarray, np.ndarray, flo
 
 
 def mean(x: np.ndarray) -> np.ndarray:
-    """Give the moving mean over `_OVER` steps, (n - _OVER,)."""
+    """Return the moving mean over `_OVER` steps, (n - _OVER,)."""
     total = np.concatenate([[0.0], np.cumsum(x)])
     return ((total[_OVER:] - total[:-_OVER]) / _OVER)[: len(x) - _OVER]
 
 
 def slope(x: np.ndarray) -> np.ndarray:
-    """Give the slope over `_OVER` steps, (n - _OVER,) [1/s]."""
+    """Return the slope over `_OVER` steps, (n - _OVER,) [1/s]."""
     return (x[_OVER:] - x[:-_OVER]) / (_OVER * STEP)
 
 
 def load(phi: np.ndarray) -> np.ndarray:
-    """Give the load factor of a level turn [-]."""
+    """Return the load factor of a level turn [-]."""
     return 1.0 / np.cos(np.clip(phi, -_BANK, _BANK))
 
 
@@ -89,7 +89,7 @@ def lifting(flight: Flight, V_0: float) -> Ridge:
 
 
 def _budget(flight: Flight, t_0: float, V_0: float) -> tuple[np.ndarray, np.ndarray]:
-    """Give what c_0 c_t c_v c_n are multiplied by, (n, 4), and the excess power that was had, (n,) [m/s2]."""
+    """Return what c_0 c_t c_v c_n are multiplied by, (n, 4), and the excess power that was had, (n,) [m/s2]."""
     V = mean(flight.V)
     y = slope(0.5 * flight.V**2 + G * flight.h) / np.maximum(V, 5.0)
     n = mean(load(flight.phi) ** 2 - 1.0)
@@ -97,7 +97,7 @@ def _budget(flight: Flight, t_0: float, V_0: float) -> tuple[np.ndarray, np.ndar
 
 
 def missed(flight: Flight, c: np.ndarray, t_0: float, V_0: float) -> np.ndarray:
-    """Give the excess power that was had beyond what c, (4,), foretells, (n,) [m/s2]."""
+    """Return the excess power that was had beyond what c, (4,), foretells, (n,) [m/s2]."""
     X, y = _budget(flight, t_0, V_0)
     return y - X @ c  # type: ignore[no-any-return]
 

@@ -102,7 +102,7 @@ class _Search:
         self.trial, self.nothing = np.empty_like(self.e), np.empty((0, 9, N_COLUMN))
 
     def fly(self, par: np.ndarray, starts: np.ndarray, W: np.ndarray, slopes: bool) -> float:
-        """Give the cost at a point; with `slopes` the residuals and sensitivities are kept."""
+        """Return the cost at a point; with `slopes` the residuals and sensitivities are kept."""
         one = self.problem
         e, J = (self.e, self.J) if slopes else (self.trial, self.nothing)
         squares = sweep(par, starts, one.segments, one.y, one.delta, one.at, one.dt, np.sqrt(W), e, J)
@@ -118,14 +118,14 @@ class _Search:
         return fresh
 
     def cost(self, par: np.ndarray, starts: np.ndarray) -> float:
-        """Give the cost of the residuals that are kept."""
+        """Return the cost of the residuals that are kept."""
         off, away = par - self.par0, starts - self.prior
         return self.problem.discount * float((self.e**2).sum()) + float(
             off @ self.Lambda @ off + (self.K * away**2).sum()
         )
 
     def normal(self, par: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Give information and slope of the parameters, start states eliminated, and what gives those back.
+        """Return information and slope of the parameters, start states eliminated, and what gives those back.
 
         That is of each segment the move of its start, less what a move of the parameters takes, (m, 9, 37 + 1).
         """

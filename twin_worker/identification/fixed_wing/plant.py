@@ -27,7 +27,7 @@ def method(plant: Plant) -> str:
 
 
 def finite(plant: Plant) -> bool:
-    """Tell whether every number of it is finite."""
+    """Return whether every number of it is finite."""
     parts = (plant.par,) if isinstance(plant, Coupled) else [axis.D for axis in plant]
     return all(bool(np.isfinite(part).all()) for part in parts)
 
@@ -63,7 +63,7 @@ def _level(plant: Coupled, recent: Window) -> np.ndarray:
 
 @nb.njit(cache=True, nogil=True)
 def _add_rates(y: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, total: np.ndarray) -> int:
-    """Add x' of every `_EVERY`th row to `total`, (9,); give how many that are."""
+    """Add x' of every `_EVERY`th row to `total`, (9,); return how many that are."""
     rate, rows = np.empty(9), range(0, len(y), _EVERY)
     for k in rows:
         rates_of_change(y[k], delta[k], par, at, rate)
@@ -72,7 +72,7 @@ def _add_rates(y: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray
 
 
 def _centred(axis: Axis, recent: Window) -> np.ndarray:
-    """Give [A B c] of an axis with c moved by its mean one-step miss."""
+    """Return [A B c] of an axis with c moved by its mean one-step miss."""
     D = axis.physical()
     y = recent.columns(axis.states) - axis.y_mean
     z = np.column_stack([y, recent.columns(axis.inputs) - axis.u_mean, np.ones(len(y))])
@@ -81,6 +81,6 @@ def _centred(axis: Axis, recent: Window) -> np.ndarray:
 
 
 def acting(good: Window) -> np.ndarray:
-    """Give the inputs in force at the end, in the order of `INPUTS`, (4,)."""
+    """Return the inputs in force at the end, in the order of `INPUTS`, (4,)."""
     assert good.u.shape[1] == len(INPUTS)
     return lagged(good.u[-50:], good.dt, TAU)[-1]

@@ -54,7 +54,7 @@ def flight_of(good: Window, history: History, scale: float) -> Flight:
 
 
 def airspeed_of(good: Window, history: History, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Give rows of `lags.STEP`, newest last, (n,) [s], and the true airspeed at each, (n,) [m/s]; as `flight_of`."""
+    """Return rows of `lags.STEP`, newest last, (n,) [s], and the true airspeed at each, (n,) [m/s]; as `flight_of`."""
     at = good.t[-1] - attitude_lag.STEP * np.arange(int(good.seconds / attitude_lag.STEP) + 1)[::-1]
     t_air, air = history.look("air", at[0] - 2.0)
     if len(t_air) > 1 and float(air[:, 0].max()) > 3.0:
@@ -63,7 +63,7 @@ def airspeed_of(good: Window, history: History, scale: float) -> tuple[np.ndarra
 
 
 def _climb(h_c: np.ndarray) -> np.ndarray:
-    """Give the smoothed slope of the demanded height, (n,) [m/s]; a step counts as a climb."""
+    """Return the smoothed slope of the demanded height, (n,) [m/s]; a step counts as a climb."""
     wide = np.pad(h_c, _SMOOTH // 2, mode="edge")
     return np.clip(
         np.gradient(np.convolve(wide, np.ones(_SMOOTH) / _SMOOTH, "valid")[: len(h_c)], attitude_lag.STEP), -5.0, 5.0
@@ -71,7 +71,7 @@ def _climb(h_c: np.ndarray) -> np.ndarray:
 
 
 def _commands(history: History, at: np.ndarray) -> np.ndarray:
-    """Give what the autopilot reports to aim at, held for at most a second, nan where missing, (n, 5)."""
+    """Return what the autopilot reports to aim at, held for at most a second, nan where missing, (n, 5)."""
     t, x = history.look("command", at[0] - 2.0)
     if not len(t):
         return np.full((len(at), 5), np.nan)

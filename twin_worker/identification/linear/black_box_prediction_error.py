@@ -76,7 +76,7 @@ def normal_equations(
 def squared_errors(
     F: np.ndarray, G: np.ndarray, C: np.ndarray, x0: np.ndarray, y: np.ndarray, w: np.ndarray
 ) -> np.ndarray:
-    """Give only the squared errors of the same run, (l,)."""
+    """Return only the squared errors of the same run, (l,)."""
     squares, x = np.zeros(len(C)), x0.copy()
     for k in range(len(y)):
         if np.isfinite(y[k]).all():

@@ -37,16 +37,16 @@ class Axis:
 
     @property
     def means(self) -> np.ndarray:
-        """Give the means of states and inputs, (n + m,)."""
+        """Return the means of states and inputs, (n + m,)."""
         return np.concatenate([self.y_mean, self.u_mean])
 
     def scaled(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
-        """Give the window's outputs (N, n) and inputs (N, m) in the model's units."""
+        """Return the window's outputs (N, n) and inputs (N, m) in the model's units."""
         y = (window.columns(self.states) - self.y_mean) / self.y_scale
         return y, (window.columns(self.inputs) - self.u_mean) / self.u_scale
 
     def physical(self) -> np.ndarray:
-        """Give [A B c] for unscaled deviations from trim, x' = A x + B u + c, (n, n + m + 1)."""
+        """Return [A B c] for unscaled deviations from trim, x' = A x + B u + c, (n, n + m + 1)."""
         n, m = len(self.y_mean), len(self.u_mean)
         right = np.concatenate([self.y_scale, self.u_scale, [1.0]])
         assert self.D.shape == (n, n + m + 1)

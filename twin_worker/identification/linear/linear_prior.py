@@ -41,7 +41,7 @@ _OFFSET = {"u": 2.0, "w": 3.0, "q": 3.0, "p": 3.0, "r": 2.0, "v": 2.0, "theta": 
 
 
 def prior(axis: str, U0: float, W0: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Give mean and standard deviation of [A B c] for a generic small fixed wing.
+    """Return mean and standard deviation of [A B c] for a generic small fixed wing.
 
     theta' = q - g/U0 bank, phi' = p, psi' = r;  u' = -g theta - W0 q, w' = U0 q, v' = g phi - U0 r + W0 p.
 
@@ -65,7 +65,7 @@ def prior(axis: str, U0: float, W0: float, dt: float) -> tuple[np.ndarray, np.nd
 
 
 def _doubt(row: str, column: str, slope: float | None) -> float:
-    """Give the standard deviation of one continuous entry; per m/s for velocities, per rad or rad/s for the rest."""
+    """Return the standard deviation of one continuous entry; per m/s for velocities, per rad or rad/s for the rest."""
     if column == "psi":
         return 1e-6  # no force knows where north is
     if column == "1":

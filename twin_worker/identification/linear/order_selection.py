@@ -124,7 +124,7 @@ def _squares(model: StateSpace, y: np.ndarray, u: np.ndarray, ok: np.ndarray) ->
 
 
 def _through(model: StateSpace, u0: np.ndarray) -> StateSpace:
-    """Give the same model for inputs that are not advanced: its state is x(k) - B u(k)."""
+    """Return the same model for inputs that are not advanced: its state is x(k) - B u(k)."""
     return replace(model, B=model.A @ model.B, D=model.C @ model.B, x0=model.x0 - model.B @ u0)
 
 

@@ -45,12 +45,12 @@ class StateSpace:
 
     @property
     def order(self) -> int:
-        """Give the number of states."""
+        """Return the number of states."""
         return len(self.A)
 
     @property
     def radius(self) -> float:
-        """Give the largest modulus of a pole."""
+        """Return the largest modulus of a pole."""
         return float(np.abs(np.linalg.eigvals(self.A)).max())
 
     def run(self, u: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
@@ -96,7 +96,7 @@ class StateSpace:
         return np.linalg.lstsq(lhs, rows.T @ rest.ravel(), rcond=1e-12)[0]
 
     def turned(self, T: np.ndarray) -> "StateSpace":
-        """Give the same model with the state T x."""
+        """Return the same model with the state T x."""
         back = np.linalg.inv(T)
         return StateSpace(T @ self.A @ back, T @ self.B, self.C @ back, T @ self.K, T @ self.c, T @ self.x0, self.D)
 

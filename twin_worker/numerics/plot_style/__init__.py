@@ -6,7 +6,7 @@ from fleet.report.ink import GRID, INK, MUTED
 
 
 def house(ax: Any, title: str) -> None:
-    """Give a panel its title and the colours of the page."""
+    """Return a panel its title and the colours of the page."""
     ax.set_title(title, fontsize=9, color=INK)
     ax.tick_params(labelsize=8, colors=MUTED)
     ax.grid(color=GRID, lw=0.6)

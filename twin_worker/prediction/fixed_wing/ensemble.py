@@ -52,7 +52,7 @@ def draw(
 def spread(
     now: Situation, start: Start, found: Hybrid, ahead: np.ndarray, rng: np.random.Generator, *, members: int = MEMBERS
 ) -> np.ndarray | None:
-    """Fly the bundle; give its standard deviations along, cross and vertical about the first member, (k, 3) [m].
+    """Fly the bundle; return its standard deviations along, cross and vertical about the first member, (k, 3) [m].
 
     None where too many members leave their envelope.
 

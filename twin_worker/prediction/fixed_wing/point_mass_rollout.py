@@ -19,7 +19,7 @@ _NO_CHANCE = np.empty((0, 4))
 
 
 def start_of(now: Situation, good: Window) -> np.ndarray:
-    """Give the state at the end of the window, (N_START,)."""
+    """Return the state at the end of the window, (N_START,)."""
     _, airspeed = airspeed_of(good.part(max(len(good) - _LOOK_ROWS, 0), len(good)), now.history, now.wind.scale)
     V = float(airspeed[-_SPEED_ROWS:].mean())
     out = np.empty(H.N_START)
@@ -32,7 +32,7 @@ def start_of(now: Situation, good: Window) -> np.ndarray:
 
 
 def air_of(now: Situation, start: np.ndarray) -> np.ndarray:
-    """Give mean wind, drift and biases of the air, (N_AIR,); what is left of the ground velocity is not in it yet."""
+    """Return mean wind, drift and biases of the air, (N_AIR,); what is left of the ground velocity is not in it yet."""
     air = np.zeros(H.N_AIR)
     air[H.W_N : H.DRIFT_E + 1] = now.wind.state[0][2:6]
     air[H.SCALE], air[H.D_PSI] = now.wind.scale, now.wind.heading_bias
@@ -46,7 +46,7 @@ def air_of(now: Situation, start: np.ndarray) -> np.ndarray:
 
 
 def rest(start: np.ndarray, air: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Give what neither airspeed nor mean wind explains of the ground velocity v (..., 2), NED [m/s].
+    """Return what neither airspeed nor mean wind explains of the ground velocity v (..., 2), NED [m/s].
 
     Args:
         start: (..., N_START)
@@ -59,12 +59,12 @@ def rest(start: np.ndarray, air: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def ground_velocity(good: Window) -> np.ndarray:
-    """Give the newest ground velocity, north and east, (2,) [m/s]."""
+    """Return the newest ground velocity, north and east, (2,) [m/s]."""
     return good.v[-_GROUND_ROWS:, :2].mean(axis=0)
 
 
 def begin(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray]:
-    """Give state (N_START,) and air (N_AIR,) at the end of the window."""
+    """Return state (N_START,) and air (N_AIR,) at the end of the window."""
     start = start_of(now, good)
     air = air_of(now, start)
     air[[H.REST_N, H.REST_E]] = rest(start, air, ground_velocity(good))
@@ -74,7 +74,7 @@ def begin(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray]:
 
 
 def over_ground(start: np.ndarray, air: np.ndarray) -> np.ndarray:
-    """Give the ground velocity that a start and its air make, north and east, (2,) [m/s]."""
+    """Return the ground velocity that a start and its air make, north and east, (2,) [m/s]."""
     return air[[H.REST_N, H.REST_E]] - rest(start, air, np.zeros(2))
 
 

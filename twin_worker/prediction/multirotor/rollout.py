@@ -100,7 +100,7 @@ def onboard(mission: Mission | None, params: dict[str, float], autopilot: str, s
 
 
 def _usual_speed(flown: Track, otherwise: float) -> float:
-    """Give the speed it cruises at, where no parameter tells: nine tenths of the time it was no faster."""
+    """Return the speed it cruises at, where no parameter tells: nine tenths of the time it was no faster."""
     level = np.hypot(*flown.v[flown.ok, :2].T)
     moving = level[level > 1.5]
     return float(np.quantile(moving, 0.9)) if len(moving) > 5.0 / STEP else otherwise
@@ -149,18 +149,18 @@ class Way:
 
     @property
     def limit(self) -> Limits:
-        """Give the limits as the aircraft makes them."""
+        """Return the limits as the aircraft makes them."""
         limit, share, push = self.board.limit, self.rotor.share, self.rotor.push
         return limit._replace(speed=limit.speed * share, acc=limit.acc * push, acc_corner=limit.acc_corner * push)
 
     @property
     def par(self) -> np.ndarray:
-        """Give what the kernel is told besides the segments."""
+        """Return what the kernel is told besides the segments."""
         return np.array([self.board.limit.jerk, self.rotor.wn, _ZETA, self.rotor.v_air, *self.rotor.wind])
 
 
 def fly_segments(track: Track, laid: np.ndarray, seq: int, way: Way, ahead: np.ndarray) -> np.ndarray:
-    """Fly laid segments ahead from the end of the track with item `seq` in force; give the path, (k, 3) [m]."""
+    """Fly laid segments ahead from the end of the track with item `seq` in force; return the path, (k, 3) [m]."""
     segments = paced(laid, way.limit)
     stops = (segments[:, copter.HOLD] > 0) & np.isfinite(segments[:, copter.HOLD])
     segments[stops, copter.HOLD] += way.rotor.pause
@@ -208,7 +208,7 @@ def _waited(track: Track, b: np.ndarray) -> float:
 
 
 def items_in_force(t: np.ndarray, leg: tuple[np.ndarray, np.ndarray], mission: Mission | None) -> np.ndarray:
-    """Give the mission item in force at times `t`, nan unknown, (n,): as reported, else as it came with the mission."""
+    """Return mission item in force at times `t`, nan unknown, (n,): as reported, else as it came with the mission."""
     seq = held(*leg, t, _TOLD_S)[:, 0]
     if mission is not None and mission.seq >= 0:
         seq = np.where(np.isfinite(seq), seq, float(mission.seq))
@@ -216,7 +216,7 @@ def items_in_force(t: np.ndarray, leg: tuple[np.ndarray, np.ndarray], mission: M
 
 
 def item_in_force(now: float, leg: tuple[np.ndarray, np.ndarray], mission: Mission | None) -> float:
-    """Give the same at one time."""
+    """Return the same at one time."""
     t, seq = leg
     k = int(t.searchsorted(now, side="right")) - 1
     if k >= 0 and not now - t[k] > _TOLD_S:

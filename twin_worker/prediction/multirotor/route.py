@@ -170,7 +170,7 @@ def stop_from(p: np.ndarray, v: np.ndarray, limit: Limits) -> np.ndarray:
 
 
 def paced(laid: np.ndarray, limit: Limits) -> np.ndarray:
-    """Give the segments with the limits on them: speed, acceleration, speed at each end."""
+    """Return the segments with the limits on them: speed, acceleration, speed at each end."""
     out = laid.copy()
     way = out[:, copter.B_N : copter.B_N + 3] - out[:, copter.A_N : copter.A_N + 3]
     length = np.linalg.norm(way, axis=1)

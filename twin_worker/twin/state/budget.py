@@ -48,7 +48,7 @@ class Quota:
 
     @property
     def limited(self) -> bool:
-        """Tell whether there is a limit: not offline."""
+        """Return whether there is a limit: not offline."""
         return self.limit < float("inf")
 
     def sweep(self, *, hurry: bool = False) -> None:
@@ -73,7 +73,7 @@ class Quota:
             self._since = None
 
     def grants(self, work: Work) -> bool:
-        """Tell whether work that is due may be begun."""
+        """Return whether work that is due may be begun."""
         if work in self.aside or (self.behind and self.limited):
             return False
         if work is Work.RENEW:

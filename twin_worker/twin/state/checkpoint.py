@@ -49,5 +49,5 @@ def mark(t: float, wind: WindFilter, plants: tuple[Plant | None, ...], hybrid: H
 
 
 def before(marks: Iterable[Mark], t: float) -> Mark | None:
-    """Give the newest mark before time t [s since 1970]; None where there is none."""
+    """Return the newest mark before time t [s since 1970]; None where there is none."""
     return max((one for one in marks if one.t < t), key=lambda one: one.t, default=None)

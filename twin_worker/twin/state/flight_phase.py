@@ -89,7 +89,7 @@ def _flies(twin: "Twin") -> bool | None:
 
 @nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath
 def moves(v: np.ndarray) -> tuple[float, float, float, float]:
-    """Give of velocities, (n, 3) [m/s], least and greatest level speed, and the greatest up or down and in all."""
+    """Return of velocities, (n, 3) [m/s], least and greatest level speed, and the greatest up or down and in all."""
     least, level, steepest, most = inf, 0.0, 0.0, 0.0
     for k in range(len(v)):
         over = hypot(v[k, 0], v[k, 1])

@@ -70,7 +70,7 @@ class Believed:
             self.miss = miss if np.isnan(self.miss) else (1 - _NEWS) * self.miss + _NEWS * miss
 
     def rank(self) -> tuple[bool, float]:
-        """Give the sort key: least miss first; those that never flew a route last, the newest of them first."""
+        """Return the sort key: least miss first; those that never flew a route last, the newest of them first."""
         return (True, -self.t) if np.isnan(self.miss) else (False, self.miss)
 
 
@@ -150,49 +150,49 @@ class Twin:
     bad: int = 0
 
     def may(self, work: Work) -> bool:
-        """Tell whether heavy work that is due may be done now."""
+        """Return whether heavy work that is due may be done now."""
         return self.quota is None or self.quota.grants(work)
 
     @property
     def name(self) -> str:
-        """Give the name sentences use, e.g. uav-7."""
+        """Return the name sentences use, e.g. uav-7."""
         return f"uav-{self.uav}"
 
     @property
     def standing(self) -> str:
-        """Give the verdict of the model in force, and what became of the newest try where that is another."""
+        """Return the verdict of the model in force, and what became of the newest try where that is another."""
         if self.in_force is None or self.verdict.outcome is Outcome.VERIFIED:
             return self.verdict.sentence
         return f"{self.in_force.sentence}; newest try: {self.verdict.outcome.value.replace('_', ' ')}"
 
     @property
     def first_item(self) -> int:
-        """Give the number of the first mission item to fly: 0 where the mission does not hold home."""
+        """Return the number of the first mission item to fly: 0 where the mission does not hold home."""
         return FIRST.get(self.autopilot, 1)
 
     @property
     def autopilot(self) -> str:
-        """Give what its heartbeat calls the autopilot, e.g. px4."""
+        """Return what its heartbeat calls the autopilot, e.g. px4."""
         return self.status.autopilot if self.status else "unknown"
 
     @property
     def received(self) -> dict[str, float]:
-        """Give the autopilot parameters received, in its own names and units."""
+        """Return the autopilot parameters received, in its own names and units."""
         return self.params.values if self.params else {}
 
     @property
     def vehicle(self) -> str:
-        """Give the kind of vehicle its heartbeat names, e.g. fixed_wing."""
+        """Return the kind of vehicle its heartbeat names, e.g. fixed_wing."""
         return self.status.vehicle if self.status else "unknown"
 
     def window(self, seconds: float) -> Window | None:
-        """Give the newest `seconds` on the grid; None while a needed kind of row is missing."""
+        """Return the newest `seconds` on the grid; None while a needed kind of row is missing."""
         assert self.origin is not None
         newest = self.history.newest
         return self.grid.window(self.history, self.origin, self.servos, self.wind.wind, until=newest, seconds=seconds)
 
     def situation(self, window: Window) -> Situation:
-        """Give what a prediction from the end of `window` starts from."""
+        """Return what a prediction from the end of `window` starts from."""
         assert self.origin is not None
         items = self.mission.items if self.mission else ()
         law = OWN.get(self.autopilot, self.learnt.law)
@@ -232,7 +232,7 @@ def hear(twin: Twin, message: Message) -> None:
 
 
 def _first_place(history: History) -> Origin | None:
-    """Give the first position that can be on earth; None before any."""
+    """Return the first position that can be on earth; None before any."""
     for lat, lon, alt in history.rows("position")[1]:
         if abs(lat) <= 9e8 and abs(lon) <= 1.8e9 and abs(alt) <= 1e8:
             return Origin(int(lat), int(lon), int(alt))

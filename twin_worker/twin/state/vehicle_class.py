@@ -45,18 +45,18 @@ class Flight:
 
 
 def nothing(sentence: str, seq: int = -1) -> Flight:
-    """Give no flight, and why."""
+    """Return no flight, and why."""
     return Flight(None, "", "", seq, sentence)
 
 
 def seen(twin: Twin, seconds: float = _BACK_S, *, turned: bool = True) -> Track | None:
-    """Give what was flown of late, from positions and velocities alone; `turned`: with its attitude."""
+    """Return what was flown of late, from positions and velocities alone; `turned`: with its attitude."""
     assert twin.origin is not None
     return track(twin.history, twin.origin, until=twin.history.newest, seconds=seconds, turned=turned)
 
 
 def hangs(twin: Twin) -> bool:
-    """Tell whether the aircraft hangs on rotors now, or is about to by its mission."""
+    """Return whether the aircraft hangs on rotors now, or is about to by its mission."""
     if twin.vehicle in NO_WINGS:
         return True
     if twin.vehicle != QUADPLANE:
@@ -70,7 +70,7 @@ def hangs(twin: Twin) -> bool:
 
 
 def command_in_force(twin: Twin) -> int:
-    """Give the command of the mission item in force; 0 unknown."""
+    """Return the command of the mission item in force; 0 unknown."""
     seq = rollout.item_in_force(twin.history.newest, twin.history.look("leg"), twin.mission)
     items = twin.mission.items if twin.mission else ()
     return next((item.command for item in items if item.seq == seq), 0) if isfinite(seq) else 0

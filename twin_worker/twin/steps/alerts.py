@@ -66,7 +66,7 @@ def _remember_ground(twin: Twin) -> None:
 
 
 def home(twin: Twin) -> Origin | None:
-    """Give home: item 0 of an ArduPilot mission, else where it was last seen disarmed; None unknown."""
+    """Return home: item 0 of an ArduPilot mission, else where it was last seen disarmed; None unknown."""
     items = twin.mission.items if twin.mission is not None else ()
     first = next((item for item in items if item.seq == 0), None)
     ardupilot = twin.status is not None and twin.status.autopilot == "ardupilot"
@@ -94,14 +94,14 @@ def _dangers(twin: Twin, flight: Forecast) -> list[Finding]:
 
 
 def _reach_s(made: Prediction) -> float:
-    """Give how far ahead a prediction says anything of ground and fence [s]."""
+    """Return how far ahead a prediction says anything of ground and fence [s]."""
     if made.method == "imm":
         return _TURNING_S
     return _GUESSED_S if made.calibration.startswith(GUESSED) else _REACH_S
 
 
 def _lands(twin: Twin, rotors: bool) -> bool:
-    """Tell whether it is landing, or about to by its mode or mission."""
+    """Return whether it is landing, or about to by its mode or mission."""
     mode = twin.status.mode if twin.status is not None else ""
     if "LAND" in mode or (rotors and mode in RETURN_MODES):
         return True

@@ -72,7 +72,7 @@ def widened(ahead: np.ndarray, tube: np.ndarray, passed: float, out: np.ndarray)
 
 
 def renew(twin: Twin) -> list[Message]:
-    """Give the last path that was flown ahead, from the newest position on; nothing where there is neither."""
+    """Return the last path that was flown ahead, from the newest position on; nothing where there is neither."""
     if twin.base is None:
         return []
     t, rows = twin.history.look("position", max(twin.base.t, twin.history.newest - 1.0))
@@ -86,7 +86,7 @@ def renew(twin: Twin) -> list[Message]:
 
 
 def renewable(twin: Twin, t: float) -> bool:
-    """Tell whether there is a path to renew at `t`: flown while telemetry came, and not long before."""
+    """Return whether there is a path to renew at `t`: flown while telemetry came, and not long before."""
     base = twin.base
     if base is None or twin.lost or twin.broken or base.coast_s:
         return False
@@ -94,12 +94,12 @@ def renewable(twin: Twin, t: float) -> bool:
 
 
 def overdue(twin: Twin, t: float) -> bool:
-    """Tell whether at `t` the next flight ahead is due, but was not made: it waits for CPU time."""
+    """Return whether at `t` the next flight ahead is due, but was not made: it waits for CPU time."""
     return t >= twin.predict_t + twin.pace.predict
 
 
 def renewed(twin: Twin, t: float, position: np.ndarray) -> Prediction | None:
-    """Give the last path that was flown ahead from a position on, (3,) [1e-7 deg, mm] at `t`; the twin stays as it is.
+    """Return last path that was flown ahead from a position on, (3,) [1e-7 deg, mm] at `t`; the twin stays as it is.
 
     The departure so far, d, fades:  p(tau) = path(t - t0 + tau) + d exp(-tau / 10 s). All is in the local frame of the
     path: that of the twin may have moved since. The horizon ends when that of the path does.

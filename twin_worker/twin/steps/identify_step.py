@@ -36,7 +36,7 @@ _TELL_S = 5.0  # between models that say nothing new [s]
 
 
 def learn(twin: Twin) -> list[Message]:
-    """Identify and verify once; give the model with its verdict where it is news, nothing while data are starved."""
+    """Identify and verify once; return the model with its verdict where it is news, nothing while data are starved."""
     compare_with_flight(twin)
     if twin.vehicle in WINGS:
         renew(twin)
@@ -74,7 +74,7 @@ def learn(twin: Twin) -> list[Message]:
 
 
 def _changed(now: Verdict, before: Verdict) -> bool:
-    """Tell whether belief changed; that a model is good and an earlier one better alternates and is no news."""
+    """Return whether belief changed; that a model is good and an earlier one better alternates and is no news."""
     sound = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST)
     return now.outcome is not before.outcome and not (now.outcome in sound and before.outcome in sound)
 
@@ -141,6 +141,6 @@ def _on_wings(twin: Twin, window: Window | None) -> Window | None:
 
 
 def _after(those: np.ndarray, more: int) -> int:
-    """Give the row after the last of those, and so many more; the first where there are none."""
+    """Return the row after the last of those, and so many more; the first where there are none."""
     found = np.flatnonzero(those)
     return int(found[-1]) + 1 + more if len(found) else 0

@@ -42,7 +42,7 @@ def model_message(twin: Twin, window: Window) -> Model:
 
 
 def derivatives_of(plant: Coupled, airframe: str) -> Derivatives:
-    """Give the parameters with their covariance, and how much of each the data told."""
+    """Return the parameters with their covariance, and how much of each the data told."""
     covariance = plant.covariance
     held = np.linalg.inv(plant.precision)
     told = 1.0 - np.diag(covariance) / np.diag(held)

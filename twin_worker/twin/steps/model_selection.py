@@ -57,7 +57,7 @@ def _join(twin: Twin, window: Window, plant: Plant, verdict: Verdict, miss: floa
 
 
 def hindcast(begin: Start | Flown | None, window: Window, start: int, plant: Plant) -> float:
-    """Give the mean miss of a flight from row `start` to the end [m]; inf: it diverges, nan: no route to fly."""
+    """Return the mean miss of a flight from row `start` to the end [m]; inf: it diverges, nan: no route to fly."""
     if not isinstance(begin, Start):
         return np.nan
     ahead = np.arange(0.0, int((len(window) - 1 - start) * window.dt) + 1.0)

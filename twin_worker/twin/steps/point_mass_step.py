@@ -49,7 +49,7 @@ def _whole(window: Window, since: float) -> Window:
 
 
 def _strays(twin: Twin, good: Window) -> float:
-    """Fly what is identified before the held-out seconds over them; give the miss at their end over the way [-]."""
+    """Fly what is identified before the held-out seconds over them; return the miss at their end over the way [-]."""
     held = int(_HELD_S / good.dt)
     known = good.part(0, len(good) - held)
     now = twin.situation(known)

@@ -74,7 +74,7 @@ def foresee(twin: Twin, now: float) -> list[Message]:
 
 
 def _coasts(twin: Twin, flown: Track, now: float) -> float:
-    """Give the time flown by the twin alone [s]; 0 with telemetry. Positions alone may stop: that is an event."""
+    """Return the time flown by the twin alone [s]; 0 with telemetry. Positions alone may stop: that is an event."""
     broken = not twin.lost and twin.history.newest - max(float(flown.t[-1]), twin.back_t) > _STALE_S
     if broken != twin.broken and not twin.lost:
         note(twin, Event.TELEMETRY_BROKEN if broken else Event.TELEMETRY_WHOLE, now)
@@ -85,7 +85,7 @@ def _coasts(twin: Twin, flown: Track, now: float) -> float:
 
 
 def _is_over(twin: Twin, coast: float, now: float) -> bool:
-    """Tell whether coasting, once it was told of, has used up the confidence horizon of the last prediction."""
+    """Return whether coasting, once it was told of, has used up the confidence horizon of the last prediction."""
     last = twin.prediction
     return coast > AHEAD[-1] or (last is not None and last.coast_s > 0 and now >= last.t + last.horizon_s)
 
@@ -119,13 +119,13 @@ def _with(twin: Twin, made: Flight) -> str:
 
 
 def _event(twin: Twin) -> dict[str, Any]:
-    """Give what the newest event tells, by the fields of a prediction."""
+    """Return what the newest event tells, by the fields of a prediction."""
     told = twin.noted
     return {} if told is None else {"event": told.event, "event_t": told.t, "event_said": told.said}
 
 
 def _controller(twin: Twin, made: Flight, now: float) -> Controller | None:
-    """Give the law and parameters in force where they are news, or were told long ago."""
+    """Return the law and parameters in force where they are news, or were told long ago."""
     control = made.control or Control(made.law)
     if control == twin.control and twin.control_t <= now < twin.control_t + _TELL_S:
         return None
@@ -134,7 +134,7 @@ def _controller(twin: Twin, made: Flight, now: float) -> Controller | None:
 
 
 def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
-    """Fly the identified model, else the law of its kind, else turn on; give the flight and when it starts."""
+    """Fly the identified model, else the law of its kind, else turn on; return the flight and when it starts."""
     window = twin.window(LOOK_BACK_S)
     whole = window is not None and bool(window.ok[-1])
     why = twin.verdict.sentence
@@ -166,7 +166,7 @@ def _good(flight: Flight) -> bool:
 
 
 def _whole(path: np.ndarray | None) -> int:
-    """Give how many look-aheads a path was flown for without a break; 0 where that is too short to be of use."""
+    """Return how many look-aheads a path was flown for without a break; 0 where that is too short to be of use."""
     if path is None:
         return 0
     broken = np.flatnonzero(~np.isfinite(path).all(axis=1))
@@ -184,7 +184,7 @@ def _group(twin: Twin, flight: Flight, flown: Track) -> str:
 
 
 def _usual(v: np.ndarray) -> float:
-    """Give the median speed of velocities, (n, 3) [m/s]."""
+    """Return the median speed of velocities, (n, 3) [m/s]."""
     ranked = np.sort(np.einsum("ij,ij->i", v, v))
     n = len(ranked)
     return 0.5 * float(np.sqrt(ranked[(n - 1) // 2]) + np.sqrt(ranked[n // 2]))

@@ -46,7 +46,7 @@ def fly_route(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
 def paths(
     twin: Twin, begin: tuple[Situation, Start], ahead: np.ndarray, due: bool
 ) -> tuple[dict[str, np.ndarray], str]:
-    """Give the path of each method that flies, NED (k, 3) [m], and why another does not; `due`: all must fly."""
+    """Return the path of each method that flies, NED (k, 3) [m], and why another does not; `due`: all must fly."""
     found: dict[str, np.ndarray] = {}
     why = ""
     if twin.hybrid is not None and twin.method in (HYBRID, "auto"):
@@ -116,7 +116,7 @@ def _fly_ensemble(twin: Twin, begin: tuple[Situation, Start], t: float) -> None:
 
 
 def in_force(twin: Twin, method: str, ahead: np.ndarray) -> np.ndarray | None:
-    """Give the spread of the newest ensemble at some look-aheads, (k, 3) [m]; None where it does not belong to these.
+    """Return the spread of the newest ensemble at some look-aheads, (k, 3) [m]; None where it does not belong to these.
 
     Args:
         twin: whose ensemble

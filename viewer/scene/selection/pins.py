@@ -41,7 +41,7 @@ class Pins:
         )
 
     def draw(self, events: tuple[Event, ...], rows: np.ndarray, at: np.ndarray | None, size: float) -> list[Tag]:
-        """Mark events where they happened; give the labels of the newest few.
+        """Mark events where they happened; return the labels of the newest few.
 
         Args:
             events: oldest first

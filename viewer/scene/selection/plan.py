@@ -51,7 +51,7 @@ class Plan:
 
 
 def seq_in_force(vehicle: Vehicle) -> int:
-    """Give the mission item in force, the newest word of it first; -1 where nobody said."""
+    """Return the mission item in force, the newest word of it first; -1 where nobody said."""
     told = vehicle.prediction.seq if vehicle.prediction is not None else -1
     sent = vehicle.mission.seq if vehicle.mission is not None else -1
     return next((seq for seq in (vehicle.known.seq, told, sent) if seq >= 0), -1)

@@ -7,7 +7,7 @@ BAND_SIGMA = 2.1  # half-axes of the 90 % band, to be held all at once, in stand
 
 
 def frame_of(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give the cross and vertical unit vectors along a path (n, 3): two (n, 3); hovering keeps the last direction."""
+    """Return the cross and vertical unit vectors along a path (n, 3): two (n, 3); hovering keeps the last direction."""
     run = np.gradient(path, axis=0) if len(path) > 1 else np.zeros_like(path)
     flat = run * [1.0, 1.0, 0.0]
     length = np.linalg.norm(flat, axis=1)
@@ -43,7 +43,7 @@ def rings(path: np.ndarray, axes: np.ndarray, sides: int = SIDES) -> np.ndarray:
 
 
 def skin(n: int, sides: int = SIDES) -> np.ndarray:
-    """Give the triangles between n rings: (2 (n - 1) sides, 3) indices into the flattened corners."""
+    """Return the triangles between n rings: (2 (n - 1) sides, 3) indices into the flattened corners."""
     near = np.arange(n - 1)[:, None] * sides + np.arange(sides)
     next_ = np.arange(n - 1)[:, None] * sides + (np.arange(sides) + 1) % sides
     halves = [np.stack([near, next_, near + sides], -1), np.stack([next_, next_ + sides, near + sides], -1)]

@@ -47,7 +47,7 @@ class Land:
 
     @property
     def lies(self) -> bool:
-        """Tell whether there is ground to see, so that the grid is in the way."""
+        """Return whether there is ground to see, so that the grid is in the way."""
         return self._form is not None
 
     def forget(self, client: int) -> None:
@@ -129,7 +129,7 @@ def shape(terrain: Raster | None, place: Place, extent: tuple[np.ndarray, np.nda
 
 
 def shade(form: Shape) -> np.ndarray:
-    """Give how much light falls on each point, about 0.5 on level ground, (n, n)."""
+    """Return how much light falls on each point, about 0.5 on level ground, (n, n)."""
     up = np.where(np.isfinite(form.up), form.up, np.nanmin(form.up))
     slope_n, slope_e = np.gradient(up, form.north, form.east)
     normal = np.stack([-2 * slope_e, -2 * slope_n, np.ones_like(up)], axis=-1)
@@ -137,7 +137,7 @@ def shade(form: Shape) -> np.ndarray:
 
 
 def contours(form: Shape) -> np.ndarray:
-    """Give the contours at whole metres above mean sea level of the scene, (n, 2, 3) [10 m]."""
+    """Return the contours at whole metres above mean sea level of the scene, (n, 2, 3) [10 m]."""
     import contourpy  # here: as in `mesh`
 
     low, high = float(np.nanmin(form.up)) * UNIT_M, float(np.nanmax(form.up)) * UNIT_M

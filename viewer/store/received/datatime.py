@@ -40,7 +40,7 @@ class DataTime(NamedTuple):
 
 
 def is_dated(t: float) -> bool:
-    """Tell whether a time is one of the calendar; else it counts from the start of its log."""
+    """Return whether a time is one of the calendar; else it counts from the start of its log."""
     return UNDATED_S + MONTH_S <= t < LATEST
 
 

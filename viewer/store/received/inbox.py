@@ -104,7 +104,7 @@ class Inbox:
                 kept.add(uav)
 
     def _is_news(self, uav: int, payload: bytes) -> bool:
-        """Tell whether a sample names another mission item than the one before; one that cannot be read may."""
+        """Return whether a sample names another mission item than the one before; one that cannot be read may."""
         try:
             told = _LEG_ALONE.decode(payload).leg.x
         except _UNREADABLE:

@@ -15,7 +15,7 @@ def _packed(dtype: str, width: int) -> struct.Struct:
 
 
 def last(x: Array) -> tuple[float, ...]:
-    """Give the last row of a table; nothing where there is none.
+    """Return the last row of a table; nothing where there is none.
 
     Raises:
         ValueError: when dtype, shape and byte count disagree; the sender must repair it.
@@ -30,7 +30,7 @@ def last(x: Array) -> tuple[float, ...]:
 
 
 def stacked(uav: int, rows: Rows) -> tuple[Any, Any]:
-    """Give the times (n,) and rows (n, 3 or more) of positions; of one row without an array.
+    """Return the times (n,) and rows (n, 3 or more) of positions; of one row without an array.
 
     Raises:
         ValueError: when their shapes are none of positions; the gateway must resend.

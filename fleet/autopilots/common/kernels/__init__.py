@@ -12,7 +12,7 @@ kernel = nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # typ
 
 @nb.njit(cache=True, error_model="numpy", inline="always")
 def hypot(x, y):  # type: ignore[no-untyped-def]
-    """Give the length of a horizontal vector; what `math.hypot` guards against is not met on this earth."""
+    """Return the length of a horizontal vector; what `math.hypot` guards against is not met on this earth."""
     return sqrt(x * x + y * y)
 
 
@@ -24,5 +24,5 @@ def clip(x: float, low: float, high: float) -> float:
 
 @kernel
 def angle_to(v_n: float, v_e: float, n: float, e: float) -> float:
-    """Give the angle from one horizontal vector to another, right positive [rad]."""
+    """Return the angle from one horizontal vector to another, right positive [rad]."""
     return atan2(v_n * e - v_e * n, v_n * n + v_e * e)

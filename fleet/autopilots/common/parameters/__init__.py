@@ -17,13 +17,13 @@ class Row(NamedTuple):
 
 
 def eas2tas(altitude_m: float) -> float:
-    """Give true over equivalent airspeed at a height above sea level [m]. Source: ISA, troposphere."""
+    """Return true over equivalent airspeed at a height above sea level [m]. Source: ISA, troposphere."""
     h = min(max(altitude_m, -500.0), 11_000.0) if isfinite(altitude_m) else 0.0
     return float((1 - 2.25577e-5 * h) ** (-4.25588 / 2))
 
 
 def find(row: Row, given: Mapping[str, float]) -> float | None:
-    """Give the value of a row under its present or an older name; None where it is missing, not finite or absurd."""
+    """Return the value of a row under its present or an older name; None where it is missing, not finite or absurd."""
     for name, unit in ((row.name, 1.0), *row.older):
         value = given.get(name)
         if value is not None and isfinite(value) and row.low <= value * unit <= row.high:

@@ -71,7 +71,7 @@ class Counts:
             self._waiting = tuple(one[done:] for one in self._waiting)  # type: ignore[assignment]
 
     def rates(self, number: int, passed: float) -> dict[str, float]:
-        """Give how often each kind comes from one aircraft [Hz], smoothed; `passed` since this was last asked [s]."""
+        """Return how often each kind comes from one aircraft [Hz], smoothed; `passed` since this was last asked [s]."""
         found, hz = _smooth(self._kinds[number], self._hz[number], passed)
         return dict(zip(map(self._names.__getitem__, found.tolist()), hz.tolist(), strict=True))
 

@@ -66,7 +66,7 @@ class Flock:
         self.look[number] = np.inf
 
     def judge(self, laid: Laid) -> Judged:
-        """Give rows their time, put them in order, leave out the late, the repeated and the second best."""
+        """Return rows their time, put them in order, leave out the late, the repeated and the second best."""
         n, many = len(laid.owner), len(self.clocks)
         t, fate, jumped = np.empty(n), np.empty(n, np.int8), np.full(many, np.nan)
         advanced = np.empty(n)

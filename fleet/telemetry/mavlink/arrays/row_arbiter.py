@@ -85,7 +85,7 @@ def _judge(memory, rank, t, timeless):
 
 @nb.njit(cache=True)
 def _speaker(heard, every, t):
-    """Give the highest rank that flows: it spoke of late, and not much less often than any other that did."""
+    """Return the highest rank that flows: it spoke of late, and not much less often than any other that did."""
     busiest = inf
     for rank in range(RANKS):
         if t < heard[rank] + YIELD_S:

@@ -65,17 +65,17 @@ class ParamBook:
 
     @property
     def complete(self) -> bool:
-        """Tell whether every index was heard."""
+        """Return whether every index was heard."""
         return self.count > 0 and len(self._indices) >= self.count
 
     def missing(self) -> list[int] | None:
-        """Give the indices not heard yet; None when not even their number is known."""
+        """Return the indices not heard yet; None when not even their number is known."""
         if not self.count:
             return None
         return [index for index in range(self.count) if index not in self._indices]
 
     def take(self, now: float) -> Params | None:
-        """Give the parameters when there is news, at most once a second."""
+        """Return the parameters when there is news, at most once a second."""
         if not self._changed or now - self._said < PAUSE_S:
             return None
         self._changed, self._said = False, now

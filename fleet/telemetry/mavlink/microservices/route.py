@@ -88,7 +88,7 @@ class RouteBook:
             self._changed = self._changed or bool(self.items)
 
     def missing(self) -> list[int] | None:
-        """Give the sequence numbers a download on its way still lacks; None when no count was heard."""
+        """Return the sequence numbers a download on its way still lacks; None when no count was heard."""
         draft = self._drafts[False]
         if draft is None or draft.count is None:
             return None
@@ -99,7 +99,7 @@ class RouteBook:
         self._drafts[False], self.stale = None, True
 
     def take(self, now: float) -> Mission | None:
-        """Give the mission when there is news."""
+        """Return the mission when there is news."""
         up, down = self._drafts[True], self._drafts[False]
         if up is not None and up.whole() and now - up.heard > ACCEPT_S:
             self._settle(accepted=True)
@@ -193,7 +193,7 @@ class RouteBook:
 
 
 def _absolute(item: Item, home_m: float) -> Item:
-    """Give an item with its altitude above sea level, where it was above home."""
+    """Return an item with its altitude above sea level, where it was above home."""
     if item.frame not in _ABSOLUTE:
         return item
     return msgspec.structs.replace(item, frame=_ABSOLUTE[item.frame], alt_m=item.alt_m + home_m)

@@ -30,7 +30,7 @@ class Frames(NamedTuple):
     senders: tuple[Hashable, ...] = (None,)
 
     def messages(self, which: np.ndarray) -> list[Any]:
-        """Give frames, by number, as pymavlink would, (k,)."""
+        """Return frames, by number, as pymavlink would, (k,)."""
         found: list[Any] = [None] * len(which)
         numbers = self.at[which, s.ID]
         for number in np.unique(numbers).tolist():
@@ -42,11 +42,11 @@ class Frames(NamedTuple):
         return found
 
     def only(self, which: np.ndarray) -> "Frames":
-        """Give some of the frames, by number or by mask."""
+        """Return some of the frames, by number or by mask."""
         return self._replace(at=self.at[which], arrival=self.arrival[which], sender=self.sender[which])
 
     def fields(self, which: np.ndarray, name: str) -> "Fields":
-        """Give the fields of frames `which`, all of one message, as arrays."""
+        """Return the fields of frames `which`, all of one message, as arrays."""
         kind = layout(name)
         laid = gather(self.buf, self.at[which, s.PAYLOAD], self.at[which, s.SIZE], kind.itemsize)
         return Fields(laid.view(kind)[:, 0])
@@ -90,7 +90,7 @@ _DTYPES: dict[str, np.dtype] = {}
 
 
 def layout(name: str) -> np.dtype:
-    """Give the layout of a message on the wire, read off pymavlink's class."""
+    """Return the layout of a message on the wire, read off pymavlink's class."""
     if name not in _DTYPES:
         kind = dialect.mavlink_map[IDS[name]]
         tokens = re.findall(r"(\d*)([a-zA-Z])", kind.unpacker.format.lstrip("<"))
@@ -125,7 +125,7 @@ class Dealt:
         self._begin, self._first = begin.tolist(), first.tolist()
 
     def fields(self, name: str) -> tuple[np.ndarray, Fields]:
-        """Give the frames of one message: numbers, (k,), and their fields as arrays."""
+        """Return the frames of one message: numbers, (k,), and their fields as arrays."""
         kind = _ORDER[name]
         told = self._told[self._begin[kind] : self._begin[kind + 1]]
         return self._which[self._first[kind] : self._first[kind + 1]], Fields(told.view(_LAYOUTS[kind]))
@@ -143,12 +143,12 @@ class Decoder:
         self._carry: OrderedDict[Hashable, bytes] = OrderedDict()
 
     def counters(self) -> Counter[str]:
-        """Give messages, bad_bytes, bad_frames and unknown (frames of messages unknown here) so far."""
+        """Return messages, bad_bytes, bad_frames and unknown (frames of messages unknown here) so far."""
         names = ("messages", "bad_bytes", "bad_frames", "unknown")
         return Counter(dict(zip(names, self.counts.tolist(), strict=True)))
 
     def feed(self, heard: Heard) -> Frames:
-        """Take pieces as they came, give the frames completed by them in order of arrival."""
+        """Take pieces as they came, return the frames completed by them in order of arrival."""
         if self._carry and not self._carry.keys().isdisjoint(heard.senders):
             return self._joined(heard)
         found = _room(heard.buf, 0)

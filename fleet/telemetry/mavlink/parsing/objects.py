@@ -19,11 +19,11 @@ class _Said:
         return self.NAME
 
     def get_srcSystem(self) -> int:
-        """Give the MAVLink system id of who said it."""
+        """Return the MAVLink system id of who said it."""
         return self[-2]  # type: ignore[index, no-any-return]
 
     def get_srcComponent(self) -> int:
-        """Give the MAVLink component id of who said it."""
+        """Return the MAVLink component id of who said it."""
         return self[-1]  # type: ignore[index, no-any-return]
 
 

@@ -22,7 +22,7 @@ _u = nb.uint64
 
 
 def _crc_table() -> np.ndarray:
-    """Give the effect of a byte followed by k zeros on the checksum, (8, 256): so eight bytes go at once.
+    """Return the effect of a byte followed by k zeros on the checksum, (8, 256): so eight bytes go at once.
 
     Source: Kounavis & Berry 2005, "slicing-by-8".
     """
@@ -48,7 +48,7 @@ EXTRA = _extra_table()
 
 @nb.njit(cache=True, nogil=True)
 def frame_length(buf, at, end):
-    """Give the length a frame starting at `at` claims [bytes]; 0: no frame, -1: header not complete yet."""
+    """Return the length a frame starting at `at` claims [bytes]; 0: no frame, -1: header not complete yet."""
     if end < at + 3:
         return -1
     if buf[at] == V1:
@@ -60,7 +60,7 @@ def frame_length(buf, at, end):
 
 @nb.njit(cache=True, nogil=True)
 def message_id(buf, at):
-    """Give the message id of the frame at `at`."""
+    """Return the message id of the frame at `at`."""
     if buf[at] == V1:
         return nb.int64(buf[at + 5])
     return nb.int64(buf[at + 7]) | nb.int64(buf[at + 8]) << 8 | nb.int64(buf[at + 9]) << 16
@@ -68,7 +68,7 @@ def message_id(buf, at):
 
 @nb.njit(cache=True, nogil=True)
 def checksum(told, at, end, extra, table):
-    """Give the checksum of bytes `at` to `end`, CRC_EXTRA after them; `table` is `CRC`."""
+    """Return the checksum of bytes `at` to `end`, CRC_EXTRA after them; `table` is `CRC`."""
     crc, i, last, low = _u(0xFFFF), _u(at), _u(end), _u(0xFF)  # unsigned: no index can be negative
     while i + _u(8) <= last:
         a, b = _u(told[i]) ^ (crc & low), _u(told[i + _u(1)]) ^ (crc >> _u(8))
@@ -97,7 +97,7 @@ def _timely(t, last):
 
 @nb.njit(cache=True, nogil=True)
 def sound(buf, at, end, extras, table):
-    """Give the end of the whole, sound frame of a message known here that starts at `at`; 0: there is none."""
+    """Return the end of the whole, sound frame of a message known here that starts at `at`; 0: there is none."""
     if at + 8 > end or (buf[at] != V1 and buf[at] != V2):
         return 0
     head, tail, number = 6, 2, nb.int64(buf[at + 5])
@@ -116,7 +116,7 @@ def sound(buf, at, end, extras, table):
 
 @nb.njit(cache=True, nogil=True)
 def _leads_on(buf, at, end, extras, table):
-    """Follow frames of unknown ids from `at` on; give where that ends: soundly, or -1."""
+    """Follow frames of unknown ids from `at` on; return where that ends: soundly, or -1."""
     while at < end:
         if sound(buf, at, end, extras, table):
             return at
@@ -132,7 +132,7 @@ def _leads_on(buf, at, end, extras, table):
 
 @nb.njit(cache=True, nogil=True)
 def _hides(buf, at, after, end, extras, table):
-    """Tell whether a sound frame begins between `at` and `after`."""
+    """Return whether a sound frame begins between `at` and `after`."""
     inside = at + 1
     while inside < after and not sound(buf, inside, end, extras, table):
         inside += 1

@@ -75,7 +75,7 @@ class Walk:
         return self._base
 
     def feed(self, data: bytes, last: bool = False) -> list[Records]:
-        """Take the next bytes, give the messages completed by them."""
+        """Take the next bytes, return the messages completed by them."""
         self._buf += data
         at = self._walk(last)
         found = self._done + [r for kind in range(256) if (r := self._records(kind)) is not None]

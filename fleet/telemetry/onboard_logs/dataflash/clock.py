@@ -49,7 +49,7 @@ class Clock:
         self._held: dict[Format, Records] = {}  # counted, waiting for the stamp after them
 
     def stamp(self, block: list[Records], last: bool = False) -> list[Records]:
-        """Give the messages of a block, stamped; those counted since the last stamp come with the next block."""
+        """Return the messages of a block, stamped; those counted since the last stamp come with the next block."""
         timed, rest = self._own([r for r in block if r.form.name != "FMT"])
         places, times = self._sound(timed)
         timed = [r for r in timed if len(r)]
@@ -81,7 +81,7 @@ class Clock:
         return timed, rest
 
     def _sound(self, timed: list[Records]) -> tuple[np.ndarray, np.ndarray]:
-        """Drop messages whose stamp cannot be; give place and time of the others, in the order of the file."""
+        """Drop messages whose stamp cannot be; return place and time of the others, in the order of the file."""
         if not timed:
             return np.zeros(0), np.zeros(0)
         place = np.concatenate([r.place for r in timed]).astype(float)
@@ -135,7 +135,7 @@ class Clock:
 
 
 def neighbours(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give for each stamp the median of those before and of those after it; infinite where there are too few."""
+    """Return for each stamp the median of those before and of those after it; infinite where there are too few."""
     n = len(t)
     before, after = np.full(n, -np.inf), np.full(n, np.inf)
     if n > _REACH:

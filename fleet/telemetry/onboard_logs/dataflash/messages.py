@@ -97,7 +97,7 @@ class Talk:
         }
 
     def take(self, block: list[Records], last: bool = False) -> list[Said]:
-        """Give what a block says, in order of time."""
+        """Return what a block says, in order of time."""
         said = [s for r in block if (tell := self._tellers.get(r.form.name)) is not None for s in _heard(tell, r)]
         if last:
             said += self._mission.end()

@@ -69,7 +69,7 @@ class DataflashLog:
         return dict(self._sources)
 
     def chunks(self) -> Iterator[Chunk]:
-        """Give the log from its beginning; may be called again."""
+        """Return the log from its beginning; may be called again."""
         damage = self._damage()
         clock, rows, talk = self._clock(damage), Rows(self._sources), Talk(self.vehicle)
         self.skipped[:] = []

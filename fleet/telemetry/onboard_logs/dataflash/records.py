@@ -20,7 +20,7 @@ class Format(NamedTuple):
     layout: np.dtype | None  # of a binary message, header included; None: text
 
     def scale(self, i: int) -> float:
-        """Give what the numbers of column `i` are to be divided by."""
+        """Return what the numbers of column `i` are to be divided by."""
         factor = FORMAT_TO_STRUCT[self.codes[i]][1]
         return 1.0 if factor is None else round(1.0 / factor)
 
@@ -57,15 +57,15 @@ class Records:
         return self._seen[column]
 
     def has(self, *columns: str) -> bool:
-        """Tell whether the format has all these columns."""
+        """Return whether the format has all these columns."""
         return all(c in self.form.columns for c in columns)
 
     def whole(self, column: str) -> bool:
-        """Tell whether the format counts this column in whole numbers."""
+        """Return whether the format counts this column in whole numbers."""
         return self.has(column) and self.form.codes[self.form.columns.index(column)] in _WHOLE
 
     def taken(self, which: np.ndarray) -> "Records":
-        """Give some of them: a mask or indices."""
+        """Return some of them: a mask or indices."""
         rows = self._rows[which] if self.form.layout is not None else _picked(self._rows, which)
         found = Records(self.form, self.place[which], rows)
         found.t = self.t[which] if len(self.t) else self.t
@@ -78,7 +78,7 @@ class Records:
         return Records(self.form, np.concatenate([self.place, later.place]), rows)
 
     def texts(self, column: str) -> list[str]:
-        """Give a column as words, up to the first zero byte, unprintable bytes dropped."""
+        """Return a column as words, up to the first zero byte, unprintable bytes dropped."""
         i = self.form.columns.index(column)
         cells = (row[i] for row in self._rows) if self.form.layout is None else self._rows[f"f{i + 1}"].tolist()
         return [_words(cell) for cell in cells]

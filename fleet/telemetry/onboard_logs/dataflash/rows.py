@@ -18,7 +18,7 @@ Series = tuple[np.ndarray, np.ndarray]  # times (n,), values (n, k)
 
 
 def read(row: Row, records: Records) -> Series | None:
-    """Give times and values of what a row of the table makes of these messages; None: it does not fit them."""
+    """Return times and values of what a row of the table makes of these messages; None: it does not fit them."""
     with np.errstate(all="ignore"):  # damaged numbers are refused below, not feared
         try:
             columns = np.stack(row.columns(records), axis=-1)
@@ -43,7 +43,7 @@ class Survey:
                     self._counts[id(row)] = self._counts.get(id(row), 0) + len(found[0])
 
     def chosen(self) -> dict[str, Row]:
-        """Give the best source of each part: of those that flow, the one of the highest rank."""
+        """Return the best source of each part: of those that flow, the one of the highest rank."""
         best: dict[str, Row] = {}
         most: dict[str, int] = {}
         for row in TABLE:
@@ -64,7 +64,7 @@ class Rows:
         self._newest: dict[str, float] = {}  # of each part, what was given [s]
 
     def take(self, block: list[Records], newest: float, last: bool = False) -> Table:
-        """Give the rows a block completes.
+        """Return the rows a block completes.
 
         Args:
             block: stamped messages

@@ -34,7 +34,7 @@ class Lines:
         self._found: dict[Format, tuple[list[int], list[list[bytes]]]] = {}
 
     def feed(self, data: bytes) -> list[Records]:
-        """Take the next bytes, give the messages completed by them."""
+        """Take the next bytes, return the messages completed by them."""
         lines = (self._carry + data).split(b"\n")
         self._carry = lines.pop()
         for line in lines:

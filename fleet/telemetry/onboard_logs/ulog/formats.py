@@ -36,7 +36,7 @@ class Topic(NamedTuple):
 
 
 def readable(text: bytes) -> bool:
-    """Tell whether bytes are text."""
+    """Return whether bytes are text."""
     return _CONTROL.search(text) is None
 
 
@@ -51,7 +51,7 @@ class Formats:
         self._declared = self._columns = self._attempts = 0
 
     def is_format(self, body: bytes) -> bool:
-        """Tell whether the bytes declare a format; in a time proportional to their number."""
+        """Return whether the bytes declare a format; in a time proportional to their number."""
         name, colon, fields = body.partition(b":")
         if not colon or len(body) >= 0xFFFF or _NAME.fullmatch(name) is None:
             return False
@@ -59,7 +59,7 @@ class Formats:
         return 0 < len(parts) <= _MOST_FIELDS and all(_FIELD.fullmatch(part) for part in parts)
 
     def is_value(self, body: bytes) -> bool:
-        """Tell whether the bytes are a key and a value of the type the key names."""
+        """Return whether the bytes are a key and a value of the type the key names."""
         if not body or len(body) < 1 + body[0]:
             return False
         key = _KEY.fullmatch(body, 1, 1 + body[0])
@@ -69,7 +69,7 @@ class Formats:
         return len(body) - 1 - body[0] == size and (key[1] != b"char" or readable(body[1 + body[0] :].rstrip(b"\0")))
 
     def knows(self, name: bytes) -> bool:
-        """Tell whether a format of that name was declared."""
+        """Return whether a format of that name was declared."""
         return name in self._fields
 
     def learn(self, body: bytes) -> bool:
@@ -115,12 +115,12 @@ class Formats:
         return wanted
 
     def _size(self, kind: bytes, depth: int) -> int | None:
-        """Give the bytes of a type; None where it is unknown, too large or contains itself."""
+        """Return the bytes of a type; None where it is unknown, too large or contains itself."""
         found = self._extent(kind, depth)
         return None if found is None else found[0]
 
     def _extent(self, kind: bytes, depth: int) -> tuple[int, int] | None:
-        """Give the bytes of a type and how many numbers they are; each type is looked into once for each depth."""
+        """Return the bytes of a type and how many numbers they are; each type is looked into once for each depth."""
         if kind.decode() in SIZES:
             return SIZES[kind.decode()], 1
         if depth == 0 or kind not in self._fields:
@@ -143,7 +143,7 @@ class Formats:
 
 
 def could_be(kind: int, raw: bytearray, begin: int, end: int) -> tuple[bool, int]:
-    """Tell whether bytes may be the body of a message, without copying them, and how many were looked at.
+    """Return whether bytes may be the body of a message, without copying them, and how many were looked at.
 
     Args:
         kind: of the message

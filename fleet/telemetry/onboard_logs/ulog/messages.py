@@ -19,7 +19,7 @@ Topics = Mapping[str, Topic]
 
 
 def system(params: Mapping[str, float], topics: Topics) -> int:
-    """Give the MAVLink system id, 1 where the log does not say."""
+    """Return the MAVLink system id, 1 where the log does not say."""
     said = params.get("MAV_SYS_ID", _latest(topics, "system_id"))
     return int(said) if said is not None and 1 <= said <= 255 else 1
 
@@ -41,7 +41,7 @@ def vehicle(params: Mapping[str, float], topics: Topics) -> str:
 
 
 def release(info: Mapping[str, Any]) -> tuple[int, int]:
-    """Give the release of PX4, major and minor; beyond any where the log does not say."""
+    """Return the release of PX4, major and minor; beyond any where the log does not say."""
     number = info.get("ver_sw_release")
     return (number >> 24 & 0xFF, number >> 16 & 0xFF) if isinstance(number, int) and number > 0 else (99, 0)
 
@@ -56,7 +56,7 @@ def firmware(info: Mapping[str, Any]) -> str:
 
 
 def epoch(topics: Topics) -> float | None:
-    """Give fleet time minus log time [s] as the satellites told it; late by a receiver's delay, 0.1 s.
+    """Return fleet time minus log time [s] as the satellites told it; late by a receiver's delay, 0.1 s.
 
     `time_ref_utc` is no help: it is the time zone the logger was set to.
     """
@@ -70,7 +70,7 @@ def epoch(topics: Topics) -> float | None:
 
 
 def said_by_topics(topics: Topics, version: tuple[int, int]) -> list[Said]:
-    """Give modes, arming and transitions, each where it changes."""
+    """Return modes, arming and transitions, each where it changes."""
     said: list[Said] = []
     status = topics.get("vehicle_status")
     if status is not None and hasattr(status, "nav_state"):
@@ -102,7 +102,7 @@ _MOST_CHANGES = 1000  # of one kind taken from one log
 
 
 def _latest(topics: Topics, field: str) -> float | None:
-    """Give what vehicle_status said most often, so that a damaged row does not decide."""
+    """Return what vehicle_status said most often, so that a damaged row does not decide."""
     status = topics.get("vehicle_status")
     if status is None or not hasattr(status, field):
         return None

@@ -51,7 +51,7 @@ class UlogLog:
             self.skipped.append("found no topic of the table in it, expected a PX4 log; check the file")
 
     def chunks(self) -> Iterator[Chunk]:
-        """Give the log in pieces of half a minute from its beginning; may be called again."""
+        """Return the log in pieces of half a minute from its beginning; may be called again."""
         times = [t.t for t in self._topics.values()]
         if not times and not self._said:
             return
@@ -74,7 +74,7 @@ class UlogLog:
         return Chunk(rows, said, {name: n for name, n in counts.items() if n})
 
     def _sorted(self, log: ULog, start_us: int) -> dict[str, Topic]:
-        """Give the topics by name, the second instance as `name.1`, rows in order of time."""
+        """Return the topics by name, the second instance as `name.1`, rows in order of time."""
         topics: dict[str, Topic] = {}
         early = 0
         while log.data_list:  # what is copied is given back
@@ -113,7 +113,7 @@ class UlogLog:
         return table
 
     def _best(self, field: str) -> tuple[Row, np.ndarray, np.ndarray] | None:
-        """Give the row of highest rank that flows, else the one that says most."""
+        """Return the row of highest rank that flows, else the one that says most."""
         most: tuple[Row, np.ndarray, np.ndarray] | None = None
         for row in ROWS[field]:
             if row.message not in self._topics:
@@ -163,7 +163,7 @@ def _read(opener: Callable[[], IO[bytes]], skipped: list[str]) -> tuple[ULog, in
 
 
 def _believed_start(log: ULog, start_us: int, skipped: list[str]) -> int:
-    """Give when the log began [us]; not the stamp in its header where that does not fit its rows."""
+    """Return when the log began [us]; not the stamp in its header where that does not fit its rows."""
     stamps = np.concatenate([data.data["timestamp"].astype(np.int64) for data in log.data_list] or [np.zeros(0, int)])
     if len(stamps) == 0:
         return start_us if start_us < LATEST_US else 0
@@ -179,7 +179,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _lay(row: Row, topic: Topic) -> tuple[np.ndarray, np.ndarray, int] | None:
-    """Give times, values and how many rows were refused; None where the log lacks what the row reads.
+    """Return times, values and how many rows were refused; None where the log lacks what the row reads.
 
     Rows are independent of each other, so a long topic is laid out in blocks, whose intermediate results need no room.
     """

@@ -66,7 +66,7 @@ class Sieve:
     # --- what pyulog calls ---
 
     def read(self, n: int) -> bytes:
-        """Give the next `n` bytes, fewer at the end."""
+        """Return the next `n` bytes, fewer at the end."""
         while len(self._good) - self._read_at < n:
             batch = next(self._source, None)
             if batch is None:
@@ -84,7 +84,7 @@ class Sieve:
         return self._read_at
 
     def tell(self) -> int:
-        """Give a position of no meaning."""
+        """Return a position of no meaning."""
         return self._read_at
 
     def close(self) -> None:
@@ -189,7 +189,7 @@ class Sieve:
         return bytes(out)
 
     def _next(self) -> bytes | None:
-        """Step over one message, or over damage; give what may pass, empty where it may not; None for damage."""
+        """Step over one message, or over damage; return what may pass, empty where it may not; None for damage."""
         self._slow += 1
         size, kind = _head(self._raw, self._at)
         end = self._offset + 3 + size
@@ -262,7 +262,7 @@ class Sieve:
             self._damage = None
 
     def _judge(self, kind: int, body: bytes) -> bytes | None:
-        """Give the bytes that may pass: empty for a good message nobody needs, None for a bad one."""
+        """Return the bytes that may pass: empty for a good message nobody needs, None for a bad one."""
         if kind == _DATA:
             return self._data(body)
         if kind == ord("B") and self.messages == 0 and 40 <= len(body) < 100:  # anywhere else it is damage
@@ -300,7 +300,7 @@ class Sieve:
         return struct.pack("<HB", topic.least + 2, _DATA) + body[: topic.least + 2]
 
     def _in_time(self, stamp: int) -> bool:
-        """Tell whether a stamp goes on from the last one, or many agree that time jumped."""
+        """Return whether a stamp goes on from the last one, or many agree that time jumped."""
         if stamp < LATEST_US and (self._now_us is None or abs(stamp - self._now_us) < JUMP_US):
             self._now_us = stamp if self._now_us is None else max(stamp, self._now_us)
             self._strangers = 0
@@ -328,7 +328,7 @@ class Sieve:
 
 
 def _is_good(kind: int, body: bytes, formats: Formats) -> bool:
-    """Tell whether a message's bytes are what its kind must be."""
+    """Return whether a message's bytes are what its kind must be."""
     if kind == _DATA:
         topic = formats.topics.get(_short(body)[0]) if len(body) > 2 else None
         return topic is not None and topic.least <= len(body) - 2 <= topic.most

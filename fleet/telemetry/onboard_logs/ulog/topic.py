@@ -19,7 +19,7 @@ class Topic:
         self._prefix = ""
 
     def __getattr__(self, name: str) -> Any:
-        """Give a field; one the log lacks is an AttributeError, and the row that asks does not apply."""
+        """Return a field; one the log lacks is an AttributeError, and the row that asks does not apply."""
         if name.startswith("_"):
             raise AttributeError(name)
         key = self._prefix + name
@@ -33,17 +33,17 @@ class Topic:
         raise AttributeError(name)
 
     def beside(self, name: str) -> "Topic":
-        """Give another topic with its values at the times of this one; the second instance is `name.1`."""
+        """Return another topic with its values at the times of this one; the second instance is `name.1`."""
         if name not in self._others:
             raise AttributeError(name)
         return self._others[name]._like(self.t, "")
 
     def strip(self) -> None:
-        """Give back the fields; the times stay."""
+        """Return the fields; the times stay."""
         self._data = {}
 
     def part(self, begin: int, end: int) -> "Topic":
-        """Give some of its rows, the other topics whole."""
+        """Return some of its rows, the other topics whole."""
         return Topic(self.t[begin:end], {name: values[begin:end] for name, values in self._data.items()}, self._others)
 
     def __len__(self) -> int:
@@ -69,7 +69,7 @@ def _between(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def in_order(stamp_us: np.ndarray) -> np.ndarray:
-    """Give the indices of rows in order of time, each time once, without stamps that stray."""
+    """Return the indices of rows in order of time, each time once, without stamps that stray."""
     if len(stamp_us) < 2 or (np.diff(stamp_us) > 0).all():
         return np.arange(len(stamp_us))
     near = np.abs(stamp_us - median_filter(stamp_us, 5, mode="nearest")) < _STRAY_S * 1e6

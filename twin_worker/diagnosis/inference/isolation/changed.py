@@ -62,7 +62,7 @@ class Equation:
 
 
 def equations_of(sight: Sight) -> Iterator[Equation]:
-    """Give every channel that was calibrated well enough, with the terms it may change by."""
+    """Return every channel that was calibrated well enough, with the terms it may change by."""
     made = sight.case.terms(sight.granted)
     for equation, channel in SHOWN_BY.items():
         if sight.base.r2.get(equation, 1.0) > WELL:
@@ -78,7 +78,7 @@ def equations_of(sight: Sight) -> Iterator[Equation]:
 
 
 def _since(sight: Sight, J: np.ndarray, apart_s: float = 0.0) -> Gain:
-    """Give what terms, (n, 1, k), gain since their best instant, so far from the ends [s]."""
+    """Return what terms, (n, 1, k), gain since their best instant, so far from the ends [s]."""
     t = sight.case.t
     rows, whens = gates_of(t, Onset.STEP)
     gain, _ = solved(sight, *normals(sight, J, rows, Onset.STEP))
@@ -88,7 +88,7 @@ def _since(sight: Sight, J: np.ndarray, apart_s: float = 0.0) -> Gain:
 
 
 def _freed(sight: Sight, J: np.ndarray) -> Sight:
-    """Give the same with terms, (n, 1, k), free throughout the flight, as nuisances are."""
+    """Return the same with terms, (n, 1, k), free throughout the flight, as nuisances are."""
     out = copy(sight)
     out.Jn = np.concatenate([sight.Jn, J], axis=2)
     between = np.einsum("tci,tcj->ij", sight.Jn, J)
@@ -99,14 +99,14 @@ def _freed(sight: Sight, J: np.ndarray) -> Sight:
 
 
 def _more(channel: str, made: Terms) -> dict[str, np.ndarray]:
-    """Give what a channel may feel that no wing does: thrust, and loads that shift with the force on them."""
+    """Return what a channel may feel that no wing does: thrust, and loads that shift with the force on them."""
     f_x, f_y, _ = made.aside["f"]
     more = {"force_x": {"thrust": made.terms["T"][0]}, "roll": {"f_y": f_y}, "pitch": {"f_x": f_x}}
     return more.get(channel, {})
 
 
 def _lagged(x: np.ndarray, tau: float) -> np.ndarray:
-    """Give x, (n,), behind a first-order lag [s]."""
+    """Return x, (n,), behind a first-order lag [s]."""
     kept = np.exp(-STEP_S / tau)
     out: np.ndarray = lfilter([1.0 - kept], [1.0, -kept], x, zi=[kept * x[0]])[0]
     return out

@@ -34,12 +34,12 @@ class Found:
 
     @property
     def worth(self) -> float:
-        """Give the gain less the price of its numbers."""
+        """Return the gain less the price of its numbers."""
         return self.gain - PRICE * self.guess.size
 
 
 def scan(sight: Sight) -> list[Found]:
-    """Give for every effect, object and kind of onset the best found, best first."""
+    """Return for every effect, object and kind of onset the best found, best first."""
     out = []
     for effect, of in candidates(sight):
         out += _by_start(sight, effect, of) if effect.starts else _by_slope(sight, effect, of)
@@ -47,7 +47,7 @@ def scan(sight: Sight) -> list[Found]:
 
 
 def candidates(sight: Sight) -> Iterator[tuple[Effect, str]]:
-    """Give every effect and what it may befall that this calibration can judge; those of the scatter left out."""
+    """Return every effect and what it may befall that this calibration can judge; those of the scatter left out."""
     for effect in catalogue().values():
         if not effect.variance:
             for of in effect.of or ("",):
@@ -56,7 +56,7 @@ def candidates(sight: Sight) -> Iterator[tuple[Effect, str]]:
 
 
 def covered(base: Baseline, effect: Effect, of: str) -> bool:
-    """Tell whether the equation an effect shows in was calibrated well enough to judge it."""
+    """Return whether the equation an effect shows in was calibrated well enough to judge it."""
     if effect.channel in ("gyro", "imu"):
         return base.vane  # an estimator's rates and velocity have lost the fault
     equation = _SURFACE.get(of) or _SHOWS_IN.get(effect.channel)
@@ -89,7 +89,7 @@ def _by_slope(sight: Sight, effect: Effect, of: str) -> list[Found]:
 
 
 def gates_of(t: np.ndarray, kind: Onset, every: int = _EVERY) -> tuple[np.ndarray, list[When]]:
-    """Give the courses to try: gates (m, n), and what they are; for steps, gates hold rows (m,), `every` so many."""
+    """Return the courses to try: gates (m, n), and what they are; for steps, gates hold rows (m,), `every` so many."""
     first, last = t[0] + _EDGE_S[0], t[-1] - _EDGE_S[1]
     if kind is Onset.ALWAYS:
         return np.ones((1, len(t))), [ALWAYS]
@@ -132,7 +132,7 @@ def _begun(
 
 
 def solved(sight: Sight, A: np.ndarray, b: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give gain (m,) and parameters (m, k) of each course, the nuisances free within their spread."""
+    """Return gain (m,) and parameters (m, k) of each course, the nuisances free within their spread."""
     inverse = np.linalg.inv(sight.Ann)
     A = A - C @ inverse @ np.swapaxes(C, 1, 2)
     b = b - C @ (inverse @ sight.bn)

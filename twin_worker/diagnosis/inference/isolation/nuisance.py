@@ -69,29 +69,29 @@ class Nuisance:
     step: float
 
     def guess(self, x: float) -> Guess:
-        """Give it at work."""
+        """Return it at work."""
         par = [0.0] * self.effect.size
         par[self.index] = x
         return Guess(self.effect, self.of, tuple(par), ALWAYS)
 
     @property
     def sensor(self) -> bool:
-        """Tell whether it is a sensor's bias."""
+        """Return whether it is a sensor's bias."""
         return self.effect.name in ("accel_bias", "gyro_bias", "heading_bias", "imu_misalignment")
 
     @property
     def released(self) -> float:
-        """Give the spreads past which it is no nuisance any more."""
+        """Return the spreads past which it is no nuisance any more."""
         return SOUND if self.sensor else RELEASED
 
     @property
     def scatter(self) -> bool:
-        """Tell whether no effect stands for it, so that it can be handed to none."""
+        """Return whether no effect stands for it, so that it can be handed to none."""
         return self.of == "side" or self.name in ("baro", "lapse")
 
     @property
     def weather(self) -> bool:
-        """Tell whether this is weather, of which any amount may be nominal."""
+        """Return whether this is weather, of which any amount may be nominal."""
         return self.effect.name in ("wind_steady", "wind_shear")
 
 
@@ -124,7 +124,7 @@ def wanders(known: Sequence[Nuisance], vane: bool) -> tuple[Wander, ...]:
 
 
 def wandering(columns: np.ndarray, several: Sequence[Wander], t: np.ndarray) -> np.ndarray:
-    """Give the slopes of slow courses, (n, c, wanders), by those of what wanders, (n, c, nuisances), at t (n,)."""
+    """Return the slopes of slow courses, (n, c, wanders), by those of what wanders, (n, c, nuisances), at t (n,)."""
     share = (t - t[0]) / max(t[-1] - t[0], 1e-9)
     waves = np.sqrt(2.0) * np.cos(np.pi * np.outer(share, [one.wave for one in several]))
     return columns[:, :, [one.of for one in several]] * waves[:, None, :]

@@ -16,7 +16,7 @@ _STRETCH = (1.5, 1.2, 1.1)
 
 
 def refine(sight: Sight, guess: Guess, rounds: int = _ROUNDS, move: bool = True) -> Found:
-    """Give the guess fitted, and its gain; `move` its onset too."""
+    """Return the guess fitted, and its gain; `move` its onset too."""
     before = sight.cost(())
     now = sight.cost((guess,))
     if now > before:
@@ -48,12 +48,12 @@ def _newton(sight: Sight, guess: Guess, now: float, rounds: int) -> tuple[Guess,
 
 
 def steps(guess: Guess) -> np.ndarray:
-    """Give steps for slopes about a guess, (k,)."""
+    """Return steps for slopes about a guess, (k,)."""
     return np.array([0.3 * max(p.step, 0.1 * abs(x)) for p, x in zip(guess.effect.parameters, guess.par, strict=True)])
 
 
 def normal(sight: Sight, guess: Guess) -> tuple[np.ndarray, np.ndarray]:
-    """Give the normal equations about a guess, nuisances profiled out, (k, k) and (k,)."""
+    """Return the normal equations about a guess, nuisances profiled out, (k, k) and (k,)."""
     J = sight.slopes(guess, steps(guess))
     e = sight.clipped((guess,))
     C = np.einsum("tci,tcj->ij", J, sight.Jn)

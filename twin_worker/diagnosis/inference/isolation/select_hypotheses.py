@@ -83,15 +83,15 @@ class Joint:
         self._none, self._bare = self._sight.cost(()), self._sight.powers(())
 
     def gain(self, named: list[Named]) -> float:
-        """Give the gain of all."""
+        """Return the gain of all."""
         return self._none - self._sight.cost([one.found.guess for one in named])
 
     def borne(self, named: list[Named]) -> np.ndarray:
-        """Give what all gain by channel, (c,)."""
+        """Return what all gain by channel, (c,)."""
         return self._bare - self._sight.powers([one.found.guess for one in named])
 
     def better(self, more: list[Named], fewer: list[Named]) -> bool:
-        """Tell whether one more is worth it: together they gain enough, and do not merely cancel each other."""
+        """Return whether one more is worth it: together they gain enough, and do not merely cancel each other."""
         gain = self.gain(more)
         without = min(self.gain([one for one in more if one is not left]) for left in more)
         cancelling = gain - without > _CANCEL * gain
@@ -114,7 +114,7 @@ class Beside:
         self._before = sight.powers(())
 
     def earned(self, found: Found) -> bool:
-        """Tell whether a guess gains what it must, and where the named are not merely wrong."""
+        """Return whether a guess gains what it must, and where the named are not merely wrong."""
         least = needed(self._sight, self._named, found)
         if not self._named or found.gain <= least:
             return found.gain > least
@@ -123,7 +123,7 @@ class Beside:
 
 
 def beyond(sight: Sight, own: np.ndarray, borne: np.ndarray) -> float:
-    """Give what a guess gains beyond errors of those beside it, which are a share of what they gain there.
+    """Return what a guess gains beyond errors of those beside it, which are a share of what they gain there.
 
     Args:
         own, borne: gain of the guess and of the others by channel, (c,)
@@ -154,14 +154,14 @@ def best(sight: Sight, beside: Sequence[Guess]) -> list[Found]:
 
 
 def rank(sight: Sight, found: Found) -> float:
-    """Give what a guess is worth: each number beyond the first must earn its price, and its share."""
+    """Return what a guess is worth: each number beyond the first must earn its price, and its share."""
     extra = found.guess.effect.price - 1
     share = 0.0 if sight.base.vane else _COARSE * extra
     return found.gain * (1.0 - share) - PRICE * found.guess.size
 
 
 def tie(sight: Sight, found: Found) -> float:
-    """Give how much less another guess may be worth and still not be told apart."""
+    """Return how much less another guess may be worth and still not be told apart."""
     if not sight.base.vane:
         return max(_LEAST_TIE, _COARSE * found.gain)
     return max(_LEAST_TIE, _NEXT * found.gain, min(_FINE * found.gain, _WIDEST_TIE))
@@ -182,7 +182,7 @@ def choose(sight: Sight, found: list[Found]) -> Named:
 
 
 def needed(sight: Sight, named: list[Named], found: Found) -> float:
-    """Give the gain a guess must reach: more than chance, and a share of the first one's."""
+    """Return the gain a guess must reach: more than chance, and a share of the first one's."""
     known = sight.base.chance
     chance = _CHANCE_COARSE * known.get(found.kind, 0.0)
     if sight.base.vane:
@@ -194,13 +194,13 @@ def needed(sight: Sight, named: list[Named], found: Found) -> float:
 
 
 def _akin(kind: str, guess: Guess) -> bool:
-    """Tell whether chance of this kind speaks of a guess too: the same effect, or the same surface."""
+    """Return whether chance of this kind speaks of a guess too: the same effect, or the same surface."""
     label = kind.partition("|")[0]
     return label == guess.label or (guess.effect.stage is Stage.DELTA and label.endswith(f":{guess.of}"))
 
 
 def believable(sight: Sight, guess: Guess) -> bool:
-    """Tell whether a guess is more than data sheets allow a sensor, by numbers of its own that are not absurd."""
+    """Return whether a guess is more than data sheets allow a sensor, by numbers of its own that are not absurd."""
     bounds = {
         n.index: n.released * max(sight.base.spread.get(n.name, n.floor), n.floor)
         for n in sight.nuisances
@@ -214,7 +214,7 @@ def believable(sight: Sight, guess: Guess) -> bool:
 
 
 def _own(sight: Sight, guess: Guess) -> float:
-    """Give the share of a guess's gain that is not of numbers that only come along."""
+    """Return the share of a guess's gain that is not of numbers that only come along."""
     aside = np.array([p.aside for p in guess.effect.parameters])
     if not aside.any():
         return 1.0
@@ -236,7 +236,7 @@ def _again(sight: Sight, named: list[Named], weather: tuple[Guess, ...]) -> list
 
 
 def turbulent(sight: Sight) -> tuple[float, float]:
-    """Give gain and share of variance of gusts: sideslip, lift and airspeed scatter together, two sensors agree."""
+    """Return gain and share of variance of gusts: sideslip, lift and airspeed scatter together, two sensors agree."""
     kept = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
     calm = [CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z", "gyro_roll", "gyro_pitch", "gyro_yaw")]
     left = sight.left() / sight.base.usual

@@ -26,7 +26,7 @@ class Tone(NamedTuple):
 
 
 def tones(sight: Sight) -> Iterator[Tone]:
-    """Give each calibrated equation's clearest tone in what is left, the nuisances taken off."""
+    """Return each calibrated equation's clearest tone in what is left, the nuisances taken off."""
     t, left = sight.case.t, (sight.e + np.einsum("tck,k->tc", sight.Jn, sight.xn)) * sight.ok[:, None]
     hertz = np.arange(*_BAND_HZ, 1.0 / (_FINE * (t[-1] - t[0])))
     starts = np.linspace(0, len(t), _BLOCKS, endpoint=False).astype(int)

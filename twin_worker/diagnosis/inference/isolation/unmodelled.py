@@ -55,19 +55,19 @@ class Odd(NamedTuple):
         return ":".join(filter(None, (self.rule, self.channel, self.term)))
 
     def limit(self, base: Baseline) -> float:
-        """Give what it must gain to be more than chance."""
+        """Return what it must gain to be more than chance."""
         rule = RULES[self.rule]
         return max(rule.least, rule.chance * base.chance.get(self.kind, 0.0))
 
     def counts(self, base: Baseline, gained: float, loud: bool) -> bool:
-        """Tell whether names that gained so much in all, 0 without any, do not explain it."""
+        """Return whether names that gained so much in all, 0 without any, do not explain it."""
         rule = RULES[self.rule]
         least = (rule.loud if loud else rule.beside) * gained
         return self.worth > max((rule.against if gained else 1.0) * self.limit(base), least)
 
 
 def oddities(sight: Sight, plain: Sight) -> list[Odd]:
-    """Give what every channel would gain by changing since its best instant, and how it hums; best first.
+    """Return what every channel would gain by changing since its best instant, and how it hums; best first.
 
     Plain telemetry knows its equations too loosely to tell.
 
@@ -88,5 +88,5 @@ def oddities(sight: Sight, plain: Sight) -> list[Odd]:
 
 
 def strange(odds: Sequence[Odd], base: Baseline, gained: float, loud: bool) -> Odd | None:
-    """Give the first that names do not explain; `gained` by them in all, 0 without any; `loud`: a channel stays so."""
+    """Return first that names do not explain; `gained` by them in all, 0 without any; `loud`: a channel stays so."""
     return next((odd for odd in odds if odd.counts(base, gained, loud)), None)

@@ -56,7 +56,7 @@ class Sight:
         self._lay()
 
     def part(self, span: np.ndarray) -> "Sight":
-        """Give the same with only the rows of `span`, (n,) bool, counting."""
+        """Return the same with only the rows of `span`, (n,) bool, counting."""
         out = copy(self)
         out.ok = self.ok & span
         out.raw, out.e = self.raw * out.ok[:, None], self.e * out.ok[:, None]
@@ -79,7 +79,7 @@ class Sight:
         return replace(noise, sigma=noise.sigma * np.clip(scatter, _QUIETEST, highest))
 
     def whitened(self, guesses: Sequence[Guess]) -> np.ndarray:
-        """Give whitened residuals with these beside the granted guesses, zero where not trusted, (n, c)."""
+        """Return whitened residuals with these beside the granted guesses, zero where not trusted, (n, c)."""
         return self._white(self.case, guesses)
 
     def _white(self, case: Case, guesses: Sequence[Guess]) -> np.ndarray:
@@ -88,7 +88,7 @@ class Sight:
         return e
 
     def clipped(self, guesses: Sequence[Guess]) -> np.ndarray:
-        """Give the same, no row counting more than `clip`."""
+        """Return the same, no row counting more than `clip`."""
         return np.clip(self.whitened(guesses), -self.clip, self.clip)
 
     def grant(self, granted: tuple[Guess, ...]) -> None:
@@ -108,7 +108,7 @@ class Sight:
         self._profile()
 
     def _varied(self, k: int) -> np.ndarray:
-        """Give the whitened residuals under coefficients of fewer flights."""
+        """Return the whitened residuals under coefficients of fewer flights."""
         return self._white(Case(self.case.flight, self.base.varied(k), like=self.case), ())
 
     def _profile(self) -> None:
@@ -132,14 +132,14 @@ class Sight:
             self.precision[worst] = _TIGHT
 
     def held(self) -> "Sight":
-        """Give the same with every nuisance held to its spread, none handed to the hypotheses."""
+        """Return the same with every nuisance held to its spread, none handed to the hypotheses."""
         out = copy(self)
         out.Ann = self.Ann - np.diag(self.precision) + np.diag(self.usual)
         out.xn = np.linalg.solve(out.Ann, self.bn)
         return out
 
     def _bounds(self, more: int) -> np.ndarray:
-        """Give how many spreads each nuisance may be off before it is handed over, (nuisances + wanders + more,)."""
+        """Return how many spreads each nuisance may be off before it is handed over, (nuisances + wanders + more,)."""
         own = [n.released for n in self.nuisances]
         return np.array([*own, *(own[one.of] for one in self.wanders), *more * [RELEASED]])
 
@@ -148,22 +148,22 @@ class Sight:
         return max(spread, 2.5) if self.weather and n.effect.name == "wind_steady" else spread
 
     def cost(self, guesses: Sequence[Guess]) -> float:
-        """Give the sum of squares with these guesses, the nuisances profiled out."""
+        """Return the sum of squares with these guesses, the nuisances profiled out."""
         return self.cost_of(self.clipped(guesses))
 
     def cost_of(self, e: np.ndarray) -> float:
-        """Give the sum of squares of whitened residuals, the nuisances profiled out."""
+        """Return the sum of squares of whitened residuals, the nuisances profiled out."""
         b = -np.einsum("tci,tc->i", self.Jn, e)
         return float((e * e).sum() - b @ np.linalg.solve(self.Ann, b))
 
     def powers(self, guesses: Sequence[Guess]) -> np.ndarray:
-        """Give each channel's sum of squares with these guesses, the nuisances profiled out, (c,)."""
+        """Return each channel's sum of squares with these guesses, the nuisances profiled out, (c,)."""
         e = self.clipped(guesses)
         left = e - self.Jn @ np.linalg.solve(self.Ann, np.einsum("tci,tc->i", self.Jn, e))
         return np.asarray((left * left).sum(axis=0))
 
     def slopes(self, guess: Guess, step: np.ndarray) -> np.ndarray:
-        """Give how the whitened residuals change with each parameter about a guess, (n, c, k)."""
+        """Return how the whitened residuals change with each parameter about a guess, (n, c, k)."""
         return self.whole(self.plain_slopes(guess, step))
 
     def whole(self, J: np.ndarray) -> np.ndarray:
@@ -181,7 +181,7 @@ class Sight:
         return np.stack([first, second]) * self.ok[None, :, None, None]
 
     def plain_slopes(self, guess: Guess, step: np.ndarray) -> np.ndarray:
-        """Give how the residuals change with each parameter about a guess, (n, c, k)."""
+        """Return how the residuals change with each parameter about a guess, (n, c, k)."""
         here = self.case.residuals((*self.granted, guess))
         out = []
         for k, h in enumerate(step):
@@ -195,6 +195,6 @@ class Sight:
         return np.stack(out, axis=2)
 
     def left(self) -> np.ndarray:
-        """Give the mean square of each channel's whitened residual, nuisances taken off, (c,)."""
+        """Return the mean square of each channel's whitened residual, nuisances taken off, (c,)."""
         e = self.e + self.Jn @ self.xn
         return (e[self.ok] ** 2).mean(axis=0) if self.ok.any() else np.zeros(len(CHANNELS))

@@ -34,7 +34,7 @@ class Proof:
 
     @property
     def gain(self) -> float:
-        """Give the share of the residual that went."""
+        """Return the share of the residual that went."""
         return 1.0 - self.after / self.before if self.before > 0 else 0.0
 
 
@@ -81,7 +81,7 @@ def _half(sight: Sight, guesses: tuple[Guess, ...], odd: bool) -> np.ndarray:
 
 
 def _powers(sight: Sight) -> np.ndarray:
-    """Give the mean square of what each channel leaves, (c,)."""
+    """Return the mean square of what each channel leaves, (c,)."""
     e = (sight.e + sight.Jn @ sight.xn)[sight.ok]
     return (e**2).mean(axis=0) if e.size else np.zeros(e.shape[1])
 

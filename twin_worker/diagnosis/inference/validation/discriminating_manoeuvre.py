@@ -34,14 +34,14 @@ def manoeuvre(sight: Sight, one: Guess, other: Guess) -> str:
 
 
 def _power(sight: Sight, one: Guess, other: Guess) -> np.ndarray:
-    """Give the squared whitened difference of two explanations, what nuisances can hide taken off, (n,)."""
+    """Return the squared whitened difference of two explanations, what nuisances can hide taken off, (n,)."""
     d = sight.whitened((one,)) - sight.whitened((other,))
     hidden = np.linalg.solve(sight.Ann, np.einsum("tci,tc->i", sight.Jn, d))
     return ((d - sight.Jn @ hidden) ** 2).sum(axis=1)
 
 
 def _flown(sight: Sight) -> Iterator[tuple[str, np.ndarray]]:
-    """Give each manoeuvre flown long enough, and its rows, (n,) bool."""
+    """Return each manoeuvre flown long enough, and its rows, (n,) bool."""
     for name, rows in _manoeuvres(sight.case.flight):
         rows = thinned(rows) & sight.ok
         if rows.sum() * STEP_S >= _LEAST_S:
@@ -49,7 +49,7 @@ def _flown(sight: Sight) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _manoeuvres(flight: Flight) -> Iterator[tuple[str, np.ndarray]]:
-    """Give rows of each manoeuvre on the flight's own grid."""
+    """Return rows of each manoeuvre on the flight's own grid."""
     r = flight.readings
     speed = np.hypot(np.hypot(r["v_n"], r["v_e"]), r["v_d"])
     air = r.get("Va", speed)

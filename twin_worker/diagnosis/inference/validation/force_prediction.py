@@ -56,7 +56,7 @@ def forces(case: Case, weather: tuple[Guess, ...], fitted: tuple[Guess, ...]) ->
 
 
 def rms(case: Case, error: np.ndarray) -> float:
-    """Give the rms of an error, (n, 3), on trusted rows held out."""
+    """Return the rms of an error, (n, 3), on trusted rows held out."""
     rows = case.ok & blocks(case.t, odd=True) & np.isfinite(error).all(axis=1)
     return float(np.sqrt((error[rows] ** 2).mean())) if rows.any() else float("nan")
 
@@ -76,7 +76,7 @@ def tell(case: Case, made: Terms, way: tuple[str, str, str]) -> np.ndarray:
     beta = flow.beta
 
     def axial(c_z: np.ndarray) -> np.ndarray:
-        """Give the axial force coefficient without thrust."""
+        """Return the axial force coefficient without thrust."""
         alpha = A[0] + A[1] * c_z + A[2] * c_z**2 + A[3] * hats[1] + A[5] * d_e
         lift = add.get("lift", 0.0) * -c_z + add.get("C_L", 0.0)
         clean = base.coef["X"] @ eq.force_terms(c_z, d_e, beta)

@@ -14,7 +14,7 @@ _MOST = np.pi  # attitude error that counts [rad]
 
 
 def stray(case: Case, guesses: tuple[Guess, ...]) -> float:
-    """Give the rms attitude error of free flights from measured starts, on blocks held out [rad].
+    """Return the rms attitude error of free flights from measured starts, on blocks held out [rad].
 
     Args:
         case: the flight

@@ -18,7 +18,7 @@ _CLOCK_S = 0.01  # clocks of messages agree no better [s]
 
 
 def covariances(sight: Sight, weather: tuple[Guess, ...], guesses: Sequence[Guess]) -> list[np.ndarray]:
-    """Give the covariance of each fitted guess's parameters, (k, k).
+    """Return the covariance of each fitted guess's parameters, (k, k).
 
     A sandwich over blocks of 10 s, the effects joint and the nuisances profiled out, plus the spread between fits that
     leave a quarter of the time at work out; and a floor.
@@ -37,7 +37,7 @@ def covariances(sight: Sight, weather: tuple[Guess, ...], guesses: Sequence[Gues
 
 
 def _floor(sight: Sight, guess: Guess) -> np.ndarray:
-    """Give the variance no flight can undercut, (k,): clocks, the simulation's form, what is usual of the aircraft.
+    """Return the variance no flight can undercut, (k,): clocks, the simulation's form, what is usual of the aircraft.
 
     What was always there cannot be told from what this aircraft has by itself.
     """
@@ -88,7 +88,7 @@ def _sandwich(sight: Sight, guesses: Sequence[Guess]) -> np.ndarray:
 
 
 def _jackknife(sight: Sight, granted: tuple[Guess, ...], guess: Guess) -> np.ndarray:
-    """Give the covariance that fits without each quarter of the time at work show, (k, k)."""
+    """Return the covariance that fits without each quarter of the time at work show, (k, k)."""
     sight.grant(granted)
     t = sight.case.t
     at_work = t[(guess.when.gate(t) > _WORKS) & sight.ok]

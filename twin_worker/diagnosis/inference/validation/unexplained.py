@@ -11,7 +11,7 @@ _TERMS = 2  # of the free-form fit
 
 
 def stretches(t: np.ndarray, e: np.ndarray, ok: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """Give the stretches where a whitened residual, (n,), is loud [s]."""
+    """Return the stretches where a whitened residual, (n,), is loud [s]."""
     power = np.where(ok, np.nan_to_num(e) ** 2, 0.0)
     weight = np.convolve(ok.astype(float), np.ones(_WINDOW), "same")
     level = np.sqrt(np.convolve(power, np.ones(_WINDOW), "same") / np.maximum(weight, 1.0))
