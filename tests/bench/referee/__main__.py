@@ -41,6 +41,8 @@ LIMITS = {  # by fault: what is measured, and the most that is allowed
 _WARM = 0.95  # share of the aircraft that must have a model before the first fault [-]
 _USUAL_S = 15.0  # between predictions of an aircraft, at most, before the first fault [s]
 ANNOUNCED_S = 1.2  # after which everyone has said what it holds now [s]
+_BEFORE_S = 4.0  # looked at before a fault [s]
+_BLOCKING = ("freeze", "cut", "stall")  # whoever is away loses its aircraft, and has them back afterwards
 RANDOM = ("kill", "freeze", "leave", "join", "cut", "stall", "delay", "blink", "restart_router")
 
 
@@ -64,6 +66,10 @@ def happen(site: Site, name: str, rng: np.random.Generator) -> dict[str, Any]:
         faults.leave(site, _oldest(site))
     site.reader.forget()
     usual_since = time.monotonic()
+    everyone, before = set(range(site.uavs)), site.reader.holders()
+    faults.wait(_BEFORE_S)
+    calm_s = {uav: site.reader.gap({uav}, usual_since) for uav in everyone}
+    begun, names = time.monotonic(), {one.name for one in site.workers}
     fault = faults.ALL[name]
     able = [one for one in site.workers if one.way is not None or fault not in faults.ON_THE_WAY]
     able = [one for one in able if one is not site.spared or fault not in faults.ENDS]
@@ -76,11 +82,25 @@ def happen(site: Site, name: str, rng: np.random.Generator) -> dict[str, Any]:
         found = {"failed": str(error), "claims": claims}
     limits = LIMITS.get(name, {})
     found["over"] = [key for key, most_of in limits.items() if not (found.get(key, np.inf) <= most_of)]
-    others = set(range(site.uavs))
+    after = site.reader.holders()
+    moved = {uav for uav in everyone if after.get(uav) != before.get(uav)}
+    stay = everyone - moved
+    if name not in _BLOCKING:
+        joined = {one.name for one in site.workers} - names
+        left = names - {one.name for one in site.workers}
+        found["moved_without_cause"] = sum(
+            before.get(uav) not in left and after.get(uav) not in joined for uav in moved
+        )
+    found["not_moved"] = {
+        "aircraft": len(stay),
+        "gap_s": site.reader.gap(stay, begun),
+        "added_s": max((site.reader.gap({uav}, begun) - calm_s[uav] for uav in stay), default=0.0),
+        "before_s": max((calm_s[uav] for uav in stay), default=0.0),
+    }
     found |= {
         "epoch_regressions": site.reader.regressions,
         "fault": name,
-        "usual_s": site.reader.usual(others, usual_since),
+        "usual_s": site.reader.usual(everyone, usual_since),
         "load": os.getloadavg()[0],
     }
     print(json.dumps(found), flush=True)
