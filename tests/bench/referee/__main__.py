@@ -26,7 +26,7 @@ from twin_worker.ownership.rendezvous import owners
 from . import faults
 from .site import PACE, Site, Worker, until
 
-LIMITS = {  # by fault: what is measured, and the most that is allowed
+LIMITS: dict[str, dict[str, float]] = {  # by fault: what is measured, and the most that is allowed
     "kill": {"taken_s": 0.5, "gap_s": 0.5},
     "freeze": {"taken_s": 1.5, "gap_s": 1.5},
     "leave": {"gap_s": 0.3},
