@@ -15,7 +15,7 @@ from fleet.telemetry.onboard_logs.ulog.formats import Formats
 from fleet.telemetry.recording.opening import RATIO, UNFOLDED, Source
 from gateway.links.isolated_replay import divided
 from gateway.settings.link_spec import read_spec
-from tests.bench.security.hostile_files import CPU_S, FILES, MEMORY_MB, a_flight, read_apart, written
+from tests.bench.security.hostile_files import CPU_S, FILES, MEMORY_MB, a_flight, read_apart, rightful_files, written
 
 SHORT = ("regex", "nested formats", "records in records", "DataFlash, formats over and over", "tlog with gaps")
 """Those that are over quickly; `python -m tests.bench.security` reads all."""
@@ -25,6 +25,10 @@ SHORT = ("regex", "nested formats", "records in records", "DataFlash, formats ov
 def test_a_hostile_file_ends_soon_in_little_memory_with_a_sentence(what: str, tmp_path: Path) -> None:
     cost = read_apart(written(tmp_path, what))
     assert cost["cpu_s"] <= CPU_S and cost["mb"] <= MEMORY_MB and cost["said"], cost
+
+
+def test_a_sound_log_of_each_kind_is_read() -> None:
+    assert rightful_files()
 
 
 def test_every_file_of_the_table_is_made() -> None:

@@ -15,6 +15,8 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from tests.ulog_writer import flight, ulog
+
 CPU_S, MEMORY_MB = 30.0, 300.0
 _ROW = "vehicle_attitude"
 _READ = """
@@ -274,7 +276,7 @@ def _attempt(what: str) -> Callable[[], str]:
 
 def rightful_files() -> str:
     """A short log of each kind, whole: it is read, and the reader costs what it costs the hostile ones at least."""
-    made = {"a.ulg": _rows(2000), "a.tlog": a_flight(), "a.parauav": many_ids()[:20_000]}
+    made = {"a.ulg": ulog(flight((1, 13), 20.0)), "a.tlog": a_flight(), "a.parauav": many_ids()[:20_000]}
     with tempfile.TemporaryDirectory() as folder:
         for name, data in made.items():
             path = Path(folder) / name
