@@ -31,7 +31,8 @@ TOLD_OF_GUIDANCE = (*_ARDUPLANE[:5], "AIRSPEED_CRUISE", "TECS_CLMB_MAX", "TECS_S
 _CONTROLS = 1024  # cached fixed-wing controllers
 _Given = tuple[tuple[str, float], ...]
 CRUISE_OF = {"arduplane": "AIRSPEED_CRUISE", "px4": "FW_AIRSPD_TRIM", "textbook": "Va_c"}
-CRUISES = (*CRUISE_OF.values(), "WP_SPD", "MPC_XY_CRUISE", "Q_WP_SPD")  # parameters that a speed override replaces
+# parameters that a speed override replaces
+CRUISES = (*CRUISE_OF.values(), "WP_SPD", "MPC_XY_CRUISE", "Q_WP_SPD")
 
 
 def why_unusable(name: str, value: float) -> str:

@@ -15,7 +15,8 @@ STEP = 0.5  # filter step [s]
 _ROWS = 24  # past steps that the filter uses
 _TURN = 0.3  # turn rate of the two turning models [rad/s]
 _FASTEST = 1e3  # faster rows are invalid [m/s]
-_STAY = np.array([[0.97, 0.015, 0.015], [0.06, 0.93, 0.01], [0.06, 0.01, 0.93]])  # transition probabilities per step
+# transition probabilities per step
+_STAY = np.array([[0.97, 0.015, 0.015], [0.06, 0.93, 0.01], [0.06, 0.01, 0.93]])
 
 
 def _transition(rate: float) -> np.ndarray:
@@ -64,7 +65,8 @@ def _after_leap(p: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     flown[1:] &= np.linalg.norm(np.diff(p, axis=0), axis=1) < _FASTEST * STEP
     leaps = np.flatnonzero(~flown)
     first = int(leaps[-1]) if len(leaps) else 0
-    first += int(len(leaps) > 0 and not np.linalg.norm(v[first]) < _FASTEST)  # the row after a position jump is valid
+    # the row after a position jump is valid
+    first += int(len(leaps) > 0 and not np.linalg.norm(v[first]) < _FASTEST)
     return p[first:], v[first:]
 
 

@@ -18,7 +18,8 @@ from twin_worker.identification.fixed_wing.output_error import Found, Problem, s
 
 DISCOUNT = 0.12  # effective fraction of residuals, one in four samples: gusts correlate them [-]
 COLD, WARM = 8, 1  # maximum steps of a first and of a repeated search
-_FORGET, _FORGET_OFFSETS, _FORGET_WIND = 0.7, 0.5, 0.7  # retained fraction of earlier information per window [-]
+# retained fraction of earlier information per window [-]
+_FORGET, _FORGET_OFFSETS, _FORGET_WIND = 0.7, 0.5, 0.7
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from fleet.frames import G
 from twin_worker.identification.fixed_wing.attitude_lag import STEP
 
 _OVER = 20  # rows of each mean
-_TURN = np.array([1.0, 0.0]), np.array([0.1, 0.02]), 0.03  # mean of k [-] and b [rad/s], standard deviation, noise
+# mean of k [-] and b [rad/s], standard deviation, noise
+_TURN = np.array([1.0, 0.0]), np.array([0.1, 0.02]), 0.03
 _LIFT = np.array([0.0, 0.06]), np.array([1e3, 0.1]), 0.02  # the same of a_0, a_n [rad]
 _POWER = np.array([0.0, np.nan, -0.10, -0.15]), np.array([30.0, 1.0, 0.03, 0.15]), 0.35  # the same of c, SI
 _GLIDE, _STEEPER = 9.0, 1.3  # lift-to-drag ratio; slope of thrust over throttle relative to proportional [-]
@@ -115,7 +116,8 @@ def power(flight: Flight, t_0: float, V_0: float) -> Ridge:
     asked = np.column_stack([np.ones(len(y)), mean(flight.climb_c), mean(flight.V_c) - V_0, X[:, 3]])
     usual, spread, noise = _POWER
     usual = usual.copy()
-    usual[1] = _STEEPER * G / _GLIDE / max(t_0, 0.15)  # t_0 balances drag in level flight; thrust grows faster
+    # t_0 balances drag in level flight; thrust grows faster
+    usual[1] = _STEEPER * G / _GLIDE / max(t_0, 0.15)
     if np.isfinite(asked).all():
         X = asked @ np.linalg.lstsq(asked, X, rcond=1e-6)[0]
         return ridge(X, y, (usual, spread, noise))

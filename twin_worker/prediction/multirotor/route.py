@@ -81,7 +81,8 @@ def lay(
             _lay_leg(laid, leg, waits.get(int(leg[m.SEQ]), 0.0), home[2], params)
     if laid.rows:
         laid.rows[-1][copter.HOLD] = inf
-    said = tuple(s for s in way.sentences if "ground speed" not in s)  # multirotor speeds are ground speeds
+    # multirotor speeds are ground speeds
+    said = tuple(s for s in way.sentences if "ground speed" not in s)
     return np.array(laid.rows).reshape(-1, copter.N_SEGMENT), said
 
 
