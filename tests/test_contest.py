@@ -30,7 +30,7 @@ def test_the_one_that_strays_least_is_used_once_enough_are_answered():
     follow(contest, {"hybrid": 1.0, "dynamics": 0.2, "both": 0.6}, 4, 100.0)
     assert contest.best(("hybrid", "dynamics", "both")) == "dynamics"
     assert contest.miss["hybrid"] == pytest.approx(0.05, rel=0.1)  # 1 of 20 m/s
-    assert contest.said("dynamics") == "dynamics strayed 1.0% of the way (hybrid 5.0%, both 3.0%)"
+    assert contest.said("dynamics") == "dynamics: mean error 1.0% of path length (hybrid 5.0%, both 3.0%)"
 
 
 def test_what_an_event_made_meaningless_and_what_fell_into_a_hole_is_not_scored():

@@ -55,7 +55,7 @@ def learn(monkeypatch: pytest.MonkeyPatch):
 def test_a_stranger_is_given_the_law_that_asks_for_its_banks(learn, law, with_params):
     found = learn(flown(law), "generic", OURS[law] if with_params else {})
     assert found.law == law
-    assert "autopilot generic is flown by " + laws.LAWS[law].sentence in found.said
+    assert "autopilot generic: control law " + laws.LAWS[law].sentence in found.said
     assert min(found.miss, key=found.miss.get) == law
 
 
@@ -75,10 +75,10 @@ def test_an_autopilot_that_says_what_it_is_flies_its_own_law(learn, autopilot, l
 
 def test_banks_that_no_law_asks_for_leave_none(learn):
     found = learn(flown("px4", banks=lambda t: 0.6 * np.sin(0.8 * t)), "generic", {})
-    assert found.law == "" and "no law known asks for the banks" in found.said
+    assert found.law == "" and "no known control law matches the commanded banks" in found.said
 
 
 @pytest.mark.parametrize("bank", [np.nan, radians(3)])
 def test_without_a_turn_no_law_can_be_told(learn, bank):
     found = learn(flown("px4", banks=lambda t: np.full(len(t), bank)), "unknown", {})
-    assert found.law == "" and "cannot be told" in found.said
+    assert found.law == "" and "control law unknown" in found.said

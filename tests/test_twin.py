@@ -184,4 +184,4 @@ def test_an_autopilot_that_does_not_say_what_it_is_is_told_by_the_banks_it_asked
     told = [msgspec.structs.replace(m, autopilot="generic") if isinstance(m, Status) else m for m in heard]
     last = predictions(drive(twin, told))[-1]
     assert twin.learnt.law == "arduplane" and last.method in ROUTE and last.law == laws.LAWS["arduplane"].sentence
-    assert "autopilot generic is flown by arduplane: L1 + TECS, which asks for the banks it asked for" in last.sentence
+    assert "autopilot generic: control law arduplane: L1 + TECS matches the commanded banks" in last.sentence

@@ -136,7 +136,7 @@ def test_a_worse_model_does_not_replace_the_last():
     window, best = fly(aircraft(0), 60.0), known(aircraft(0))
     worse = changed(best, Z_w=0.7, L_p=0.7)
     verdict = verify(worse, window, START, last=best)
-    assert verdict.outcome is Outcome.WORSE_THAN_LAST and "the model in force has" in verdict.sentence
+    assert verdict.outcome is Outcome.WORSE_THAN_LAST and "the active model has" in verdict.sentence
     assert verify(worse, window, START).outcome is Outcome.VERIFIED  # good enough by itself
     assert verify(best, window, START, last=worse).outcome is Outcome.VERIFIED
     assert verify(best, window, START, last=best).outcome is Outcome.VERIFIED  # its equal is no worse

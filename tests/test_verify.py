@@ -166,4 +166,4 @@ def test_one_axis_cannot_carry_the_other():
     frozen_lon = standstill((lon, lat))[0]
     verdict = verify((frozen_lon, lat), linear_flight(20.0), 0, omega=-100.0)
     assert verdict.outcome is Outcome.BELOW_THRESHOLD
-    assert "no better than holding still" in verdict.sentence
+    assert "no better than persistence" in verdict.sentence

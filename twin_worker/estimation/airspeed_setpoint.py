@@ -1,8 +1,8 @@
-"""The airspeed that the autopilot says it aims at, where the route alone does not tell.
+"""Airspeed set-point of the autopilot, for legs whose route item does not define it.
 
-A mission that jumps back keeps the speed that was commanded last; which one that was is not on the wire, but how far
-the flown airspeed is from the wanted one is (NAV_CONTROLLER_OUTPUT). Who does not say so, as PX4 by its attitude
-targets, still holds one of the few speeds that its mission names.
+After a mission jump the autopilot keeps the speed commanded last. Telemetry does not contain that speed, but
+NAV_CONTROLLER_OUTPUT contains the airspeed error. Autopilots that do not send the error, such as PX4, still fly one
+of the few speeds in the mission.
 """
 
 import numpy as np
@@ -10,15 +10,15 @@ import numpy as np
 from fleet.mission import SEQ, VA_C
 from twin_worker.telemetry.history import History
 
-_OVER_S = 3.0  # seconds whose median counts [s]
-_LEAST = 3  # reports within them
-_STEADY_S = 20.0  # seconds over which a speed is held
-_STEADY, _STRAYS = 0.04, 0.06  # of the airspeed: change within them, distance from the speed held [-]
-_APART = 0.5  # a smaller difference is rounding and noise [m/s]
+_OVER_S = 3.0  # window of the median [s]
+_LEAST = 3  # minimum reports in the window
+_STEADY_S = 20.0  # window in which the airspeed must be steady
+_STEADY, _STRAYS = 0.04, 0.06  # largest change and largest offset, relative to the airspeed [-]
+_APART = 0.5  # smaller differences are rounding and noise [m/s]
 
 
 def aimed_at(history: History, t: float) -> float:
-    """Return the airspeed aimed at just before `t`, as reported; nan where it is not [m/s]."""
+    """Return the reported airspeed set-point just before `t`; nan if it is not reported [m/s]."""
     t_c, command = history.look("command", t - _OVER_S)
     t_air, air = history.look("air", t - _OVER_S - 2.0)
     if len(t_c) < _LEAST or len(t_air) < _LEAST or air[:, 0].max() < 3.0:
@@ -28,7 +28,7 @@ def aimed_at(history: History, t: float) -> float:
 
 
 def held_to(history: History, t: float, speeds: np.ndarray) -> float:
-    """Return the one of `speeds` [m/s] that was held just before `t`; nan where the airspeed keeps to none of them."""
+    """Return the one of `speeds` [m/s] that was flown just before `t`; nan if the airspeed matches none of them."""
     t_air, air = history.look("air", t - _STEADY_S)
     Va = air[t_air <= t, 0]
     if len(Va) < 2 * _LEAST or not len(speeds) or Va.min() < 3.0:
@@ -43,20 +43,20 @@ def held_to(history: History, t: float, speeds: np.ndarray) -> float:
 
 
 def _middle(x: np.ndarray) -> float:
-    """Return the median; nan where any is."""
+    """Return the median; nan if any value is nan."""
     ranked = np.sort(x)
     n = len(ranked)
     return 0.5 * float(ranked[(n - 1) // 2] + ranked[n // 2]) if ranked[-1] == ranked[-1] else float("nan")
 
 
 def as_told(legs: np.ndarray, seq: float, cruise: float, told: float) -> np.ndarray:
-    """Return the legs with the speed that is aimed at on the one in force, and on its neighbours of the same speed.
+    """Set the airspeed set-point on the current leg and on its neighbours of the same speed; return the legs.
 
     Args:
         legs: route, (n, 9)
-        seq: mission item in force
-        cruise: speed of legs that name none [m/s]
-        told: airspeed aimed at; nan changes nothing [m/s]
+        seq: current mission item
+        cruise: speed of legs without a commanded speed [m/s]
+        setpoint: airspeed set-point; nan changes nothing [m/s]
     """
     found = np.flatnonzero(legs[:, SEQ] == seq)
     speeds = np.where(legs[:, VA_C] > 0, legs[:, VA_C], cruise)

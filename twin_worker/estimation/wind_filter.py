@@ -1,4 +1,4 @@
-"""Wind and airspeed scale from ground velocity, airspeed and heading: a Kalman filter on the wind triangle."""
+"""Estimate wind and airspeed scale from ground velocity, airspeed and heading: Kalman filter on the wind triangle."""
 
 from bisect import bisect_left
 from collections.abc import Iterable
@@ -10,30 +10,30 @@ from fleet.physics.kernel import kernel
 from twin_worker.telemetry.history import History
 
 DRIFT, DRIFT_S = 0.6, 60.0  # slow change of the wind: standard deviation, correlation time [m/s, s]
-GUST, GUST_S = 0.8, 7.0  # turbulence along the flight, likewise
+GUST, GUST_S = 0.8, 7.0  # turbulence along the flight: the same two numbers
 _WANDER = 0.01  # random walk of the mean [m/s per sqrt(s)]
 _SIGMA = 1.0  # sideslip and sensors in one ground-velocity component [m/s]
-_GATE = 25.0  # squared normalised innovation beyond which a row is ignored
-_SURPRISE_S = 60.0  # innovations are averaged over as much [s]
-_CALM, _ROUGH = 0.05, 10.0  # least and most mean squared innovation that is believed [-]
-_FASTEST = 1e3  # speeds through the air or over ground beyond are noise [m/s]
-_STRONGEST = 150.0  # wind beyond is noise: the filter begins anew [m/s]
+_GATE = 25.0  # normalised innovation squared (NIS) from which a row is rejected
+_SURPRISE_S = 60.0  # time constant of the mean NIS [s]
+_CALM, _ROUGH = 0.05, 10.0  # bounds of the mean NIS [-]
+_FASTEST = 1e3  # larger airspeeds and ground speeds are noise [m/s]
+_STRONGEST = 150.0  # a larger wind is invalid: the filter restarts [m/s]
 _START = np.array([0.03, 0.03, 6.0, 6.0, DRIFT, DRIFT, GUST, GUST])
 
 
 @kernel
 def _take(x: np.ndarray, P: np.ndarray, dt: float, c: float, s: float, north: float, east: float, gate: float) -> float:
-    """Foretell state and covariance by dt and correct them by one ground velocity, unless it surprises too much.
+    """Predict state and covariance by dt and correct them with one ground velocity that passes the gate.
 
     Args:
         x, P: state (8,) and covariance (8, 8), changed in place
-        dt: since the row before [s]
-        c, s: reported velocity through the air, level, along north and east by the heading [m/s]
+        dt: time since the previous row [s]
+        c, s: horizontal reported air velocity along north and east, by the heading [m/s]
         north, east: ground velocity [m/s]
-        gate: surprise from which nothing is corrected
+        gate: NIS from which the correction is skipped
     Returns:
-        the squared normalised innovation
-    Source: Bar-Shalom 2001, 5.2.4 (Joseph's form).
+        the normalised innovation squared (NIS)
+    Source: Bar-Shalom 2001, 5.2.4 (Joseph form).
     """
     keep, H, HP, y = np.ones(8), np.zeros((2, 8)), np.zeros((2, 8)), np.empty(2)
     for i in range(2):
@@ -84,10 +84,10 @@ def _correct(x: np.ndarray, P: np.ndarray, H: np.ndarray, HP: np.ndarray, pull: 
 
 
 class WindFilter:
-    """States a, b, mean, drift, gust of  v = Va cos(gamma) (a e(psi) + b e(psi + 90 deg)) + mean + drift + gust.
+    """Estimate a, b, mean, drift, gust of  v = Va cos(gamma) (a e(psi) + b e(psi + 90 deg)) + mean + drift + gust.
 
-    a, b are airspeed scale times cosine and sine of the heading bias; the mean wanders, drift and gust are first-order
-    Gauss-Markov processes, so that a gust does not pass for wind.
+    a, b are airspeed scale times cosine and sine of the heading bias. The mean is a random walk. Drift and gust are
+    first-order Gauss-Markov processes, which separates gusts from wind.
     Source: Beard & McLain 2012, sec. 2.4 (wind triangle); Bar-Shalom 2001, 5.4 (gating), 8.2 (coloured noise).
     """
 
@@ -96,7 +96,7 @@ class WindFilter:
         self._reset()
 
     def update(self, t: float, ground: Iterable[float], Va: float, psi: float) -> None:
-        """Take one row: ground velocity NED (3,) [m/s], reported airspeed [m/s], heading [rad]."""
+        """Update with one row: ground velocity NED (3,) [m/s], reported airspeed [m/s], heading [rad]."""
         dt = min(t - self.t, 5.0) if isfinite(self.t) else 0.2
         north, east, down = map(float, ground)
         if dt <= 0 or not 3.0 <= Va < _FASTEST or not hypot(north, east, down) < _FASTEST:
@@ -112,30 +112,30 @@ class WindFilter:
             self._reset()
 
     def _believable(self) -> bool:
-        """Return whether the estimate is a wind; false for nan."""
+        """Return whether the wind estimate is plausible; false for nan."""
         return hypot(self.x[2] + self.x[4], self.x[3] + self.x[5]) < _STRONGEST and bool(np.isfinite(self.P).all())
 
     def _reset(self) -> None:
-        """Set the estimate back to no wind; its time stays."""
+        """Reset the estimate to zero wind; the time stays."""
         self.x, self.P = np.array([1.0, *np.zeros(7)]), np.diag(_START**2)
         self._rows, self._surprise = 0, 1.0
 
     def blow(self, t: float, wind: np.ndarray) -> None:
-        """Believe this wind at time `t` [s since 1970], NED, (3,) [m/s]; one that cannot be changes nothing."""
+        """Set the wind at time `t` [s since 1970], NED, (3,) [m/s]; ignore an implausible wind."""
         if not hypot(*wind[:2]) < _STRONGEST:
             return
         self.t = t
-        self.x[2:6] = *wind[:2], 0.0, 0.0  # mean, and no drift from it
+        self.x[2:6] = *wind[:2], 0.0, 0.0  # mean; zero drift
 
     def jump(self, wind: np.ndarray, scale: float, doubt: float) -> None:
-        """Let wind and airspeed sensor change at once, by what is known only up to a share `doubt`.
+        """Apply a step of wind and airspeed scale and inflate the covariance by `relative_sigma` of the step.
 
         Args:
-            wind: added, NED, (3,) [m/s]
-            scale: true over reported airspeed from now on, over what it was [-]
-            doubt: standard deviation, as a share of the change
+            wind: added wind, NED, (3,) [m/s]
+            scale: factor on true over reported airspeed [-]
+            relative_sigma: standard deviation as a fraction of the step
 
-        A change that cannot be is left out.
+        An implausible step is ignored.
         """
         if not (hypot(*wind[:2]) < _STRONGEST and 0.0 < scale < inf):
             return
@@ -152,13 +152,13 @@ class WindFilter:
 
     @property
     def wind(self) -> np.ndarray:
-        """Return the wind without its gusts, NED, the direction it blows to, (3,) [m/s]."""
+        """Return the wind without gusts, NED, the direction it blows to, (3,) [m/s]."""
         x = self.x
         return np.array([x[2] + x[4], x[3] + x[5], 0.0])
 
     @property
     def roughness(self) -> float:
-        """Return how rough the air of the last minute was, over what the filter takes for usual [-]."""
+        """Return the root of the mean NIS of the last minute: measured over assumed innovation [-]."""
         return sqrt(min(max(self._surprise, _CALM), _ROUGH))
 
     @property
@@ -179,23 +179,23 @@ class WindFilter:
         return sqrt(max(both[0, 0], both[1, 1]))
 
 
-_EVERY_S = 0.199  # between rows taken [s]
-_STALE_S = 0.5  # airspeed and heading older than this say nothing of a velocity [s]
+_EVERY_S = 0.199  # interval of the rows used [s]
+_STALE_S = 0.5  # older airspeed and heading are not combined with a velocity [s]
 
 
 def blow(wind: WindFilter, history: History, last: float, since: float, until: float = inf) -> float:
-    """Take ground velocities, five a second; return the time of the newest taken [s since 1970].
+    """Update the filter with five ground velocities a second; return the time of the newest [s since 1970].
 
     Args:
-        wind: changed in place
+        wind_filter: changed in place
         history: telemetry
-        last: newest row taken before [s since 1970]
-        since, until: rows before and after are left out [s since 1970]
+        last_t: time of the newest row used so far [s since 1970]
+        since, until: rows before and after are skipped [s since 1970]
     """
     times, v = history.look("velocity", since)
     air_times, air = history.look("air", since - 1.0)
     att_times, attitude = history.look("attitude", since - 1.0)
-    t_air, t_att = air_times.tolist(), att_times.tolist()  # a few numbers are looked at faster than an array
+    t_air, t_att = air_times.tolist(), att_times.tolist()  # bisect on a short list is faster than on an array
     if not (t_air and t_att):
         return last
     for t, ground in zip(times.tolist(), v.tolist(), strict=True):

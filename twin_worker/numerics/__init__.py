@@ -1,1 +1,1 @@
-"""Numerical methods that know nothing of aircraft."""
+"""Numerical methods independent of aircraft."""

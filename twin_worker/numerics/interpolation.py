@@ -1,17 +1,17 @@
-"""Straight lines between rows, every column at once."""
+"""Linear interpolation between rows, all columns at once."""
 
 import numba as nb
 import numpy as np
 
 
 def straight(at: np.ndarray, t: np.ndarray, x: np.ndarray, beyond: float | None = None) -> np.ndarray:
-    """Interpolate rows as `numpy.interp` does each column, to the last bit.
+    """Interpolate rows linearly, bit-identical to `numpy.interp` of each column.
 
     Args:
-        at: wanted times, in any order, (k,) [s]
+        query_t: requested times, in any order, (k,) [s]
         t: times of the rows, rising, at least one, (n,) [s]
         x: rows, (n, m)
-        beyond: what there is after the last row; None: that row
+        fill_value: value after the last row; None: the last row
     Returns:
         (k, m)
     """
@@ -24,7 +24,7 @@ def straight(at: np.ndarray, t: np.ndarray, x: np.ndarray, beyond: float | None 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath
 def _lay(at: np.ndarray, t: np.ndarray, x: np.ndarray, after: np.ndarray, out: np.ndarray) -> None:
-    """Fill in the rows at each time, (k, m)."""
+    """Compute the rows at each time into `out`, (k, m)."""
     n, j = len(t), 0
     for k in range(len(at)):
         a = at[k]

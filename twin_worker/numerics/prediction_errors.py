@@ -1,6 +1,6 @@
-"""How predictions fared against the flight: along, across and down; the relative error M1 and its first passage.
+"""Prediction errors against the recorded flight: along, cross and vertical; relative error M1 and its first passage.
 
-M1 is |p_hat - p| / max(path flown, 2 s of ground speed). Every function takes one prediction or many at once.
+M1 is |p_hat - p| / max(path flown, 2 s of ground speed). Every function accepts one prediction or a batch.
 """
 
 from math import sqrt
@@ -9,13 +9,13 @@ import numba as nb
 import numpy as np
 
 AHEAD = np.concatenate([np.arange(0.0, 61.0), np.arange(64.0, 181.0, 4.0)])  # look-ahead of every prediction, (91,) [s]
-LIMIT = 0.10  # relative error at which trust ends [-]
-QUANTILE = 0.9  # share of flights that tube and horizon are meant to hold [-]
-_FLOOR_S = 2.0  # least path length, as seconds of ground speed [s]
+LIMIT = 0.10  # relative error that ends the confidence horizon [-]
+QUANTILE = 0.9  # nominal coverage of tube and horizon [-]
+_FLOOR_S = 2.0  # minimum path length, in seconds of ground speed [s]
 
 
 def track_frame(path: np.ndarray, ahead: np.ndarray = AHEAD) -> np.ndarray:
-    """Return the horizontal unit vector along paths (..., n, 3) at each point, (..., n, 2); north where one stands."""
+    """Return the horizontal unit vector along paths (..., n, 3), (..., n, 2); north where the path is stationary."""
     out = np.empty((*path.shape[:-1], 2))
     each = np.ascontiguousarray(path, float).reshape(-1, *path.shape[-2:])
     _frame_each(each, np.ascontiguousarray(ahead, float), out.reshape(-1, path.shape[-2], 2))
@@ -24,13 +24,13 @@ def track_frame(path: np.ndarray, ahead: np.ndarray = AHEAD) -> np.ndarray:
 
 @nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath
 def _frame_each(path: np.ndarray, t: np.ndarray, out: np.ndarray) -> None:
-    """Fill in the unit vectors of each path, (m, n, 2): its slope over uneven times, of second order inside."""
+    """Compute the unit vectors of each path into `out`, (m, n, 2): slope over uneven times, second order inside."""
     n = path.shape[1]
     for i in range(len(path)):
         for k in range(n):
             first, last = max(k - 1, 0), min(k, n - 2)
             east, north = 0.0, 0.0
-            before = (t[k + 1] - t[k]) / (t[k + 1] - t[k - 1]) if 0 < k < n - 1 else 1.0  # the nearer side weighs more
+            before = (t[k + 1] - t[k]) / (t[k + 1] - t[k - 1]) if 0 < k < n - 1 else 1.0  # nearer side
             for j in range(first, last + 1):
                 share, step = (before if j == first else 1.0 - before), t[j + 1] - t[j]
                 north += share * ((path[i, j + 1, 0] - path[i, j, 0]) / step)
@@ -41,7 +41,7 @@ def _frame_each(path: np.ndarray, t: np.ndarray, out: np.ndarray) -> None:
 
 
 def along_cross_down(along: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Turn NED errors (..., 3) into along, cross, vertical, by the unit vector along the path, (..., 2) [m]."""
+    """Convert NED errors (..., 3) to along, cross, vertical, by the unit vector along the path, (..., 2) [m]."""
     ahead = error[..., 0] * along[..., 0] + error[..., 1] * along[..., 1]
     across = error[..., 1] * along[..., 0] - error[..., 0] * along[..., 1]
     return np.stack([ahead, across, error[..., 2]], axis=-1)
@@ -55,26 +55,26 @@ def axes_error(path: np.ndarray, flown: np.ndarray, ahead: np.ndarray = AHEAD) -
 
 
 def path_length(path: np.ndarray, speed: float, before: float = 0.0) -> np.ndarray:
-    """Return the path length so far, at least two seconds of ground speed, (n,) [m].
+    """Return the cumulative path length, at least two seconds of ground speed, (n,) [m].
 
     Args:
         path: positions, (n, 3) [m]
         speed: over ground at the start [m/s]
-        before: length flown before the first of them [m]
+        length_before: length flown before the first position [m]
     """
     flown = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     return np.maximum(before + flown, least_length(speed))
 
 
 def least_length(speed: float) -> float:
-    """Return the length below which no path counts: two seconds of ground speed, at least a metre [m]."""
+    """Return the minimum path length: two seconds of ground speed, at least a metre [m]."""
     return max(_FLOOR_S * speed, 1.0)
 
 
 def first_passage(relative: np.ndarray, ahead: np.ndarray = AHEAD) -> tuple[float, bool]:
-    """Return the time the relative error first passes 10 % [s], and whether it never did while it was followed.
+    """Return the time at which the relative error first exceeds 10 % [s], and whether it is censored.
 
-    The flight was followed up to the first that is not finite; the time is then that of the last before.
+    A censored flight never exceeds 10 %; its time is that of the last finite value before the first non-finite one.
     """
     broken = np.flatnonzero(~np.isfinite(relative))
     n = int(broken[0]) if len(broken) else len(relative)

@@ -1,15 +1,15 @@
-"""Least squares held to zero a little: what the rows leave open stays small, whatever its unit."""
+"""Ridge regression, independent of the units of the terms."""
 
 import numpy as np
 
 
 def ridge(A: np.ndarray, y: np.ndarray, pull: float | np.ndarray) -> np.ndarray:
-    """Return x of  min |y - A x|^2 + sum (pull_k |a_k| x_k)^2, a_k the k-th column, (k,).
+    """Return x of  min |y - A x|^2 + sum (penalty_k |a_k| x_k)^2, a_k the k-th column, (k,).
 
     Args:
         A: terms, (n, k)
-        y: (n,)
-        pull: as a share of a term's length, one for all or one each, (k,)
+        y: targets, (n,)
+        penalty: fraction of a term's norm, scalar or (k,)
     Source: Hoerl & Kennard 1970 (ridge regression), terms scaled to unit length.
     """
     length = np.linalg.norm(A, axis=0) + 1e-12

@@ -1,1 +1,1 @@
-"""Predictions with the autopilot in the loop, and the choice between methods."""
+"""Predictions with the autopilot in the loop, and selection of the method."""

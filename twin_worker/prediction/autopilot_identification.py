@@ -1,9 +1,9 @@
-"""Which control law an aircraft flies, and those of its parameters that it never sent: by replay of what was flown.
+"""Identification of the control law and of missing autopilot parameters by replay of the flight.
 
-An autopilot that says what it is flies its own law; any other flies the law that asks for the banks it asked for.
-A parameter that shapes the turns is found among several values, judged by all replays so far; the steepest bank, the
-airspeed and the distance of waypoint switches are read off the flight. What cannot be learnt stays at its default,
-and is told as such.
+A known autopilot has a known law. For any other autopilot the law with the smallest error to the commanded banks is
+selected. Turn parameters are estimated by a search over several values, scored over all replays. Bank limit, airspeed
+and waypoint radius are read from the flight. Parameters that cannot be identified keep their default and are reported
+as defaults.
 """
 
 from collections.abc import Mapping
@@ -21,14 +21,14 @@ from twin_worker.prediction.autopilot_parameters import CRUISE_OF, on_wings
 from twin_worker.prediction.closed_loop import Heard, Situation, heard, known_wind
 
 OWN = {"ardupilot": "arduplane", "px4": "px4"}
-EVERY_S = 10.0  # between replays [s]
-_BELIEVED = radians(6.0)  # a law that misses the banks asked for by more is not theirs [rad]
-_TURN = radians(12.0)  # banks below tell no law from another [rad]
-_NEWS = 0.15  # weight of the newest replay, once there are many
-_FLAT = radians(0.3), 8  # so many reports this near the steepest bank: a limit holds it [rad]
-_NEAR = (0.7, 1.4)  # least and most airspeed over cruise, where they are not known [-]
-_SHARPEST = radians(35.0)  # turns that tell a distance of switching [rad]
-_SHAPES: dict[str, dict[str, tuple[float, ...]]] = {  # shape the turns: tried where they were not received
+EVERY_S = 10.0  # interval of replays [s]
+_BELIEVED = radians(6.0)  # largest error to the commanded banks of an accepted law [rad]
+_TURN = radians(12.0)  # smaller banks do not distinguish laws [rad]
+_NEWS = 0.15  # smoothing weight of the newest replay
+_FLAT = radians(0.3), 8  # band below the steepest bank, and minimum reports in it, that indicate a limit [rad]
+_NEAR = (0.7, 1.4)  # default minimum and maximum airspeed over cruise [-]
+_SHARPEST = radians(35.0)  # minimum turn that determines the switch distance [rad]
+_SHAPES: dict[str, dict[str, tuple[float, ...]]] = {  # turn parameters, tried if not received
     "arduplane": {
         "NAVL1_PERIOD": (8.0, 10.0, 12.0, 13.0, 14.0, 15.0, 16.0, 17.0, 18.0, 20.0, 22.0, 25.0, 30.0),
         "NAVL1_DAMPING": (0.65, 0.7, 0.75, 0.8, 0.85, 0.95),
@@ -46,16 +46,17 @@ _RANGE: dict[str, tuple[str, ...]] = {
 
 @dataclass
 class Learnt:
-    """What flight told of one aircraft's autopilot.
+    """Identified law and parameters of one autopilot.
 
     Attributes:
-        law: name in `laws.LAWS`; empty while none is believed
-        values: parameters learnt, in the autopilot's units, of that law
-        said: how the law was chosen, or why none is; empty where the autopilot says it itself
-        steepest: banks asked for that were the steepest so far [rad]
-        switched: waypoint radii that switches so far tell [m]
-        cost: smoothed miss of each value tried [rad], by law, parameter and value
-        t: last replay [s since 1970]
+        law: name in `laws.LAWS`; empty while unknown
+        values: identified parameters of that law, in autopilot units
+        reason: how the law was selected, or why none is; empty for a known autopilot
+        steepest_banks: steepest commanded banks so far [rad]
+        switch_radii: waypoint radii from switches so far [m]
+        cost: smoothed bank error of each tried value [rad], by law, parameter and value
+        bank_error: smoothed bank error of each law [rad]
+        replay_t: last replay [s since 1970]
     """
 
     law: str = ""
@@ -69,12 +70,12 @@ class Learnt:
 
 
 def learn_law(learnt: Learnt, autopilot: str, now: Situation) -> None:
-    """Replay the flight so far where something is not known; `learnt` is changed.
+    """Replay the flight to identify unknown law and parameters; update `estimate` in place.
 
     Args:
-        learnt: what was learnt before
-        autopilot: what it calls itself
-        now: newest telemetry; its own law and values do not matter
+        estimate: earlier estimate
+        autopilot: reported autopilot type
+        context: newest telemetry; its law and values are ignored
     """
     own = OWN.get(autopilot)
     lacking = {law: laws.parameters(law, now.onboard.params)[1] for law in ((own,) if own else _SHAPES)}
@@ -100,13 +101,13 @@ def learn_law(learnt: Learnt, autopilot: str, now: Situation) -> None:
 
 
 def _watch_banks(learnt: Learnt, phi_c: np.ndarray) -> None:
-    """Keep the steepest banks asked for."""
+    """Store the steepest commanded banks."""
     banks = np.concatenate([learnt.steepest, np.abs(phi_c[np.isfinite(phi_c)])])
     learnt.steepest = np.sort(banks)[-200:]
 
 
 def _values(learnt: Learnt, law: str, absent: tuple[str, ...], now: Situation, seen: Heard) -> dict[str, float]:
-    """Read off the flight what needs no replay."""
+    """Read the parameters that need no replay from the flight."""
     values: dict[str, float] = {}
     name, unit = _LIMIT[law]
     if name in absent and len(learnt.steepest):
@@ -125,7 +126,7 @@ def _values(learnt: Learnt, law: str, absent: tuple[str, ...], now: Situation, s
 
 
 def _cruise(learnt: Learnt, now: Situation, seen: Heard, name: str) -> float:
-    """Return the airspeed aimed at on a leg that names none, else what was learnt or is flown [m/s]."""
+    """Return the set-point on a leg without commanded speed, else the identified or the flown airspeed [m/s]."""
     at = np.flatnonzero(seen.legs[:, SEQ] == seen.seq[-1])
     told = aimed_at(now.history, learnt.t)
     if len(at) and seen.legs[at[0], VA_C] <= 0 and isfinite(told):
@@ -135,7 +136,7 @@ def _cruise(learnt: Learnt, now: Situation, seen: Heard, name: str) -> float:
 
 
 def _switches(seen: Heard) -> dict[int, float]:
-    """Return waypoint radius that each switch between two lines tells [m], by its time: distance over turn share."""
+    """Return the waypoint radius of each switch between two lines [m], by time: distance over turn fraction."""
     found: dict[int, float] = {}
     dt = float(seen.t[1] - seen.t[0])
     for k in np.flatnonzero(np.diff(seen.seq)).tolist():
@@ -144,7 +145,7 @@ def _switches(seen: Heard) -> dict[int, float]:
             continue
         a, b, c = seen.legs[i[0] - 1 : i[0] + 2, P_N:P_D]
         turn = abs(wrap(atan2(c[1] - b[1], c[0] - b[0]) - atan2(b[1] - a[1], b[0] - a[0])))
-        late = min(int(0.5 / dt), k)  # reported once a second: half of that ago
+        late = min(int(0.5 / dt), k)  # mean delay of a report once a second
         if turn > _SHARPEST:
             away = float(np.hypot(*(seen.p[k - late, :2] - b)))
             found[round(float(seen.good.t[0] + seen.t[k]))] = away / (min(turn, pi / 2) / (pi / 2))
@@ -154,7 +155,7 @@ def _switches(seen: Heard) -> dict[int, float]:
 def _replay(
     learnt: Learnt, law: str, absent: tuple[str, ...], flown: tuple[Situation, Heard], values: dict[str, float]
 ) -> None:
-    """Try the values of what shapes the turns, one parameter after the other; fill in the best."""
+    """Try the values of the turn parameters one after the other; set the best in `values`."""
     for name, tried in _SHAPES[law].items():
         if name not in absent:
             continue
@@ -170,7 +171,7 @@ def _replay(
 
 
 def _least(tried: list[tuple[float, float]]) -> float:
-    """Return the value of least cost, by the parabola through it and its neighbours."""
+    """Return the minimum of the parabola through the value of least cost and its neighbours."""
     x, y = (np.array(column) for column in zip(*tried, strict=True))
     k = int(np.argmin(y))
     if not 0 < k < len(x) - 1:
@@ -180,7 +181,7 @@ def _least(tried: list[tuple[float, float]]) -> float:
 
 
 def _rms(law: str, flown: tuple[Situation, Heard], values: Mapping[str, float]) -> float:
-    """Replay; return how far the banks of the law are from those asked for [rad]."""
+    """Replay the flight; return the RMS error of the law to the commanded banks [rad]."""
     now, seen = flown
     control = on_wings(now.onboard.params, values, law=law)
     par = laws.blown(control.par(seen.altitude_m), *known_wind(now, seen.good))
@@ -189,15 +190,15 @@ def _rms(law: str, flown: tuple[Situation, Heard], values: Mapping[str, float]) 
 
 
 def _choose(learnt: Learnt, autopilot: str) -> None:
-    """Take the law that misses least, where that is little."""
+    """Select the law with the smallest bank error if it is below the limit."""
     if not learnt.miss:
-        learnt.said = f"autopilot {autopilot}: no bank asked for was reported in a turn yet, so its law cannot be told"
+        learnt.said = f"autopilot {autopilot}: no commanded bank received in a turn yet, control law unknown"
         return
     law, miss = min(learnt.miss.items(), key=lambda one: one[1])
-    within = f"the banks it asked for within {degrees(miss):.1f} deg"
+    within = f"the commanded banks within {degrees(miss):.1f} deg"
     if miss < _BELIEVED:
         learnt.law = law
-        learnt.said = f"autopilot {autopilot} is flown by {laws.LAWS[law].sentence}, which asks for {within}"
+        learnt.said = f"autopilot {autopilot}: control law {laws.LAWS[law].sentence} matches {within}"
     else:
         learnt.law = ""
-        learnt.said = f"autopilot {autopilot}: no law known asks for {within}"
+        learnt.said = f"autopilot {autopilot}: no known control law matches {within}"

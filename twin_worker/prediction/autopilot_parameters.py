@@ -1,7 +1,7 @@
-"""The controller twin in force: its law, its parameters, and how each of them is known.
+"""Controller twin: control law, parameters and the provenance of each parameter.
 
-Made in one place, so that what is published is what was flown. A parameter that the autopilot does not tell is the one
-learnt from flight, where one was, and else the autopilot's default, which is said.
+One module creates it, so that published and simulated parameters are equal. A parameter that is not received is
+identified from flight, or else the default of the autopilot; the provenance is published.
 """
 
 from collections.abc import Mapping
@@ -26,16 +26,17 @@ _PX4 = (
 )  # fmt: skip
 _TEXTBOOK = ("chi_inf", "k_path", "k_orbit", "R_fillet", "R_orbit", "phi_max", "Va_c", "climb_max", "sink_max")
 TOLD_OF = {"arduplane": _ARDUPLANE, "px4": _PX4, "textbook": _TEXTBOOK}
-"""Parameters that shape a path, by law; the others are flown with all the same."""
+"""Published parameters by law: those that shape the path."""
 TOLD_OF_GUIDANCE = (*_ARDUPLANE[:5], "AIRSPEED_CRUISE", "TECS_CLMB_MAX", "TECS_SINK_MAX")
-_CONTROLS = 1024  # of fixed wings that are kept
+_CONTROLS = 1024  # cached fixed-wing controllers
 _Given = tuple[tuple[str, float], ...]
 CRUISE_OF = {"arduplane": "AIRSPEED_CRUISE", "px4": "FW_AIRSPD_TRIM", "textbook": "Va_c"}
-CRUISES = (*CRUISE_OF.values(), "WP_SPD", "MPC_XY_CRUISE", "Q_WP_SPD")  # what a wished speed overrides
+# parameters that a speed override replaces
+CRUISES = (*CRUISE_OF.values(), "WP_SPD", "MPC_XY_CRUISE", "Q_WP_SPD")
 
 
 def why_unusable(name: str, value: float) -> str:
-    """Say why a law would not take this value of a parameter of its own; empty where it would, or knows no such."""
+    """Describe why a value is outside the range of a parameter; empty for valid values and unknown parameters."""
     row = next((row for law in laws.LAWS.values() for row in law.table if row.name == name), None)
     if row is None or row.low <= value <= row.high:
         return ""
@@ -44,14 +45,14 @@ def why_unusable(name: str, value: float) -> str:
 
 @dataclass(frozen=True)
 class Control:
-    """A controller twin's law and parameters.
+    """Control law and parameters of a controller twin.
 
     Attributes:
         law: as in `Prediction`
-        values: parameters in the autopilot's names and units
-        known: how each of them is known
-        told: those worth telling
-        name: of the law in `laws.LAWS`
+        values: parameters in autopilot names and units
+        provenance: received, identified, default or asked, by parameter
+        published_names: published parameters
+        name: name of the law in `laws.LAWS`
     """
 
     law: str
@@ -61,21 +62,21 @@ class Control:
     name: str = "arduplane"
 
     def par(self, altitude_m: float) -> np.ndarray:
-        """Return the vector the law's kernels read, at a height above mean sea level [m]."""
+        """Return the parameter vector of the law's kernels at a height above mean sea level [m]."""
         return laws.vector(self.name, self._found, altitude_m)
 
     @cached_property
     def _found(self) -> dict[str, float]:
-        """Return what the law reads of the values: they do not change, and every flight begins with them."""
+        """Return the values that the law reads, cached because every rollout needs them."""
         return laws.read(self.name, self.values)[0]
 
     @property
     def absent(self) -> tuple[str, ...]:
-        """Return the names of those at their defaults."""
+        """Return the names of parameters at their defaults."""
         return tuple(name for name, how in self.known.items() if how == DEFAULT)
 
     def wire(self) -> Controller:
-        """Return it as it is published."""
+        """Return the bus message."""
         parts: dict[str, dict[str, float]] = {RECEIVED: {}, IDENTIFIED: {}, DEFAULT: {}, ASKED: {}}
         for name in self.told:
             parts[self.known[name]][name] = round(float(self.values[name]), 4)
@@ -92,11 +93,11 @@ def on_wings(
     """Return the controller twin of a fixed wing.
 
     Args:
-        received: parameters as the autopilot names and scales them, current or older names
-        identified: learnt from flight, current names; they count only where none was received
-        asked: what a what-if has instead of either
+        received: parameters in autopilot names and units, current or older names
+        identified: parameters identified from flight, current names; used only if not received
+        overrides: parameters of a what-if query, which replace both
         law: name in `laws.LAWS`
-        sentence: of the law as in `Prediction`, where it is flown by its guidance alone
+        sentence: description as in `Prediction` if only the guidance of the law is used
     """
     given = (tuple(each.items()) if each else () for each in (received, identified, asked))
     return _on_wings(*given, law, sentence)
@@ -104,7 +105,7 @@ def on_wings(
 
 @lru_cache(maxsize=_CONTROLS)
 def _on_wings(given: _Given, identified: _Given, wished: _Given, law: str, sentence: str) -> Control:
-    """Return the same; parameters hardly ever change, and to read them takes as long as to fly a minute."""
+    """Return the cached controller: reading parameters takes as long as simulating a minute."""
     received, asked = dict(given), dict(wished)
     _, missing = laws.read(law, {**received, **asked})
     learnt = {name: value for name, value in identified if name in missing}
@@ -119,13 +120,13 @@ def _on_wings(given: _Given, identified: _Given, wished: _Given, law: str, sente
 def on_rotors(
     received: Mapping[str, float], prefix: str, limit: copter.Limits, asked: Mapping[str, float] | None = None
 ) -> Control:
-    """Return the controller twin of what hovers.
+    """Return the controller twin of a hovering aircraft.
 
     Args:
-        received: parameters as the autopilot names and scales them
+        received: parameters in autopilot names and units
         prefix: `Q_` for the rotors of a quadplane
-        limit: what it flies with, SI; a limit that no parameter gave and no default is was seen in flight
-        asked: what a what-if has instead
+        limit: limits in use, SI; a limit that is neither received nor default is identified from flight
+        overrides: parameters of a what-if query
     """
     asked = asked or {}
     given = {**received, **asked}

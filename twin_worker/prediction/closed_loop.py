@@ -1,4 +1,4 @@
-"""Fly the twin ahead of the aircraft: synchronise the controller twin on telemetry, then simulate the route.
+"""Closed-loop prediction: synchronise the controller twin with telemetry, then simulate the route.
 
 Source: Huang 2021, section 3.4 (identical controller, same route, identified model in the loop).
 """
@@ -26,24 +26,24 @@ from twin_worker.prediction.autopilot_parameters import CRUISE_OF, Control, on_w
 from twin_worker.prediction.route_override import Instead, gone_over
 from twin_worker.telemetry.history import History
 
-LEAST_AHEAD_S = 60.0  # a flight ahead that ends before is none [s]
-SHADOW_S = 60.0  # telemetry the controller twin is synchronised on [s]
-_WIND_S = 10.0  # the autopilot's own wind is believed for as long [s]
+LEAST_AHEAD_S = 60.0  # shortest valid rollout [s]
+SHADOW_S = 60.0  # telemetry for the synchronisation of the controller twin [s]
+_WIND_S = 10.0  # maximum age of the autopilot's wind estimate [s]
 _SHADOW_STEP = 2  # window rows per shadow step
-_ROUTES = 1024  # routes that are kept unrolled: missions stay, and each costs as much as a flight
+_ROUTES = 1024  # cached routes: missions change rarely, and a route takes as long as a rollout
 _REFUSED = {TAKEOFF: "take-off", LAND: "landing"}
 
 
 @dataclass(frozen=True)
 class Flown:
-    """One simulated flight ahead, or why there is none.
+    """Simulated flight ahead, or the reason why there is none.
 
     Attributes:
-        path: position at each wanted look-ahead time, NED, (k, 3) [m]; None where the twin cannot fly this
-        seq: mission item it starts on
-        sentence: what limits it, or empty
+        path: position at each requested look-ahead time, NED, (k, 3) [m]; None without a prediction
+        seq: mission item at the start
+        sentence: limitations or reason, or empty
         diverged: the twin left its flight envelope
-        law: the controller twin it was flown by
+        controller: the controller twin
     """
 
     path: np.ndarray | None
@@ -55,15 +55,15 @@ class Flown:
 
 @dataclass(frozen=True)
 class Start:
-    """Where flights ahead start, whatever model flies them.
+    """Start of rollouts of any model.
 
     Attributes:
-        good: what was flown on the present route
-        control: synchronised state, parameters and legs of the controller twin
-        state: state, commands and inputs in force, and air, as `fleet.physics.simulate` takes them
-        seq: mission item in force
-        sentence: what limits the flights, or empty
-        law: the controller twin
+        window: flight on the present route
+        synchronised: synchronised state, parameters and legs of the controller twin
+        state: state, current commands and inputs, and air, as for `fleet.physics.simulate`
+        seq: current mission item
+        sentence: limitations, or empty
+        controller: the controller twin
     """
 
     good: Window
@@ -76,29 +76,29 @@ class Start:
 
 @dataclass(frozen=True)
 class Onboard:
-    """What is known of the autopilot: its route and its parameters."""
+    """Route and parameters of the autopilot."""
 
     items: tuple[Item, ...]
     params: Mapping[str, float]  # received
     since: float  # when route, mode and parameters last changed [s since 1970]
-    identified: Mapping[str, float] = field(default_factory=dict)  # learnt from flight; counts where none was received
-    instead: Instead | None = None  # what a what-if flies from the start on
-    autopilot: str = "ardupilot"  # what it calls itself
-    law: str = "arduplane"  # name in `laws.LAWS`; empty: none is believed
-    why: str = ""  # how the law was chosen, or why there is none
+    identified: Mapping[str, float] = field(default_factory=dict)  # from flight; used if not received
+    instead: Instead | None = None  # what-if query, from the start on
+    autopilot: str = "ardupilot"  # reported type
+    law: str = "arduplane"  # name in `laws.LAWS`; empty: unknown
+    why: str = ""  # how the law was selected, or why none is
 
 
 @dataclass(frozen=True)
 class Heard:
-    """What was flown on the present route, as a law is replayed on it.
+    """Telemetry on the present route for the replay of a control law.
 
     Attributes:
-        good: telemetry, unbroken
-        legs, start: route from the item in force at its beginning, and the point before
-        rows: t p v euler rates Va phi_c theta_c delta, as `shadow` takes them
-        seq: mission item in force at each
-        altitude_m: above mean sea level, at the end [m]
-        sentence: what is wrong with the route, or empty
+        window: telemetry without gaps
+        legs, start_point: route from the first current item, and the point before
+        rows: t p v euler rates Va phi_c theta_c delta, as for `shadow`
+        seq: current mission item of each row
+        altitude_m: final height above mean sea level [m]
+        sentence: problems of the route, or empty
     """
 
     good: Window
@@ -111,7 +111,7 @@ class Heard:
 
     @property
     def t(self) -> np.ndarray:
-        """Return times from the first, (n,) [s]."""
+        """Return times since the first row, (n,) [s]."""
         return self.rows[0]
 
     @property
@@ -126,19 +126,19 @@ class Heard:
 
     @property
     def phi_c(self) -> np.ndarray:
-        """Return the banks asked for, (n,) [rad]."""
+        """Return the commanded banks, (n,) [rad]."""
         return self.rows[6]
 
 
 @dataclass(frozen=True)
 class Situation:
-    """Everything a prediction starts from.
+    """Inputs of a prediction.
 
     Attributes:
-        window: newest telemetry on the grid, at least `SHADOW_S` where there is as much
-        history: telemetry as it came
-        onboard: route and parameters in force
-        wind: wind filter, up to date
+        window: newest resampled telemetry, at least `SHADOW_S` if available
+        history: telemetry as received
+        onboard: active route and parameters
+        wind_filter: current wind filter
         origin: origin of the twin's NED frame
     """
 
@@ -150,7 +150,7 @@ class Situation:
 
 
 def held(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float) -> np.ndarray:
-    """Hold each row until the next, nan before the first and after `longest` seconds, (len(at), k)."""
+    """Sample rows with zero-order hold, nan before the first and after `max_age` seconds, (len(query_t), k)."""
     if not len(t):
         return np.full((len(at), x.shape[1]), np.nan)
     out = np.empty((len(at), x.shape[1]))
@@ -160,7 +160,7 @@ def held(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float) -> np.nda
 
 @nb.njit(cache=True, nogil=True)
 def _hold(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float, out: np.ndarray) -> None:
-    """Fill in the last row before each of some rising times, nan where it is none or old, (k, m)."""
+    """Compute the last row before each of the rising times, nan if there is none or it is too old, (k, m)."""
     k = -1
     for i in range(len(at)):
         while k + 1 < len(t) and t[k + 1] <= at[i]:
@@ -171,7 +171,7 @@ def _hold(t: np.ndarray, x: np.ndarray, at: np.ndarray, longest: float, out: np.
 
 
 def _reported(history: History, name: str, at: np.ndarray, longest: float) -> np.ndarray:
-    """Return what was reported last at each time, nan after `longest` seconds, (len(at), k)."""
+    """Return the last reported row at each time, nan after `max_age` seconds, (len(query_t), k)."""
     return held(*history.look(name, at[0] - longest - 1.0), at, longest)
 
 
@@ -179,16 +179,16 @@ def fly_ahead(now: Situation, plant: Plant, ahead: np.ndarray) -> Flown:
     """Predict with the identified model and the controller twin in closed loop.
 
     Args:
-        now: where the prediction starts, the end of its window
-        plant: coupled model, or longitudinal and lateral one
-        ahead: wanted look-ahead times from there, rising, (k,) [s]
+        context: inputs; the prediction starts at the end of its window
+        plant: derivatives model, or longitudinal and lateral linear axes
+        ahead: requested look-ahead times, rising, (k,) [s]
     """
     start = set_out(now)
     return start if isinstance(start, Flown) else fly_from(start, plant, ahead)
 
 
 def heard(now: Situation) -> Heard | Flown:
-    """Lay what was flown on the present route for a replay, or say why it cannot be."""
+    """Return the replay data of the present route, or the reason why there are none."""
     good = _on_this_route(now.window, now.onboard.since)
     if len(good) < 5.0 / good.dt:
         return Flown(None, -1, f"{below(good.seconds, 5.0)} s on this route, 5 s are needed; wait")
@@ -196,7 +196,7 @@ def heard(now: Situation) -> Heard | Flown:
     at = good.t[every]
     seq = _reported(now.history, "leg", at, 15.0)[:, 0]
     if not np.isfinite(seq[-1]):
-        return Flown(None, -1, "the mission item in force is not reported (MISSION_CURRENT)")
+        return Flown(None, -1, "the current mission item is not reported (MISSION_CURRENT)")
     seq = np.where(np.isfinite(seq), seq, seq[np.isfinite(seq)][0]).astype(np.int64)
     board = now.onboard
     first = FIRST.get(board.autopilot, 1)
@@ -210,7 +210,7 @@ def heard(now: Situation) -> Heard | Flown:
 
 
 def unrolled(items: tuple[Item, ...], seq: int, origin: Origin, params: Mapping[str, float], first: int) -> Route:
-    """Return the legs from item `seq` on, that nobody changes; as `route`."""
+    """Return the cached, read-only result of `fleet.mission.route`: legs from item `seq` on."""
     return _unrolled(items, seq, origin, tuple((name, params[name]) for name in READ if name in params), first)
 
 
@@ -222,14 +222,14 @@ def _unrolled(
 
 
 def known_wind(now: Situation, good: Window) -> tuple[float, float]:
-    """Return the wind the autopilot believes in: its own where it tells it, else the twin's, NED [m/s]."""
+    """Return the wind estimate of the autopilot if reported, else of the twin, NED [m/s]."""
     reported = _reported(now.history, "wind", good.t[-1:], _WIND_S)[0]
     w_n, w_e = reported if np.isfinite(reported).all() else now.wind.wind[:2]
     return float(w_n), float(w_e)
 
 
 def set_out(now: Situation) -> Start | Flown:
-    """Synchronise the controller twin on what was flown; return where any model starts, or why none can."""
+    """Synchronise the controller twin with telemetry; return the start of rollouts, or why there is none."""
     seen, board = heard(now), now.onboard
     if isinstance(seen, Flown):
         return seen
@@ -249,7 +249,7 @@ def set_out(now: Situation) -> Start | Flown:
 
 
 def _aimed(now: Situation, t: float, cruise: float) -> float:
-    """Return the airspeed aimed at: as told, else the one of the mission's that is held; nan unknown [m/s]."""
+    """Return the airspeed set-point: reported, else the flown one of the mission speeds; nan if unknown [m/s]."""
     told = aimed_at(now.history, t)
     if np.isfinite(told):
         return told
@@ -262,7 +262,7 @@ def _altitude(now: Situation, good: Window) -> float:
 
 
 def _otherwise(now: Situation, begun: Start, instead: Instead, told: float) -> Start:
-    """Let the synchronised controller go over to what a what-if flies; `told`: airspeed aimed at so far [m/s]."""
+    """Transfer the synchronised controller to a what-if query; `setpoint`: airspeed set-point so far [m/s]."""
     name = now.onboard.law
     law, cruise = on_wings(now.onboard.params, now.onboard.identified, instead.asked, name), CRUISE_OF[name]
     way = instead.way(now.origin, now.onboard.params)
@@ -280,7 +280,7 @@ def _otherwise(now: Situation, begun: Start, instead: Instead, told: float) -> S
 
 
 def _refused(begun: Start) -> Flown | None:
-    """Say why this is not flown; None where it is."""
+    """Return the reason why the current leg is not modelled; None if it is."""
     ctl, _, legs = begun.control
     if not len(legs):
         return Flown(None, begun.seq, begun.sentence or "the mission has no legs to fly")
@@ -291,14 +291,14 @@ def _refused(begun: Start) -> Flown | None:
 
 
 def _assumed(law: Control) -> str:
-    """Say which parameters are the autopilot's defaults because nothing better is known; empty where none is."""
+    """Describe the parameters that are assumed at their defaults; empty if there are none."""
     absent = law.absent
     few = f"({', '.join(absent[:3])} …)"
     return f"{len(absent)} autopilot parameters not received, defaults assumed {few}" if absent else ""
 
 
 def fly_from(start: Start, plant: Plant, ahead: np.ndarray) -> Flown:
-    """Fly one model from there; arguments as for `fly_ahead`. Beyond its envelope, if that is far, the path is nan."""
+    """Simulate one model from the start; arguments as for `fly_ahead`. The path is nan beyond the envelope."""
     ctl, par, legs = start.control
     dt = start.good.dt
     out = np.empty((int(ahead[-1] / dt) + 2, N_STATE))
@@ -308,13 +308,13 @@ def fly_from(start: Start, plant: Plant, ahead: np.ndarray) -> Flown:
 
 
 def at_times(p: np.ndarray, step: float, start: Start, ctl: np.ndarray, ahead: np.ndarray) -> Flown:
-    """Return a flight at the look-aheads wanted: nan beyond its end, held in place beyond its touch-down.
+    """Sample a rollout at the look-ahead times: nan beyond its end, constant position after touchdown.
 
     Args:
-        p: positions every `step` [s] until the twin left its envelope, NED, (n, 3) [m], changed
-        start: where it started
-        ctl: the controller at its end
-        ahead: wanted look-ahead times, rising, (k,) [s]
+        p: positions every `step` [s] until the twin left its envelope, NED, (n, 3) [m], changed in place
+        initial: start of the rollout
+        ctl: final controller state
+        ahead: requested look-ahead times, rising, (k,) [s]
     """
     landed = _stay_down(p, ctl, start.control[2])
     if not landed and len(p) <= min(ahead[-1], ahead[0] + LEAST_AHEAD_S) / step:
@@ -325,7 +325,7 @@ def at_times(p: np.ndarray, step: float, start: Start, ctl: np.ndarray, ahead: n
 
 
 def _stay_down(p: np.ndarray, ctl: np.ndarray, legs: np.ndarray) -> bool:
-    """Hold a flight, NED (n, 3) [m], where its route ends on the ground; tell whether it came so far."""
+    """Fix positions, NED (n, 3) [m], after touchdown at the end of the route; return whether it is reached."""
     at = int(ctl[arduplane.LEG])
     if not len(p) or int(legs[at, KIND]) != LAND:
         return False
@@ -338,7 +338,7 @@ def _stay_down(p: np.ndarray, ctl: np.ndarray, legs: np.ndarray) -> bool:
 
 
 def _on_this_route(window: Window, since: float) -> Window:
-    """Cut what was flown on the present route, unbroken, at most `SHADOW_S`."""
+    """Return the gap-free flight on the present route, at most `SHADOW_S`."""
     start = max(int(np.searchsorted(window.t, since)), len(window) - int(SHADOW_S / window.dt))
     bad = np.flatnonzero(~window.ok)
     start = max(start, int(bad[-1]) + 1 if len(bad) else 0)
@@ -346,7 +346,7 @@ def _on_this_route(window: Window, since: float) -> Window:
 
 
 def _telemetry(good: Window, every: slice, history: History) -> tuple[np.ndarray, ...]:
-    """Return what the controller twin is synchronised on at some rows: t p v euler rates Va phi_c theta_c delta."""
+    """Return the synchronisation data at some rows: t p v euler rates Va phi_c theta_c delta."""
     at = good.t[every]
     command, Va = _reported(history, "command", at, 1.0), _reported(history, "air", at, 1.0)[:, 0]
     euler, rates = good.x[every, 6:9].copy(), good.x[every, 3:6]
@@ -356,7 +356,7 @@ def _telemetry(good: Window, every: slice, history: History) -> tuple[np.ndarray
 
 
 def _start(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return state (12,), commands and inputs in force (6,) and air (4,) at the end of the window."""
+    """Return state (12,), current commands and inputs (6,) and air (4,) at the end of the window."""
     state = np.concatenate([good.p[-1], good.x[-3:, :6].mean(axis=0), good.x[-1, 6:]])
     command = _reported(now.history, "command", good.t[-1:], 1.0)[0, :2]
     command = np.where(np.isfinite(command), command, good.x[-1, 6:8])
@@ -365,7 +365,7 @@ def _start(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _gust(now: Situation, good: Window) -> float:
-    """Return the airspeed beyond what the mean wind explains [m/s]; 0 without an airspeed sensor."""
+    """Return the airspeed minus the airspeed by mean wind [m/s]; 0 without an airspeed sensor."""
     t, air = now.history.look("air", good.t[-1] - 1.0)
     recent = air[t <= good.t[-1], 0]
     if not len(recent) or recent.min() < 3.0:

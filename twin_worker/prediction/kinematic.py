@@ -1,7 +1,7 @@
-"""The twin of a fixed wing without a model of its own: guidance on the route and lags, seen in positions alone.
+"""Kinematic model of a fixed wing: route guidance and lags, identified from positions alone.
 
-Airspeed and wind come from the wind filter, or without an airspeed sensor from how ground speed changes with course.
-The guidance period, where no parameter tells it, is the one whose flights over the last minute stray least.
+Airspeed and wind come from the wind filter; without an airspeed sensor they come from the change of ground speed with
+course. A guidance period that is not received is the one with the smallest error over the last minute.
 """
 
 from dataclasses import dataclass, replace
@@ -23,48 +23,48 @@ from twin_worker.prediction.closed_loop import unrolled
 from twin_worker.prediction.route_override import Instead, gone_over
 from twin_worker.telemetry.track import STEP, Track
 
-LEAST_S = 5.0  # shortest track on this route [s]
-_SYNC_S = 60.0  # flight the guidance is synchronised on [s]
-_BACK_S, _EVERY_S, _OVER_S = 80.0, 8.0, 20.0  # flight compared with; between starts; how far each looks [s]
-_PERIODS = (9.0, 12.0, 16.0, 20.0, 26.0)  # NAVL1_PERIOD tried where it is not known [s]
-_LAGS = (0.4, 0.8, 1.4)  # bank lags tried [s]
-_SPEED_S = 20.0  # airspeed is the mean over as much [s]
-_SLOWEST = 5.0  # a wing flies no slower [m/s]
+LEAST_S = 5.0  # minimum track on this route [s]
+_SYNC_S = 60.0  # flight for the synchronisation of the guidance [s]
+_BACK_S, _EVERY_S, _OVER_S = 80.0, 8.0, 20.0  # compared flight, interval of starts, length of a rollout [s]
+_PERIODS = (9.0, 12.0, 16.0, 20.0, 26.0)  # NAVL1_PERIOD tried if not received [s]
+_LAGS = (0.4, 0.8, 1.4)  # tried bank lags [s]
+_SPEED_S = 20.0  # window of the mean airspeed [s]
+_SLOWEST = 5.0  # minimum airspeed of fixed-wing flight [m/s]
 CRUISE = CRUISE_OF["arduplane"]
-_RIDGE = 5.0  # usual wind, before it is seen [m/s]
+_RIDGE = 5.0  # prior standard deviation of the wind [m/s]
 
 
 @dataclass(frozen=True)
 class Grey:
-    """What flight has told: guidance period [s], bank lag [s], mean miss over 20 s [m] and starts behind it."""
+    """Identified guidance period [s], bank lag [s], mean error over 20 s [m] and its number of starts."""
 
-    period: float = 0.0  # 0: as the parameters say
+    period: float = 0.0  # 0: from the parameters
     tau_phi: float = 0.8
     miss: float = float("nan")
     starts: int = 0
 
     @property
     def identified(self) -> dict[str, float]:
-        """Return what flight has told, by the autopilot's names."""
+        """Return the identified parameters by autopilot name."""
         return {"NAVL1_PERIOD": self.period} if self.period > 0 else {}
 
 
 @dataclass(frozen=True)
 class Board:
-    """What is known of the autopilot and the air."""
+    """Route and parameters of the autopilot, and wind."""
 
     items: tuple[Item, ...]
     params: dict[str, float]
     since: float
     origin: Origin
-    wind: np.ndarray | None  # NED, (3,) [m/s]; None: no airspeed was ever received
-    instead: Instead | None = None  # what a what-if flies from the start on
+    wind: np.ndarray | None  # NED, (3,) [m/s]; None: no airspeed received
+    instead: Instead | None = None  # what-if query, from the start on
     first: int = 1  # number of the first mission item to fly
 
 
 @dataclass(frozen=True)
 class Ahead:
-    """A flight ahead, or why there is none."""
+    """Rollout, or the reason why there is none."""
 
     path: np.ndarray | None
     seq: int
@@ -82,7 +82,7 @@ def air_of(track: Track, wind: np.ndarray | None) -> tuple[np.ndarray, float]:
         w = np.asarray(wind[:2], float)
     else:
         A = np.column_stack([2 * v, np.ones(len(v))])
-        spread = 2.0 * max(float(np.mean(np.hypot(*v.T))), 5.0)  # a metre per second of gust in |v|^2
+        spread = 2.0 * max(float(np.mean(np.hypot(*v.T))), 5.0)  # a gust of 1 m/s in |v|^2
         ridge = np.diag([(spread / _RIDGE) ** 2, (spread / _RIDGE) ** 2, 1e-9])
         middle = np.array([0.0, 0.0, np.mean(np.sum(v * v, axis=1))])
         w = np.linalg.solve(A.T @ A + ridge, A.T @ (np.sum(v * v, axis=1)) + ridge @ middle)[:2]
@@ -92,13 +92,13 @@ def air_of(track: Track, wind: np.ndarray | None) -> tuple[np.ndarray, float]:
 
 
 def fly(track: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarray) -> Ahead:
-    """Fly the route ahead from the end of the track.
+    """Predict the flight along the route from the end of the track.
 
     Args:
         track: newest flight
-        seq: mission item in force at each of its rows, nan unknown, (n,)
-        board, grey: what is known of autopilot, air and aircraft
-        ahead: wanted look-ahead times, (k,) [s]
+        seq: current mission item of each row, nan if unknown, (n,)
+        config, model: configuration of the autopilot, and the identified model
+        ahead: requested look-ahead times, (k,) [s]
     """
     first = max(int(np.searchsorted(track.t, board.since)), len(track) - int(_SYNC_S / STEP))
     bad = np.flatnonzero(~track.ok | ~np.isfinite(seq))
@@ -106,7 +106,7 @@ def fly(track: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
     if len(track) - first < LEAST_S / STEP:
         reported = len(track) and np.isfinite(seq[-1])
         why = f"{below(max(len(track) - first, 0) * STEP, LEAST_S)} s on this route, {LEAST_S:.0f} s are needed; wait"
-        return Ahead(None, -1, why if reported else "the mission item in force is not reported (MISSION_CURRENT)")
+        return Ahead(None, -1, why if reported else "the current mission item is not reported (MISSION_CURRENT)")
     seen = track.part(first, len(track))
     return _fly(seen, seq[first:].astype(np.int64), board, grey, ahead)
 
@@ -141,7 +141,7 @@ def _fly(seen: Track, seq: np.ndarray, board: Board, grey: Grey, ahead: np.ndarr
 
 @dataclass(frozen=True)
 class _Course:
-    """What is flown ahead: state and parameters of the guidance, route, lags, and the law they are of."""
+    """State and parameters of the guidance, route, lags and controller."""
 
     ctl: np.ndarray
     par: np.ndarray
@@ -155,7 +155,7 @@ def _altitude(seen: Track, board: Board) -> float:
 
 
 def _otherwise(now: _Course, seen: Track, board: Board, grey: Grey, instead: Instead) -> _Course:
-    """Let the synchronised guidance go over to what a what-if flies; its lags and shares stay."""
+    """Transfer the synchronised guidance to a what-if query; its lags and speed ratio stay."""
     control = on_wings(board.params, grey.identified, instead.asked, sentence=law.LAW)
     way, par, lags = instead.way(board.origin, board.params), control.par(_altitude(seen, board)), now.lags.copy()
     if CRUISE in instead.asked:
@@ -167,7 +167,7 @@ def _otherwise(now: _Course, seen: Track, board: Board, grey: Grey, instead: Ins
 
 
 def _synchronised(seen: Track, seq: np.ndarray, way: tuple[np.ndarray, ...], w: np.ndarray) -> np.ndarray:
-    """Run the guidance over what was flown, so that it stands where the aircraft's does."""
+    """Synchronise the guidance with the flight."""
     n = len(seen)
     nil = np.full(n, np.nan)
     air = seen.v - [*w, 0.0]
@@ -180,7 +180,7 @@ def _synchronised(seen: Track, seq: np.ndarray, way: tuple[np.ndarray, ...], w: 
 
 
 def _banks(seen: Track, air: np.ndarray) -> np.ndarray:
-    """Return the bank at each row: as sent, else as the turn of the track asks for [rad]."""
+    """Return the bank at each row: reported, else from the turn rate of the track [rad]."""
     course = np.unwrap(np.arctan2(air[:, 1], air[:, 0]))
     rate = np.gradient(course, STEP)
     smooth = np.convolve(np.pad(rate, 5, mode="edge"), np.ones(11) / 11, mode="valid")
@@ -197,7 +197,7 @@ def _state(seen: Track, w: np.ndarray) -> np.ndarray:
 def _lags(
     seen: Track, leg: np.ndarray, par: np.ndarray, absent: tuple[str, ...], told: tuple[Grey, float]
 ) -> np.ndarray:
-    """Return the numbers of the law: lags, and the speeds that were flown of late."""
+    """Return the parameters of the law: lags and recent speeds."""
     grey, V = told
     known = CRUISE not in absent
     commanded = leg[VA_C] if leg[VA_C] > 0 else par[P.VA_CRUISE] if known else 0.0
@@ -213,7 +213,7 @@ def _lags(
 
 
 def compare(track: Track, seq: np.ndarray, board: Board, grey: Grey) -> Grey:
-    """Fly the law over the last minute from several starts, and keep period and lag that stray least."""
+    """Fit period and lag: minimise the mean rollout error from several starts over the last minute."""
     over = int(_OVER_S / STEP)
     last = len(track) - 1 - over
     rows = range(last, max(len(track) - int(_BACK_S / STEP), int(LEAST_S / STEP)), -int(_EVERY_S / STEP))
@@ -246,8 +246,8 @@ def _strays(track: Track, k: int, seq: np.ndarray, board: Board, grey: Grey) -> 
 
 
 def said(grey: Grey) -> str:
-    """Say what the flight ahead rests on."""
+    """Describe the model and its error."""
     if not grey.starts:
         return "route flown by guidance and lags, not yet compared with flight"
     period = f"L1 period {grey.period:.0f} s, " if grey.period else ""
-    return f"route flown by guidance and lags: {period}strays {grey.miss:.0f} m in {_OVER_S:.0f} s"
+    return f"route flown by guidance and lags: {period}mean error {grey.miss:.0f} m over {_OVER_S:.0f} s"

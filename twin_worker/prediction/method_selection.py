@@ -1,6 +1,6 @@
-"""Which way of flying the route is used: the one whose past predictions strayed least, all scored at the same instants.
+"""Selection of the prediction method with the smallest past error, all methods scored at the same times.
 
-Source: Bates & Granger 1969, "The combination of forecasts" (why the mean of two is one of them).
+Source: Bates & Granger 1969, "The combination of forecasts" (the mean of two forecasts is one of the methods).
 """
 
 from collections import deque
@@ -11,22 +11,23 @@ import numpy as np
 from twin_worker.confidence.tube_and_horizon import path_length
 from twin_worker.numerics.interpolation import straight
 
-AT = np.arange(0.0, 61.0, 5.0)  # look-ahead at which paths are compared [s]
-EVERY_S = 5.0  # between predictions that are compared [s]
-ORDER = ("both", "hybrid", "dynamics", "paper")  # while there is nothing to compare
-_NEWS = 0.1  # weight of the newest, once there are many
-_CLEARLY = 0.85  # share of the usual one's miss below which another is preferred: the mean of two errs less [-]
-_LEAST = 4  # answered predictions before any of them counts
-_HOLE_S = 2.0  # a longer hole in the flight gives no answer [s]
+AT = np.arange(0.0, 61.0, 5.0)  # look-ahead of the scores [s]
+EVERY_S = 5.0  # interval of scored predictions [s]
+ORDER = ("both", "hybrid", "dynamics", "paper")  # preference before any score
+_NEWS = 0.1  # smoothing weight of the newest score
+_CLEARLY = 0.85  # another method replaces the preferred one below this ratio of errors [-]
+_LEAST = 4  # minimum scored predictions
+_HOLE_S = 2.0  # predictions across a longer gap are not scored [s]
 
 
 @dataclass
 class Contest:
-    """Paths of every method that wait for the flight, and how far each strayed so far.
+    """Score the predicted paths of every method against the flight.
 
     Attributes:
-        miss: mean relative error up to 60 s, smoothed, by method [-]
-        count: predictions answered, by method
+        pending: predictions that are not scored yet: start time, ground speed, path by method
+        mean_error: smoothed mean relative error up to 60 s, by method [-]
+        n_scored: number of scored predictions, by method
     """
 
     waiting: deque[tuple[float, float, dict[str, np.ndarray]]] = field(default_factory=deque)
@@ -34,27 +35,27 @@ class Contest:
     count: dict[str, int] = field(default_factory=dict)
 
     def due(self, t: float) -> bool:
-        """Return whether the paths made at `t` are to be compared, so that every method must fly."""
+        """Return whether predictions at `t` are scored, which requires a path of every method."""
         return not self.waiting or not self.waiting[-1][0] <= t < self.waiting[-1][0] + EVERY_S
 
     def keep(self, t: float, speed: float, ahead: np.ndarray, paths: dict[str, np.ndarray]) -> None:
-        """Remember what each method foretells at `t`.
+        """Add the predicted path of each method at `t`.
 
         Args:
-            t: when they start [s since 1970]
-            speed: over ground [m/s]
-            ahead: look-ahead from there, (k,) [s]
+            t: start time [s since 1970]
+            speed: ground speed [m/s]
+            ahead: look-ahead times, (k,) [s]
             paths: NED, (k, 3) [m] by method
         """
         rows = {method: straight(AT, ahead, path) for method, path in paths.items()}
         self.waiting.append((t, speed, rows))
 
     def forget(self) -> None:
-        """Drop what an event has made meaningless."""
+        """Discard pending predictions that an event has invalidated."""
         self.waiting.clear()
 
     def answer(self, t: np.ndarray, flown: np.ndarray) -> None:
-        """Score what has been flown to its end: times (n,) [s since 1970], positions NED (n, 3) [m]."""
+        """Score completed predictions with the flight: times (n,) [s since 1970], positions NED (n, 3) [m]."""
         while self.waiting and len(t) and self.waiting[0][0] + AT[-1] <= t[-1]:
             begun, speed, paths = self.waiting.popleft()
             at = begun + AT
@@ -72,7 +73,7 @@ class Contest:
         self.miss[method] = before + max(_NEWS, 1.0 / n) * (miss - before)
 
     def best(self, methods: tuple[str, ...]) -> str:
-        """Choose the first of `ORDER` among methods, unless another strayed clearly less in enough of them."""
+        """Return the first of `PREFERENCE` among methods, unless another has a clearly smaller error."""
         known = [method for method in methods if self.count.get(method, 0) >= _LEAST]
         if len(known) < len(methods):
             return min(methods, key=ORDER.index)
@@ -81,8 +82,8 @@ class Contest:
         return least if self.miss[least] < _CLEARLY * self.miss[usual] else usual
 
     def said(self, method: str) -> str:
-        """Say what the choice rests on; empty before enough were answered."""
+        """Describe the errors of all methods; empty before enough scores."""
         if len(self.miss) < 2 or self.count.get(method, 0) < _LEAST:
             return ""
         others = ", ".join(f"{name} {miss:.1%}" for name, miss in self.miss.items() if name != method)
-        return f"{method} strayed {self.miss[method]:.1%} of the way ({others})"
+        return f"{method}: mean error {self.miss[method]:.1%} of path length ({others})"

@@ -1,4 +1,4 @@
-"""What is flown instead of what is on board: the synchronised controller goes over to another route and parameters."""
+"""Override of route and parameters, with a bumpless transfer of the synchronised controller."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,20 +10,20 @@ from fleet.contract import Item
 from fleet.frames import Origin
 from fleet.mission import VA_C, Route, route
 
-_STILL = 0.5  # slower than this it stands [m/s]
+_STILL = 0.5  # stationary below this speed [m/s]
 
 
 @dataclass(frozen=True)
 class Instead:
-    """What a question has instead, from the start of the prediction on.
+    """Route, parameters and speed of a what-if query, from the start of the prediction on.
 
     Attributes:
         items: mission
-        seq: item flown to first
-        asked: autopilot parameters
-        anew: begin at `seq` from where the aircraft is, though it may already be flying that item
-        speed: through the air at the start, of what hovers over ground [m/s]; None: as it is
-        first: number of the first item to fly, as for `fleet.mission.route`
+        seq: first target item
+        parameters: autopilot parameters
+        restart_leg: start the leg to `seq` at the aircraft position, even if that item is current
+        speed: airspeed at the start, ground speed for hovering aircraft [m/s]; None: unchanged
+        first_item: number of the first item to fly, as for `fleet.mission.route`
     """
 
     items: tuple[Item, ...]
@@ -34,11 +34,11 @@ class Instead:
     first: int = 1
 
     def way(self, origin: Origin, received: Mapping[str, float]) -> Route:
-        """Lay the route."""
+        """Return the route."""
         return route(self.items, seq=self.seq, origin=origin, params={**received, **self.asked}, first=self.first)
 
     def at_speed(self, velocity: np.ndarray, psi: float = 0.0) -> np.ndarray:
-        """Return a velocity (3,) [m/s] the speed asked for; of one who stands the nose tells the direction [rad]."""
+        """Scale a velocity (3,) [m/s] to the requested speed; a stationary aircraft uses the heading `psi` [rad]."""
         if self.speed is None:
             return velocity
         now = float(np.linalg.norm(velocity))
@@ -49,12 +49,12 @@ class Instead:
 def gone_over(
     ctl: np.ndarray, was: np.ndarray, par: np.ndarray, legs: np.ndarray, begin: tuple[bool, np.ndarray]
 ) -> np.ndarray:
-    """Return controller's state on another route: filters and integrators stay, and the leg where it is the same one.
+    """Return the controller state on another route: filters and integrators stay, an identical leg continues.
 
     Args:
-        ctl, was: synchronised state, and the legs it is on
-        par, legs: parameters and legs from now on
-        begin: whether the leg begins anew in any case, and where the aircraft is, NED, (3,) [m]
+        ctl, old_legs: synchronised state and its legs
+        par, legs: new parameters and legs
+        restart: whether to restart the leg unconditionally, and the aircraft position, NED, (3,) [m]
     """
     out, (anew, p) = ctl.copy(), begin
     rest = [column for column in range(legs.shape[1]) if column != VA_C]

@@ -1,4 +1,4 @@
-"""Prediction without a route: an interacting multiple model of straight flight and turns to either side.
+"""Prediction without a route: interacting multiple model (IMM) of straight flight, left and right turns.
 
 Source: Bar-Shalom 2001, section 11.6 (IMM), 11.7 (coordinated turn); filterpy.kalman.IMMEstimator.
 """
@@ -12,14 +12,15 @@ from twin_worker.telemetry.track import STEP as TRACK_STEP
 from twin_worker.telemetry.track import Track
 
 STEP = 0.5  # filter step [s]
-_ROWS = 24  # steps of the past the filter runs over
+_ROWS = 24  # past steps that the filter uses
 _TURN = 0.3  # turn rate of the two turning models [rad/s]
-_FASTEST = 1e3  # faster rows, and rows farther apart, are no flight of one aircraft [m/s]
-_STAY = np.array([[0.97, 0.015, 0.015], [0.06, 0.93, 0.01], [0.06, 0.01, 0.93]])  # model switching per step
+_FASTEST = 1e3  # faster rows are invalid [m/s]
+# transition probabilities per step
+_STAY = np.array([[0.97, 0.015, 0.015], [0.06, 0.93, 0.01], [0.06, 0.01, 0.93]])
 
 
 def _transition(rate: float) -> np.ndarray:
-    """Return the step of p_n, v_n, p_e, v_e at one turn rate [rad/s]."""
+    """Return the transition matrix of p_n, v_n, p_e, v_e at one turn rate [rad/s]."""
     if rate == 0.0:
         block = np.array([[1.0, STEP], [0.0, 1.0]])
         return np.kron(np.eye(2), block)
@@ -43,13 +44,13 @@ def _filter(rate: float, noise: float, start: np.ndarray) -> KalmanFilter:
 
 
 def turn_on(flown: Track, ahead: np.ndarray) -> np.ndarray | None:
-    """Predict from the end of a track, NED, (k, 3) [m]; None while less than four steps of it are unbroken.
+    """Predict from the end of a track, NED, (k, 3) [m]; None with fewer than four gap-free steps.
 
-    Where the clock jumps, rows of two times lie on one grid: what is before the last leap is left out.
+    A clock jump puts rows of two times on one grid; rows before the last jump are ignored.
 
     Args:
-        flown: newest flight
-        ahead: wanted look-ahead times, (k,) [s]
+        track: newest flight
+        ahead: requested look-ahead times, (k,) [s]
     """
     every = round(STEP / TRACK_STEP)
     whole = flown.whole()
@@ -59,22 +60,23 @@ def turn_on(flown: Track, ahead: np.ndarray) -> np.ndarray | None:
 
 
 def _after_leap(p: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cut positions and velocities, (n, 3), to those after the last row that no aircraft can fly; nan is none."""
+    """Return positions and velocities, (n, 3), after the last implausible row; nan is implausible."""
     flown = np.linalg.norm(v, axis=1) < _FASTEST
     flown[1:] &= np.linalg.norm(np.diff(p, axis=0), axis=1) < _FASTEST * STEP
     leaps = np.flatnonzero(~flown)
     first = int(leaps[-1]) if len(leaps) else 0
-    first += int(len(leaps) > 0 and not np.linalg.norm(v[first]) < _FASTEST)  # after a leap in position it flies on
+    # the row after a position jump is valid
+    first += int(len(leaps) > 0 and not np.linalg.norm(v[first]) < _FASTEST)
     return p[first:], v[first:]
 
 
 def imm(p: np.ndarray, v: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Predict from recent positions alone.
+    """Predict from recent positions and velocities.
 
     Args:
         p: recent positions every `STEP` seconds, NED, newest last, (n, 3) [m]
         v: recent velocities over ground, NED, (n, 3) [m/s]
-        ahead: wanted look-ahead times, (k,) [s]
+        ahead: requested look-ahead times, (k,) [s]
     Returns:
         mean path, NED, (k, 3) [m]
     """
@@ -87,12 +89,12 @@ def imm(p: np.ndarray, v: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     steps = int(np.ceil(ahead[-1] / STEP))
     track = _run_forward(estimator, steps)
     t = STEP * np.arange(steps + 1)
-    climb = np.clip(v[-4:, 2].mean(), -8.0, 8.0) * 6.0 * (1 - np.exp(-ahead / 6.0))  # a climb seldom lasts
+    climb = np.clip(v[-4:, 2].mean(), -8.0, 8.0) * 6.0 * (1 - np.exp(-ahead / 6.0))  # the climb decays
     return np.column_stack([np.interp(ahead, t, track[:, 0]), np.interp(ahead, t, track[:, 1]), p[-1, 2] + climb])
 
 
 def _run_forward(estimator: IMMEstimator, steps: int) -> np.ndarray:
-    """Mix and step the models without data; return the mean p_n, p_e, (steps + 1, 2) [m]."""
+    """Propagate the mixed models without measurements; return the mean p_n, p_e, (steps + 1, 2) [m]."""
     mu = estimator.mu.copy()
     x = np.stack([filt.x for filt in estimator.filters])
     F = np.stack([filt.F for filt in estimator.filters])

@@ -1,1 +1,1 @@
-"""Telemetry of one aircraft: buffered, resampled, checked for what is missing."""
+"""Telemetry of one aircraft: buffering, resampling and completeness check."""

@@ -1,22 +1,22 @@
-"""Messages dated by the gateway's clock, placed on the time axis of telemetry, which may be behind that clock."""
+"""Delay of telemetry time behind the gateway clock."""
 
 from dataclasses import dataclass
 
-_TOLERATED_S = 0.5  # telemetry is behind by as much on any radio link: such a delay counts as none [s]
+_TOLERATED_S = 0.5  # usual delay of a radio link; treated as zero [s]
 
 
 @dataclass
 class Delay:
-    """How far the times of telemetry are behind the gateway's clock, by the order of arrival.
+    """Estimate how far telemetry times are behind the gateway clock, from the order of arrival.
 
-    Samples are dated by the aircraft's clock, status messages by the gateway's. A sample of time t that arrives after
-    a status of time G is delayed by G - t at least; the greatest of these bounds between two status messages is the
-    delay. A simulator slower than real time, or one that paused, falls behind without limit.
+    Samples have aircraft time, status messages have gateway time. A sample of time t that arrives after a status of
+    time G is delayed by at least G - t. The largest such bound between two status messages is the delay. The delay of
+    a simulator that is paused or slower than real time is unbounded.
 
     Attributes:
         gateway_t: newest time of a status [s since 1970]
-        bound: greatest lower bound since that status [s]
-        known: in force since that status [s]
+        bound: largest lower bound since that status [s]
+        established: delay established at that status [s]
     """
 
     gateway_t: float = float("-inf")
@@ -25,23 +25,23 @@ class Delay:
 
     @property
     def now(self) -> float:
-        """Return the delay of the newest sample [s]; 0 where it is a usual one."""
+        """Return the delay of the newest sample [s]; 0 within the tolerance."""
         return _unusual(max(self.known, self.bound))
 
     def take_sample(self, newest: float, leapt: bool) -> None:
-        """Learn that telemetry up to `newest` has arrived [s since 1970]; of a leap only what follows it counts."""
+        """Update with telemetry up to `newest` [s since 1970]; a clock jump discards earlier bounds."""
         bound = self.gateway_t - newest
         self.bound = bound if leapt else max(self.bound, bound)
         self.known = 0.0 if leapt else self.known
 
     def of_status(self, t: float, newest: float) -> float:
-        """Return delay at a status of time `t`, before it is taken; the first one is taken to come with a sample."""
+        """Return the delay at a status of time `t` before `on_status`; the first status follows a sample."""
         if self.gateway_t == float("-inf"):
             return _unusual(t - newest)
         return self.known if self.bound == float("-inf") else _unusual(self.bound)
 
     def take_status(self, t: float, newest: float) -> None:
-        """Learn that a status of time `t` has arrived, telemetry up to `newest` before it [s since 1970]."""
+        """Update with a status of time `t` that follows telemetry up to `newest` [s since 1970]."""
         self.known = self.of_status(t, newest)
         self.gateway_t, self.bound = max(t, self.gateway_t), float("-inf")
 

@@ -1,4 +1,4 @@
-"""The last minutes of one aircraft's telemetry, as it came."""
+"""Telemetry of one aircraft over the last minutes, as received."""
 
 from struct import Struct
 
@@ -7,16 +7,16 @@ import numpy as np
 from fleet.contract import COLUMNS, DTYPES, UNTOLD, Array, Rows, Sample
 from twin_worker.telemetry.row_buffer import Kept
 
-_AHEAD_S = 1.0  # rows newer than their message by more are refused [s]
-_MOST = 1e5  # values beyond are noise [m/s, rad, us, ...]
-_MOST_OF = {"position": 2e9, "target": 2e9, "gnss": 2e9, "pressure": 1e6}  # the same [1e-7 deg, mm, Pa]
+_AHEAD_S = 1.0  # rows further in the future of their message are rejected [s]
+_MOST = 1e5  # larger values are invalid [m/s, rad, us, ...]
+_MOST_OF = {"position": 2e9, "target": 2e9, "gnss": 2e9, "pressure": 1e6}  # exceptions [1e-7 deg, mm, Pa]
 _WIDTHS = tuple((name, len(columns)) for name, columns in COLUMNS.items())
 _SIZES = {name: np.dtype(name).itemsize for name in DTYPES}
-_TIMES = tuple(Struct(f"<{n}d").unpack for n in range(17))  # of so many rows: few numbers need no array
+_TIMES = tuple(Struct(f"<{n}d").unpack for n in range(17))  # by number of rows; faster than an array
 
 
 class History:
-    """Rows of every kind over the last `keep_s` seconds; out-of-order and repeated rows are sorted out on reading."""
+    """Buffer rows of every kind over the last `keep_s` seconds; reading sorts rows and drops duplicates."""
 
     def __init__(self, keep_s: float = 160.0) -> None:
         self.keep_s = keep_s
@@ -24,7 +24,7 @@ class History:
         self._kept: dict[str, Kept] = {}
 
     def add(self, sample: Sample) -> int:
-        """Take one message; return how many of its kinds did not fit the contract."""
+        """Add one message; return how many of its kinds violate the contract."""
         bad, latest = 0, sample.t + _AHEAD_S
         for name, width in _WIDTHS:
             rows: Rows | None = getattr(sample, name)
@@ -38,21 +38,21 @@ class History:
         return bad
 
     def _doubt(self, name: str, rows: Rows, latest: float) -> bool:
-        """Take of many rows, or of odd ones, those that fit; tell whether some do not."""
+        """Add the valid rows of a large or irregular batch; return whether some rows are invalid."""
         try:
             t, x = rows.t.numpy(), rows.x.numpy()
         except ValueError:
             return True
         if x.ndim != 2 or t.shape != x.shape[:1] or x.shape[1] != len(COLUMNS[name]) or not len(t):
             return True
-        timed = (t <= latest) & (t > 0)  # false for nan; a message that dates its rows later contradicts itself
+        timed = (t <= latest) & (t > 0)  # false for nan; rows later than their message are inconsistent
         if timed.any():
             t, x = t[timed], x[timed]
             self._of(name, float(t.max())).add(t, x, self.newest - self.keep_s)
         return not timed.all()
 
     def _of(self, name: str, newest: float) -> Kept:
-        """Return what is kept of a kind of which rows up to `newest` came."""
+        """Return the buffer of a kind and record its newest row time."""
         if newest > self.newest:
             self.newest = newest
         kept = self._kept.get(name)
@@ -61,12 +61,12 @@ class History:
         return kept
 
     def rows(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
-        """Return times (n,) and values (n, k) of one kind from `since` on, rising in time, believable, once each."""
+        """Return copies of times (n,) and values (n, k) of one kind from `since` on: valid, rising in time, unique."""
         t, x = self.look(name, since)
         return t.copy(), x.copy()
 
     def look(self, name: str, since: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
-        """Return the same where it lies: only to read, and not beyond the next message."""
+        """Return the same as read-only views, valid until the next message."""
         kept = self._kept.get(name)
         if kept is None:
             return np.empty(0), np.empty((0, len(COLUMNS[name])))
@@ -78,29 +78,29 @@ class History:
         return t[first:], kept.x[first : kept.n]
 
     def put(self, name: str, t: np.ndarray, x: np.ndarray) -> None:
-        """Have these rows, (n,) and (n, k), instead of all of their kind."""
+        """Replace all rows of one kind, (n,) and (n, k)."""
         self._kept[name] = Kept(np.array(t, float), np.array(x, float))
 
     def advance(self, before: float, by: float) -> None:
-        """Date rows from before a time later by `by` [s since 1970, s]: their clock was found to be so far behind."""
+        """Shift rows before `before_t` [s since 1970] by `shift_s` [s], after a correction of their clock."""
         for kept in self._kept.values():
             kept.advance(before, by)
         self.newest = max((float(kept.t[: kept.n].max()) for kept in self._kept.values() if kept.n), default=-np.inf)
 
     def sound(self) -> bool:
-        """Return whether every kind has its columns: compiled code does not look."""
+        """Return whether every kind has its columns; compiled code does not check bounds."""
         widths = dict(_WIDTHS)
         kinds = self._kept.items() if isinstance(self._kept, dict) else [("", None)]
         return all(isinstance(kept, Kept) and kept.x.shape[1] == widths.get(name) for name, kept in kinds)
 
     def clear(self) -> None:
-        """Forget everything, as after a jump of the clock."""
+        """Remove all rows, for example after a clock jump."""
         self._kept.clear()
         self.newest = -np.inf
 
 
 def _newest(t: Array, x: Array, width: int, latest: float) -> float:
-    """Return the newest time of rows as they mostly are: few, sound, none later than `latest`; 0 where they are not."""
+    """Return the newest time of a small valid batch, none later than `max_t`; 0 for any other batch."""
     n = len(t.data) >> 3
     if not 0 < n < len(_TIMES) or t.dtype != "<f8" or t.shape != (n,) or x.shape != (n, width):
         return 0.0

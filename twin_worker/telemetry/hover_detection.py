@@ -1,4 +1,4 @@
-"""When a quadplane hangs on its rotors: the lift motors turn, or its mode says so, or it is too slow for wings."""
+"""Hover detection of a quadplane: lift motors spin, or the flight mode is a hover mode."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,14 +6,14 @@ import numpy as np
 
 from twin_worker.telemetry.history import History
 
-SETTLE_S = 3.0  # after a transition its air flow is not yet that of a wing [s]
+SETTLE_S = 3.0  # settling time of the air flow after a transition [s]
 _MOTORS = (*range(33, 41), *range(82, 86))  # SERVOn_FUNCTION of motors 1 to 12
-_SPINS = 0.08  # of the throw, above which a lift motor turns [-]
+_SPINS = 0.08  # fraction of the pulse range above which a lift motor spins [-]
 _SERVOS = 8
 
 
 def lift_channels(params: Mapping[str, float]) -> list[tuple[int, float]]:
-    """Return the servo outputs of the lift motors: (column, pulse above which it turns [us])."""
+    """Return the servo outputs of the lift motors: (column, pulse above which the motor spins [us])."""
     found = []
     for n in range(1, _SERVOS + 1):
         if params.get(f"SERVO{n}_FUNCTION") in _MOTORS:
@@ -26,13 +26,13 @@ def lift_channels(params: Mapping[str, float]) -> list[tuple[int, float]]:
 def lifted(
     t: np.ndarray, history: History, params: Mapping[str, float], modes: Sequence[tuple[float, str]]
 ) -> np.ndarray:
-    """Tell when it hung on its rotors, (n,) bool.
+    """Return the mask of hovering flight, (n,) bool.
 
     Args:
-        t: wanted times, rising, (n,) [s since 1970]
-        history: telemetry as it came
-        params: autopilot parameters, for the outputs of the lift motors
-        modes: changes of mode, (when, name), in order
+        t: requested times, rising, (n,) [s since 1970]
+        history: telemetry as received
+        params: autopilot parameters, which define the outputs of the lift motors
+        modes: mode changes, (time, name), in order
     """
     out = np.zeros(len(t), bool)
     ends = [since for since, _ in list(modes)[1:]] + [np.inf]

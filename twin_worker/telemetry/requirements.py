@@ -1,15 +1,15 @@
-"""What telemetry lacks for a model to be identified, and what that costs: one sentence."""
+"""Check of the telemetry that identification requires."""
 
 import numpy as np
 
 from twin_worker.telemetry.history import History
 
-_NEEDS_HZ = {"attitude": 5.0, "velocity": 2.0, "position": 2.0, "servo": 5.0}  # for surfaces and modes to be seen
-_OVER_S = 20.0  # rates are taken over as much [s]
+_NEEDS_HZ = {"attitude": 5.0, "velocity": 2.0, "position": 2.0, "servo": 5.0}  # minimum rates
+_OVER_S = 20.0  # window of the rate [s]
 
 
 def rate_hz(history: History, kind: str) -> float:
-    """Return the rate of one kind of row of late [Hz]; 0 where none came."""
+    """Return the recent rate of one kind of row [Hz]; 0 without rows."""
     t, _ = history.look(kind, history.newest - _OVER_S)
     if not len(t):
         return 0.0
@@ -18,7 +18,7 @@ def rate_hz(history: History, kind: str) -> float:
 
 
 def lacking(history: History) -> str:
-    """Say which kinds of row never came and which come too seldom; empty where everything is there."""
+    """Describe which kinds of row are missing or too slow; empty if telemetry is sufficient."""
     none = [kind for kind in (*_NEEDS_HZ, "air") if not len(history.look(kind)[0])]
     slow = {kind: rate_hz(history, kind) for kind in _NEEDS_HZ if kind not in none}
     said = [f"no {', '.join(none)} rows yet"] if none else []

@@ -1,4 +1,4 @@
-"""Samples to `Window`: one time grid, lost samples filled by Lagrange interpolation, long gaps marked.
+"""Resample telemetry to a `Window`: one time grid, Lagrange interpolation of lost samples, long gaps marked.
 
 Source: Huang 2021, section 3.2 (time-stamp calibration, eq. 18; Lagrange interpolation, eq. 19).
 """
@@ -14,24 +14,24 @@ from fleet.window import INPUTS, STATES, Window
 from twin_worker.telemetry.history import History
 
 DT = 0.04  # grid of every window [s]
-LONGEST_GAP = {"attitude": 0.5, "velocity": 1.0, "servo": 0.5, "position": 1.0}  # wider gaps are never filled [s]
-_SETTLED_S = 1.5  # rows older than the newest grid time by more come no longer [s]
-_BEFORE_S = 4.0  # rows before a piece that its interpolation looks at [s]
-_LEAST_ROWS = 4, 8  # of every kind, to go on and to begin
-_FEWEST = 50  # grid times of a window
-_BENT = 8.0  # usual gaps that the four points of a cubic may span [-]
-_LOST = 1.6  # usual gaps from which a gap means lost samples [-]
-_LAID, _TURN, _WIDTH = 12, 16, 22  # where inputs begin in what is kept, cosines and sines of the angles, and its end
-_SPARE_S = 20.0  # place for so much more is made at once [s]
+LONGEST_GAP = {"attitude": 0.5, "velocity": 1.0, "servo": 0.5, "position": 1.0}  # longer gaps are not filled [s]
+_SETTLED_S = 1.5  # rows older than this no longer arrive [s]
+_BEFORE_S = 4.0  # rows before a segment that its interpolation uses [s]
+_LEAST_ROWS = 4, 8  # minimum of every kind, to continue and to start
+_FEWEST = 50  # minimum grid times of a window
+_BENT = 8.0  # largest span of the four points of a cubic, in median gaps [-]
+_LOST = 1.6  # gap that indicates lost samples, in median gaps [-]
+_LAID, _TURN, _WIDTH = 12, 16, 22  # first column of inputs, first of cosines and sines, number of columns
+_SPARE_S = 20.0  # spare capacity on growth [s]
 
 
 def lagrange(t: np.ndarray, y: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Interpolate by the cubic Lagrange polynomial through the four samples around each grid time.
+    """Interpolate with the cubic Lagrange polynomial through the four samples around each grid time.
 
     Args:
         t: sample times, rising, (m,) [s]
         y: samples, (m, k)
-        grid: wanted times within the samples, rising, (n,) [s]
+        grid: requested times within the samples, rising, (n,) [s]
     Returns:
         values on the grid, (n, k)
     """
@@ -41,12 +41,12 @@ def lagrange(t: np.ndarray, y: np.ndarray, grid: np.ndarray) -> np.ndarray:
 def fill(
     t: np.ndarray, y: np.ndarray, grid: np.ndarray, longest: float, bent: float = _BENT
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lay samples on the grid: cubic where they are dense, linear across a short gap, not at all across a long one.
+    """Interpolate samples on the grid: cubic where dense, linear across a short gap, invalid across a long gap.
 
     Args:
         t, y, grid: as for `lagrange`
-        longest: wider gaps are not filled [s]
-        bent: usual gaps that the four points of a cubic may span; next to a wide gap noise would swing it [-]
+        max_gap: longer gaps are not filled [s]
+        max_cubic_gaps: largest span of a cubic in median gaps; near a wide gap a cubic amplifies noise [-]
     Returns:
         values (n, k), measured or filled (n,) bool, filled across lost samples (n,) bool
     """
@@ -65,7 +65,7 @@ def _laid(
     return out, ok, lost
 
 
-@nb.njit(cache=True, nogil=True)  # no fastmath: a gap just as long as the longest is filled
+@nb.njit(cache=True, nogil=True)  # no fastmath: a gap exactly as long as the limit is filled
 def _lay_each(
     t: np.ndarray,
     y: np.ndarray,
@@ -75,7 +75,7 @@ def _lay_each(
     ok: np.ndarray,
     lost: np.ndarray,
 ) -> None:
-    """Fill in what `fill` gives; limits: usual gap, longest gap, longest span of a cubic [s].
+    """Compute the result of `interpolate_samples`; limits: median gap, longest gap, longest span of a cubic [s].
 
     L(a) = sum_i b_i prod_(j != i) (a - a_j) / (a_i - a_j).  Source: Huang 2021 eq. 19.
     """
@@ -102,35 +102,35 @@ def _lay_each(
 
 
 class Grid:
-    """One aircraft's telemetry on one grid, multiples of `DT`; what is settled is laid once, the tail every time."""
+    """Resample telemetry of one aircraft on multiples of `DT`; final rows are computed once, the tail every time."""
 
     def __init__(self, keep_s: float = 160.0) -> None:
         self.keep_s = keep_s
         self._origin: Origin | None = None
         self._servos: ServoMap | None = None
-        self._first, self._stop = 0, 0  # rows in use of the three below
+        self._first, self._stop = 0, 0  # range in use of the three arrays below
         self._k = np.empty(0, np.int64)  # grid times in steps of DT
-        self._laid = np.empty((0, _WIDTH))  # attitude, velocity, position, inputs, and what turns it to the body
+        self._laid = np.empty((0, _WIDTH))  # attitude, velocity, position, inputs, cosines and sines
         self._ok = np.empty((0, 2), bool)  # measured or filled; filled
 
     def clear(self) -> None:
-        """Forget everything, as after a jump of the clock."""
+        """Discard all rows, for example after a clock jump."""
         self._first, self._stop = 0, 0
 
     def window(
         self, history: History, origin: Origin, servos: ServoMap, wind: np.ndarray, *, until: float, seconds: float
     ) -> Window | None:
-        """Lay what is new, and return the newest `seconds` before `until`.
+        """Resample new telemetry and return the newest `seconds` before `until`.
 
         Args:
-            history: telemetry as it came
-            origin: where the twin's NED frame touches the earth
-            servos: pulse widths to inputs
+            history: telemetry as received
+            origin: origin of the twin's NED frame
+            servos: map from pulse widths to inputs
             wind: wind, NED, the direction it blows to, (3,) [m/s]
             until: newest grid time [s since 1970]
-            seconds: wanted length [s]
+            seconds: requested length [s]
         Returns:
-            the window, or None while any needed kind of row is missing
+            the window, or None while a required kind of row is missing
         """
         if self._origin != origin or self._servos is None or not servos.same(self._servos):
             self.clear()
@@ -150,7 +150,7 @@ class Grid:
         return Window(k[rows] * DT, x, u, p, v, ok, filled)
 
     def _extend(self, history: History, until: float) -> bool:
-        """Lay the tail anew from where rows may still have come; tell whether every kind is there."""
+        """Resample the tail that may still receive rows; return whether every kind is available."""
         begun = self._stop > self._first
         settled = self._k[self._stop - 1] * DT - _SETTLED_S if begun else max(until - self.keep_s, 0.0)
         rows = {name: history.look(name, settled - _BEFORE_S) for name in LONGEST_GAP}
@@ -167,10 +167,10 @@ class Grid:
         return True
 
     def _join(self, k: np.ndarray, laid: np.ndarray, ok: np.ndarray) -> None:
-        """Have these rows, (n,), (n, 20), (n, 2), instead of all from the first of them on."""
+        """Replace all rows from `k[0]` on with these rows, (n,), (n, 20), (n, 2)."""
         at = [k[0] - int(self.keep_s / DT), k[0]]
         first, stop = (self._first + int(row) for row in self._k[self._first : self._stop].searchsorted(at))
-        if self._stop > self._first:  # angles go on from the turn they were on
+        if self._stop > self._first:  # angles continue without a jump of 2 pi
             before = self._laid[stop - 1, :3] if stop > first else np.zeros(3)
             laid[:, :3] += 2 * np.pi * np.round((before - laid[0, :3]) / (2 * np.pi))
         if stop + len(k) > len(self._k):
@@ -184,7 +184,7 @@ class Grid:
         self._first, self._stop = first, new.stop
 
     def _make_place(self, first: int, stop: int, more: int) -> None:
-        """Keep rows `first` to `stop` in arrays that have place for `more`, and for some time to come."""
+        """Move rows `first` to `stop` to larger arrays with space for `n_new` rows and a reserve."""
         size = stop - first + more + int(_SPARE_S / DT)
         for name in ("_k", "_laid", "_ok"):
             old = getattr(self, name)
@@ -195,7 +195,7 @@ class Grid:
 
 @nb.njit(cache=True, nogil=True)  # no fastmath: as `fleet.frames.ned_to_body` has it
 def _turn(laid: np.ndarray) -> None:
-    """Fill in the cosines and sines of every row's angles: a window is turned anew with every new wind."""
+    """Compute cosines and sines of the angles of every row, which every new wind reuses."""
     for k in range(len(laid)):
         for i in range(3):
             laid[k, _TURN + 2 * i], laid[k, _TURN + 2 * i + 1] = cos(laid[k, i]), sin(laid[k, i])
@@ -203,7 +203,7 @@ def _turn(laid: np.ndarray) -> None:
 
 @nb.njit(cache=True, nogil=True)  # no fastmath: as `fleet.frames.ned_to_body` has it
 def _seen(laid: np.ndarray, wind: np.ndarray, x: np.ndarray, u: np.ndarray, p: np.ndarray, v: np.ndarray) -> None:
-    """Fill in states, (n, 9), inputs, (n, 4), positions and velocities, (n, 3), of rows as `Grid` keeps them."""
+    """Compute states, (n, 9), inputs, (n, 4), positions and velocities, (n, 3), from rows of `Resampler`."""
     for k in range(len(laid)):
         row = laid[k]
         cf, sf, ct, st, cp, sp = row[16], row[17], row[18], row[19], row[20], row[21]
@@ -222,7 +222,7 @@ def _seen(laid: np.ndarray, wind: np.ndarray, x: np.ndarray, u: np.ndarray, p: n
 def _lay(
     rows: dict[str, tuple[np.ndarray, np.ndarray]], grid: np.ndarray, origin: Origin
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lay every kind on grid times; return columns as in `Grid`, what is measured or filled, and what is filled."""
+    """Interpolate every kind on the grid; return columns of `Resampler`, mask of valid rows, mask of filled rows."""
     t, attitude = rows["attitude"]
     unwrapped = np.hstack([np.unwrap(attitude[:, :3], axis=0), attitude[:, 3:]])
     t_p, place = rows["position"]
@@ -230,7 +230,7 @@ def _lay(
         fill(t, unwrapped, grid, LONGEST_GAP["attitude"]),
         fill(*rows["velocity"], grid, LONGEST_GAP["velocity"]),
         fill(t_p, to_ned(origin, *place.T), grid, LONGEST_GAP["position"]),
-        fill(*rows["servo"], grid, LONGEST_GAP["servo"], 0.0),  # a servo does not overshoot as a cubic would
+        fill(*rows["servo"], grid, LONGEST_GAP["servo"], 0.0),  # a cubic would overshoot, a servo does not
     ]
     values, ok, filled = zip(*laid, strict=True)
     return np.hstack(values), np.logical_and.reduce(ok), np.logical_or.reduce(filled)
@@ -239,5 +239,5 @@ def _lay(
 def preprocess(
     history: History, origin: Origin, servos: ServoMap, wind: np.ndarray, *, until: float, seconds: float
 ) -> Window | None:
-    """Lay the newest `seconds` before `until` on one grid; arguments as for `Grid.window`."""
+    """Resample the newest `seconds` before `until` on one grid; arguments as for `Resampler.window`."""
     return Grid(seconds).window(history, origin, servos, wind, until=until, seconds=seconds)

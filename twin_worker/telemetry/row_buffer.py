@@ -1,27 +1,27 @@
-"""Rows of one kind of telemetry: bytes as they came until somebody reads them, then numbers."""
+"""Buffer of telemetry rows of one kind; bytes are decoded on reading."""
 
 import numba as nb
 import numpy as np
 
-_SPARE = 40  # rows that there is always place for
-_LATER = 256  # rows that wait as bytes at most
+_SPARE = 40  # minimum spare capacity [rows]
+_LATER = 256  # largest number of undecoded rows
 
 
 class Kept:
-    """Rows of one kind: times (n,) and values (n, k) float, with place for more; what came last is not sorted yet.
+    """Buffer rows of one kind: times (n,) and values (n, k) float, with spare capacity; the newest rows are unsorted.
 
-    What was heard waits as bytes: to make numbers of a few rows takes as long as of many.
+    Received rows stay bytes until reading, because decoding a few rows takes as long as decoding many.
     """
 
     def __init__(self, t: np.ndarray, x: np.ndarray) -> None:
         self.t, self.x = t, x
-        self.n, self.settled = len(t), 0  # rows, and how many of them are sorted
+        self.n, self.settled = len(t), 0  # number of rows, and of sorted rows
         self._t: list[bytes] = []
         self._x: list[bytes] = []
-        self._dtype, self._waiting = "", 0  # of the values that wait; rows
+        self._dtype, self._waiting = "", 0  # type of pending values; number of pending rows
 
     def hear(self, t: bytes, x: bytes, dtype: str, since: float) -> None:
-        """Let rows wait, whose bytes were counted: times <f8, values of `dtype`; `since` as for `add`."""
+        """Append undecoded rows of checked length: times <f8, values of `dtype`; `since` as for `add`."""
         if dtype != self._dtype or self._waiting >= _LATER:
             self.lay(since)
             self._dtype = dtype
@@ -30,7 +30,7 @@ class Kept:
         self._waiting += len(t) >> 3
 
     def lay(self, since: float = -np.inf) -> None:
-        """Make numbers of what waits."""
+        """Decode pending rows."""
         if self._waiting:
             t = np.frombuffer(b"".join(self._t), "<f8")
             x = np.frombuffer(b"".join(self._x), self._dtype).reshape(len(t), -1)
@@ -38,7 +38,7 @@ class Kept:
             self.add(t, x, since)
 
     def add(self, t: np.ndarray, x: np.ndarray, since: float) -> None:
-        """Take rows; where there is no place left, those of before `since` are forgotten."""
+        """Append rows; if capacity is exhausted, drop rows before `since`."""
         self.lay(since)
         end = self.n + len(t)
         if end > len(self.t):
@@ -57,10 +57,10 @@ class Kept:
         self.t[: self.n], self.x[: self.n] = t, x
 
     def settle(self, most: float, told: int | None) -> None:
-        """Sort what is new in: rising in time, each time once, as it came first, and only what can be believed."""
+        """Sort new rows by time, drop duplicates (the first is kept) and invalid values."""
         told = self.x.shape[1] if told is None else told
         if not _settled(self.t[: self.n], self.x, (self.settled, told), most):
-            good = (np.abs(self.x[self.settled : self.n, :told]) < most).all(axis=1)  # nan is not
+            good = (np.abs(self.x[self.settled : self.n, :told]) < most).all(axis=1)  # false for nan
             keep = np.concatenate([np.ones(self.settled, bool), good])
             t, first = np.unique(self.t[: self.n][keep], return_index=True)
             self.x[: len(t)] = self.x[: self.n][keep][first]
@@ -69,21 +69,21 @@ class Kept:
         self.settled = self.n
 
     def advance(self, before: float, by: float) -> None:
-        """Date rows from before a time later by `by` [s]."""
+        """Shift rows before `before_t` by `shift_s` [s]."""
         self.lay()
         t = self.t[: self.n]
         t[t < before] += by
-        self.settled = 0  # what came since may lie among them
+        self.settled = 0  # later rows may overlap the shifted ones
 
     def whole(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return all rows as they came, (n,) and (n, k)."""
+        """Return all rows in order of arrival, (n,) and (n, k)."""
         self.lay()
         return self.t[: self.n], self.x[: self.n]
 
 
 @nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
 def _settled(t: np.ndarray, x: np.ndarray, what: tuple[int, int], most: float) -> bool:
-    """Tell whether rows from what[0] on rise, the one before included, and what[1] columns are believable, not nan."""
+    """Return whether rows from bounds[0] on rise in time and their first bounds[1] columns are valid, not nan."""
     for k in range(what[0], len(t)):
         if k > 0 and not t[k] > t[k - 1]:
             return False

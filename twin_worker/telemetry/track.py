@@ -1,4 +1,4 @@
-"""Where an aircraft was and how it moved, from positions and velocities alone: all that every vehicle sends."""
+"""Track of an aircraft from positions and velocities alone, which every vehicle sends."""
 
 from dataclasses import dataclass, replace
 
@@ -10,22 +10,22 @@ from twin_worker.telemetry.history import History
 from twin_worker.telemetry.resample import fill
 
 STEP = 0.1  # grid of every track [s]
-_LONGEST = 2.5  # wider gaps are never filled: 1 Hz with a lost row [s]
-_SLOPE_S = 1.0  # velocity is the slope of the position over as much to either side [s]
-_OLD_S = 3.0  # attitude or velocity older than the newest position by more is no longer sent [s]
+_LONGEST = 2.5  # longer gaps are not filled: 1 Hz with a lost row [s]
+_SLOPE_S = 1.0  # half-width of the position slope that replaces velocity [s]
+_OLD_S = 3.0  # attitude or velocity this much older than the newest position is considered lost [s]
 
 
 @dataclass(frozen=True)
 class Track:
-    """A stretch of one flight on an equal grid of `STEP`.
+    """Segment of one flight on an equal grid of `STEP`.
 
     Attributes:
         t: fleet time, (n,) [s since 1970]
         p: position, NED from the twin's origin, (n, 3) [m]
         v: velocity over ground, NED, (n, 3) [m/s]
-        euler: phi theta psi, nan where attitude is not sent, (n, 3) [rad]
+        euler: phi theta psi, nan without attitude, (n, 3) [rad]
         ok: measured or interpolated across a short gap, (n,) bool
-        sentence: what is missing, or empty
+        sentence: missing telemetry, or empty
     """
 
     t: np.ndarray
@@ -39,27 +39,27 @@ class Track:
         return len(self.t)
 
     def part(self, start: int, stop: int) -> "Track":
-        """Cut rows `start` to `stop`."""
+        """Return rows `start` to `stop`."""
         s = slice(start, stop)
         return Track(self.t[s], self.p[s], self.v[s], self.euler[s], self.ok[s], self.sentence)
 
     def whole(self, since: float = -np.inf) -> "Track":
-        """Cut what is unbroken up to the end, from `since` on."""
+        """Return the gap-free tail from `since` on."""
         bad = np.flatnonzero(~self.ok)
         return self.part(max(int(bad[-1]) + 1 if len(bad) else 0, int(np.searchsorted(self.t, since))), len(self))
 
     def turned(self, history: History) -> "Track":
-        """Return the same with its attitude."""
+        """Return the track with attitude."""
         return replace(self, euler=_attitude(history, self.t))
 
 
 def track(history: History, origin: Origin, *, until: float, seconds: float, turned: bool = True) -> Track | None:
-    """Lay the newest `seconds` before `until` on one grid; velocity is differentiated where none is sent.
+    """Resample the newest `seconds` before `until` on one grid; differentiate positions if velocity is missing.
 
-    Not `turned` its attitude is nan as yet: to lay it takes longer than all else, and not all need it.
+    Without `with_attitude` the attitude is nan: its interpolation takes longer than the rest.
 
     Returns:
-        the track, or None before a second and a half of positions
+        the track, or None with less than 1.5 s of positions
     """
     t_p, position = history.look("position", until - seconds - 2.0)
     if len(t_p) < 3:
@@ -78,13 +78,13 @@ def track(history: History, origin: Origin, *, until: float, seconds: float, tur
         ok &= also
     else:
         v = _slope(grid, p)
-    said = "" if moving else "no velocity rows: it is differentiated from positions, which costs precision"
+    said = "" if moving else "no velocity rows: velocity is differentiated from positions, with less precision"
     found = Track(grid, p, v, np.full((n, 3), np.nan), ok, said)
     return found.turned(history) if turned else found
 
 
 def _laid(t: np.ndarray, x: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lay rows on the grid, straight where there are too few for more."""
+    """Interpolate rows on the grid, linearly if there are fewer than four."""
     if len(t) < 4:
         return straight(grid, t, x), np.ones(len(grid), bool)
     values, ok, _ = fill(t, x, grid, _LONGEST)
@@ -98,7 +98,7 @@ def _slope(t: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 
 def _attitude(history: History, grid: np.ndarray) -> np.ndarray:
-    """Return phi theta psi on the grid; nan where the nearest row is too far."""
+    """Return phi theta psi on the grid; nan where the nearest row is too far away."""
     t, x = history.look("attitude", grid[0] - 2.0)
     if len(t) < 2 or t[-1] < grid[-1] - _OLD_S:
         return np.full((len(grid), 3), np.nan)

@@ -1,9 +1,9 @@
-"""What a model's free runs have earned: how far each state's forecast is believed against its mean and its last value.
+"""Shrinkage of a model's free runs towards the mean and the last value of each state.
 
     y_hat = m + kappa (run - m) + hold (y0 - m)
 
-m is the mean of the stretch before (psi: the last value). kappa and hold, per state and look-ahead, are those that
-would have served best on flight the model had not seen; before there is any they are 1 and 0.
+m is the mean of the preceding segment (psi: the last value). The weights kappa (model) and hold (persistence), per
+state and look-ahead, minimise the error on held-out flight; without held-out flight they are 1 and 0.
 
 Source: James & Stein 1961 (shrinkage); Bates & Granger 1969 (combination of forecasts).
 """
@@ -15,29 +15,29 @@ import numpy as np
 from fleet.window import STATES
 from twin_worker.validation.gust_observer import Observer
 
-KNOTS_S = np.array([0.0, 1.0, 4.0, 10.0, 20.0, 40.0])  # look-ahead of kappa and hold [s]
-_WEIGHT = 0.3  # lessons that the look-ahead before counts as
-_KEEP = 0.8  # of what was learnt before, at each lesson: aircraft and air change
+KNOTS_S = np.array([0.0, 1.0, 4.0, 10.0, 20.0, 40.0])  # look-ahead of the weights [s]
+_WEIGHT = 0.3  # updates that the previous look-ahead is equivalent to
+_KEEP = 0.8  # of earlier data at each update: aircraft and air change
 _PSI = STATES.index("psi")
 
 
 @dataclass
 class Earned:
-    """Normal equations of kappa and hold, for each knot and state, and how far each state usually strays, squared."""
+    """Normal equations of kappa and hold per knot and state, and the usual mean square of each state."""
 
     H: np.ndarray = field(default_factory=lambda: np.zeros((len(KNOTS_S), 9, 2, 2)))
     g: np.ndarray = field(default_factory=lambda: np.zeros((len(KNOTS_S), 9, 2)))
     usual: np.ndarray = field(default_factory=lambda: np.zeros((len(KNOTS_S), 9)))
 
     def learn(self, runs: np.ndarray, y: np.ndarray, m: np.ndarray, dt: float, weight: float = 1.0) -> None:
-        """Take runs and what was flown; no lesson weighs more than another, one of quiet flight less.
+        """Update with free runs and the recorded flight; quiet flight has less weight, other updates equal weight.
 
         Args:
-            runs: free runs from fresh starts, (k, n, 9)
-            y: what was flown meanwhile, from each start on, nan where it is not known, (k, n, 9)
-            m: mean of the stretch before, (9,)
+            runs: free runs from measured starts, (k, n, 9)
+            y: measured states from each start on, nan where not measured, (k, n, 9)
+            m: mean of the preceding segment, (9,)
             dt: sample time [s]
-            weight: of this lesson [-]
+            weight: weight of this update [-]
         """
         self.H *= _KEEP
         self.g *= _KEEP
@@ -56,15 +56,15 @@ class Earned:
             self.g[knot] += weight * np.einsum("aknj,knj->ja", z, flown) / power[:, None]
 
     def copy(self) -> "Earned":
-        """Return one that may learn apart."""
+        """Return an independent copy."""
         return Earned(self.H.copy(), self.g.copy(), self.usual.copy())
 
     def shares(self) -> np.ndarray:
-        """Return kappa and hold at each knot, (knots, 9, 2), each within 0..1, as is their sum."""
+        """Return kappa and hold at each knot, (knots, 9, 2); each and their sum are within 0..1."""
         ridge = _WEIGHT * np.eye(2)
         out = np.empty(self.g.shape)
         out[0] = 1.0, 0.0
-        for knot in range(1, len(KNOTS_S)):  # without lessons of its own a look-ahead is worth what the one before is
+        for knot in range(1, len(KNOTS_S)):  # default: weights of the previous knot
             k = np.linalg.solve(self.H[knot] + ridge, (self.g[knot] + out[knot - 1] @ ridge)[..., None])[..., 0]
             k = np.clip(k, 0.0, 1.0)
             out[knot] = k / np.maximum(k.sum(axis=-1, keepdims=True), 1.0)
@@ -76,12 +76,12 @@ class Earned:
         return {name: float(np.interp(ahead_s, KNOTS_S, kappa[:, j])) for j, name in enumerate(STATES)}
 
     def forecast(self, run: np.ndarray, y0: np.ndarray, m: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-        """Temper free runs.
+        """Shrink free runs.
 
         Args:
             run: states at the look-aheads, (..., n, 9)
-            y0: states they start from, (..., 9)
-            m: mean of the stretch before, (9,)
+            y0: start states, (..., 9)
+            m: mean of the preceding segment, (9,)
             ahead: look-aheads, (n,) [s]
         """
         k = self.shares()
@@ -94,13 +94,13 @@ class Earned:
 def runs_and_flown(
     eye: Observer, y: np.ndarray, delta: np.ndarray, begins: np.ndarray, seconds: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return free runs from rows of a flight, and what was flown meanwhile, nan where it is not known, (k, n, 9) each.
+    """Return free runs and the measured states over the same rows, nan where not measured, (k, n, 9) each.
 
     Args:
-        eye: filter of the model
-        y: measured states, u v w over the ground, nan where nobody measured, (n, 9)
-        delta: inputs as they act, (n, 4)
-        begins: rows the runs begin at, (k,)
+        gust_filter: filter of the model
+        y: measured states, u v w over the ground, nan where not measured, (n, 9)
+        delta: actuator states, (n, 4)
+        start_rows: first row of each run, (k,)
         seconds: length of a run [s]
     """
     length = min(round(seconds / eye.dt) + 1, len(y))
@@ -112,7 +112,7 @@ def runs_and_flown(
 
 
 def _mean(m: np.ndarray, y0: np.ndarray) -> np.ndarray:
-    """Return the mean each start falls back to, (..., 9): its own heading, for no heading is usual."""
+    """Return the mean for each start, (..., 9); psi is the start heading, because headings have no mean."""
     out = np.broadcast_to(m, y0.shape).copy()
     out[..., _PSI] = y0[..., _PSI]
     return out

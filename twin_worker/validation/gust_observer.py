@@ -1,7 +1,7 @@
-"""What a free run starts from: the state behind the noise, and the gust that is blowing.
+"""Alpha-beta filter of state and gust, which provides the start of a free run.
 
-Gusts are accelerations d beyond the model's in u v w p q r that fade: they explain the next step and leave a forecast,
-so that the derivatives need not know them.
+Gusts are decaying accelerations d in u v w p q r in addition to the model. They explain the next step and decay
+within a forecast, so that the derivatives do not include them.
 
     x' = f(x, delta) + d,   d' = -d / TAU,   e = y - x_hat,   x_hat += alpha e,   d_hat += beta e / dt
 
@@ -17,44 +17,44 @@ from fleet.physics.kernel import kernel
 from fleet.physics.wrench import OFFSETS
 from twin_worker.identification.fixed_wing.derivatives_model import Coupled
 
-TAU = np.array([0.3, 0.3, 0.3, 0.1, 0.1, 0.1])  # gusts in u v w p q r fade in [s]
+TAU = np.array([0.3, 0.3, 0.3, 0.1, 0.1, 0.1])  # decay time of gusts in u v w p q r [s]
 _ALPHA = np.array([0.8, 0.8, 0.8, 1.0, 1.0, 1.0, 0.9, 0.9, 0.9])  # u v w over the ground, p q r, angles
 _BETA = np.array([0.08, 0.08, 0.08, 0.25, 0.25, 0.25, 0.0, 0.0, 0.0])
-_DRIVEN = (0, 2, 4, 1, 3, 5)  # state each offset drives, in the order of `OFFSETS`
-_OFFSET = np.array([OFFSETS[_DRIVEN.index(k)] for k in range(6)])  # and the other way round
+_DRIVEN = (0, 2, 4, 1, 3, 5)  # state that each offset drives, in the order of `OFFSETS`
+_OFFSET = np.array([OFFSETS[_DRIVEN.index(k)] for k in range(6)])  # the inverse map
 
 
 @dataclass(frozen=True)
 class Observer:
-    """A filter for one model, at a sample time dt [s]."""
+    """Filter for one model at a sample time dt [s]."""
 
     model: Coupled
     dt: float
 
     @property
     def left(self) -> np.ndarray:
-        """Return how much of each gust is left after one sample, (6,) [-]."""
+        """Return the decay factor of each gust over one sample, (6,) [-]."""
         return np.exp(-self.dt / TAU)
 
     def track(self, y: np.ndarray, delta: np.ndarray) -> np.ndarray:
-        """Filter a stretch: states and gusts at every row, from the rows up to it, (n, 15).
+        """Filter a segment: states and gusts at every row, from the rows up to it, (n, 15).
 
         Args:
             y: measured states, u v w over the ground, (n, 9)
-            delta: inputs as they act, (n, 4)
+            delta: actuator states, (n, 4)
         """
         out = np.empty((len(y), N_X + 6))
         _track(y, delta, self.model.par, self.model.at, self.dt, self.left, out, np.empty_like(y))
         return out
 
     def foretell(self, y: np.ndarray, delta: np.ndarray) -> np.ndarray:
-        """Predict every row from the rows before it, (n, 9); the first is itself. Arguments as for `track`."""
+        """Predict every row from the rows before it, (n, 9); the first is measured. Arguments as for `filter`."""
         foretold = np.empty_like(y)
         _track(y, delta, self.model.par, self.model.at, self.dt, self.left, np.empty((len(y), N_X + 6)), foretold)
         return foretold
 
     def fly(self, tracked: np.ndarray, begins: np.ndarray, length: int, delta: np.ndarray) -> np.ndarray:
-        """Run free from tracked rows, (m, 15), at `begins`, (m,), with fading gusts; return them, (m, length, 9)."""
+        """Simulate from filtered rows, (m, 15), at `start_rows`, (m,), with decaying gusts; return (m, length, 9)."""
         out = np.empty((len(begins), length, N_X))
         _fly(tracked, begins, delta, self.model.par, self.model.at, self.dt, self.left, out)
         return out
@@ -101,7 +101,7 @@ def _blow(
     blown: np.ndarray,
     work: np.ndarray,
 ) -> None:
-    """Advance x by dt in the gust d, and let that fade."""
+    """Advance x by dt under the gust d and decay the gust."""
     for i in range(6):
         blown[_OFFSET[i]] = par[_OFFSET[i]] + d[i]
         d[i] *= left[i]

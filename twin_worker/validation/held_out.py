@@ -1,4 +1,4 @@
-"""Data a model has not seen, and its free runs over them."""
+"""Free runs of a model over held-out data."""
 
 import numpy as np
 
@@ -15,10 +15,10 @@ _TO_END = np.linalg.pinv(np.column_stack([np.ones(LINE), np.arange(1 - LINE, 1)]
 
 
 class Unseen:
-    """One model over one window, of which it has seen the rows before `start`: they settle lags and start states.
+    """One model over one window; rows from `start` on are held out, rows before initialise lags and start states.
 
     Attributes:
-        y: states as this kind of model has them, u v w over the ground or through the air, from `start` on, (n, 9)
+        y: states of this kind of model, u v w over the ground or through the air, from `start` on, (n, 9)
         ok: rows that were measured, (n,) bool
         dt: sample time [s]
     """
@@ -31,7 +31,7 @@ class Unseen:
         self.y, self.ok, self.dt = self._y[start:], window.ok[start:], window.dt
 
     def runs(self, length: int) -> np.ndarray:
-        """Run free from a fresh start every `length` rows; nan where a run would cross unmeasured rows, (n, 9)."""
+        """Simulate from a measured start every `length` rows, (n, 9); nan where a run would cross unmeasured rows."""
         n = len(self._window)
         begins = np.arange(self._start, n, length)
         whole = self._broken[np.minimum(begins + length, n)] == self._broken[begins]
@@ -42,9 +42,9 @@ class Unseen:
         return self._linear_runs(begins, length)
 
     def one_step(self) -> np.ndarray:
-        """Predict each row from those before it, (n, 9); nan at and after unmeasured rows, and at fresh starts."""
+        """Predict each row from those before it, (n, 9); nan at and after unmeasured rows, and at starts."""
         if isinstance(self._plant, Coupled):
-            y = np.where(self._window.ok[:, None], self._y, np.nan)  # where the filter begins anew
+            y = np.where(self._window.ok[:, None], self._y, np.nan)  # the filter restarts at nan
             out = Observer(self._plant, self.dt).foretell(y, self._delta)[self._start :]
         else:
             out = self.runs(2)
@@ -52,10 +52,10 @@ class Unseen:
         return np.where(self.ok[:, None], out, np.nan)
 
     def lesson(self, seconds: float, every: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Return a coupled model's free runs, what was flown meanwhile, and the mean before; None for two linear axes.
+        """Return free runs, measured states and the preceding mean of a derivatives model; None for linear axes.
 
         Args:
-            seconds, every: length of a run, and time between their starts [s]
+            seconds, interval: length of a run, and time between starts [s]
         """
         if not isinstance(self._plant, Coupled):
             return None
@@ -66,7 +66,7 @@ class Unseen:
         return runs, flown, before.mean(axis=0)
 
     def _fresh(self, begins: np.ndarray) -> np.ndarray:
-        """Read the states at rows off a line through the rows up to each; off that row alone where they are broken."""
+        """Return the start states at rows from a line fit through the rows up to each; the row itself at gaps."""
         rows = begins[:, None] + np.arange(1 - LINE, 1)
         smooth = np.einsum("l,mlk->mk", _TO_END, self._y[np.maximum(rows, 0)])
         straight = (rows[:, 0] >= 0) & self._window.ok[np.maximum(rows, 0)].all(axis=1)

@@ -1,4 +1,4 @@
-"""Does a model deserve belief? Free runs over data it has not seen, against a threshold, holding still and the last.
+"""Verify a model: free runs on held-out data against a threshold, persistence and the active model.
 
 fit = 100 (1 - ||y - y_hat|| / ||y - mean(y)||).  Source: Huang 2021, eq. 22.
 """
@@ -13,24 +13,24 @@ from twin_worker.identification.fixed_wing.plant import Plant, finite
 from twin_worker.validation.held_out import Unseen
 from twin_worker.validation.whiteness import whiteness
 
-HORIZONS_S = (40.0, 16.0, 8.0, 4.0)  # longest first: a model is verified at the longest its data allow
-TOLD_S = (40.0, 16.0, 4.0, 1.0)  # told, too; 1 s is no ground for belief: inputs hold the noise of what they answered
-OMEGA = 0.0  # least mean fit over the nine states [%]; the paper: "greater than 0 is acceptable"
+HORIZONS_S = (40.0, 16.0, 8.0, 4.0)  # longest first: the longest that the data allow
+TOLD_S = (40.0, 16.0, 4.0, 1.0)  # reported only; 1 s does not verify: feedback correlates inputs and noise
+OMEGA = 0.0  # minimum mean fit over the nine states [%]; paper: "greater than 0 is acceptable"
 AXES = {"lon": ("u", "w", "q", "theta"), "lat": ("phi", "psi", "p", "r", "v")}
-_LOST = -99.0  # mean fit that only a diverging run has [%]
-_QUIET = {"phi": 0.04, "theta": 0.04, "q": 0.05}  # if all move less it is steady flight [rad, rad, rad/s]
-_NO_WORSE = 1.0  # points a new model may lie below the last: chance [%]
+_LOST = -99.0  # mean fit of a diverging run [%]
+_QUIET = {"phi": 0.04, "theta": 0.04, "q": 0.05}  # steady flight below all [rad, rad, rad/s]
+_NO_WORSE = 1.0  # allowed loss against the active model: chance [%]
 
 
 def hold(y: np.ndarray, ok: np.ndarray, length: int) -> np.ndarray:
-    """Predict by holding the value at each fresh start: the least any model must beat."""
+    """Predict the value of each start: the baseline of every model."""
     starts = (np.arange(len(y)) // length) * length
     return np.where(ok[:, None] & ok[starts][:, None], y[starts], np.nan)
 
 
 @nb.njit(cache=True, nogil=True)
 def fit_percent(y: np.ndarray, y_hat: np.ndarray) -> np.ndarray:
-    """Return the fit of each column over the rows both have, (n,) [%]; -100 where nothing is left or it diverged."""
+    """Return the fit of each column over the common rows, (n,) [%]; -100 without rows or after divergence."""
     rows, columns = y.shape
     good = np.ones(rows, np.bool_)
     for i in range(rows):
@@ -53,19 +53,19 @@ def fit_percent(y: np.ndarray, y_hat: np.ndarray) -> np.ndarray:
 
 
 def fits_at(unseen: Unseen, horizon_s: float) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the fit of the model's free runs, and of holding the last value, per state [%]; an odd end is left out."""
+    """Return the fit of free runs and of persistence per state [%]; an incomplete last run is excluded."""
     y, ok, length = _whole(unseen, horizon_s)
     return fit_at(unseen, horizon_s), _named(fit_percent(y, hold(y, ok, length)))
 
 
 def fit_at(unseen: Unseen, horizon_s: float) -> dict[str, float]:
-    """Return the first of both alone."""
+    """Return the fit of free runs per state [%]; an incomplete last run is excluded."""
     y, ok, length = _whole(unseen, horizon_s)
     return _named(fit_percent(y, np.where(ok[:, None], unseen.runs(length)[: len(y)], np.nan)))
 
 
 def _whole(unseen: Unseen, horizon_s: float) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return states and mask without the odd end, and the length of a run in rows."""
+    """Return states and mask of complete runs, and the length of a run in rows."""
     length = max(int(horizon_s / unseen.dt), 2)
     n = max(len(unseen.y) // length, 1) * length
     return unseen.y[:n], unseen.ok[:n], length
@@ -86,18 +86,18 @@ def by_axis(fit: dict[str, float], horizon_s: float) -> dict[str, float]:
 
 
 def verify(plant: Plant, window: Window, start: int, omega: float = OMEGA, last: Plant | None = None) -> Verdict:
-    """Judge a model on data it has not seen: above the threshold, better than holding still, no worse than the last.
+    """Verify a model on held-out data: above the threshold, better than persistence, no worse than the active model.
 
     Args:
         plant: the model
-        window: flight; rows from `start` on it has not seen
+        window: flight; rows from `start` on are held out
         start: first row to predict
-        omega: threshold on the mean fit [%]
-        last: the model in force
+        threshold: minimum mean fit [%]
+        active: the active model
     Returns:
-        a verdict whose sentence does not yet say whose it is
+        a verdict whose sentence does not yet name the model
     Raises:
-        ValueError: when the data are shorter than the shortest horizon; wait for more.
+        ValueError: if the data are shorter than the shortest horizon; wait for more data.
     """
     held = window.part(start, len(window))
     allowed = [h for h in HORIZONS_S if h <= held.seconds + held.dt]
@@ -112,14 +112,14 @@ def verify(plant: Plant, window: Window, start: int, omega: float = OMEGA, last:
     if last is not None:
         before = mean(fit_at(Unseen(last, window, start), horizon))
         if outcome is Outcome.VERIFIED and mean(fit) < before - _NO_WORSE:
-            outcome, said = Outcome.WORSE_THAN_LAST, f"the model in force has {before:.0f} % and stays"
+            outcome, said = Outcome.WORSE_THAN_LAST, f"the active model has {before:.0f} % and stays active"
         elif outcome in (Outcome.BELOW_THRESHOLD, Outcome.DIVERGED) and before <= omega:
-            outcome, said = Outcome.DRIFTING, f"and {before:.0f} % by the model in force: aircraft or air have changed"
+            outcome, said = Outcome.DRIFTING, f"active model {before:.0f} %: aircraft or air has changed"
     if not finite(plant):
         outcome, said = Outcome.DIVERGED, "the model is not finite; trying again"
     return Verdict(
         outcome=outcome,
-        sentence=f"mean fit {mean(fit):.0f} % over {horizon:.0f} s of unseen data, {said}",
+        sentence=f"mean fit {mean(fit):.0f} % over {horizon:.0f} s of held-out data, {said}",
         fit=fit,
         fit_hold=still,
         horizon_s=horizon,
@@ -128,7 +128,7 @@ def verify(plant: Plant, window: Window, start: int, omega: float = OMEGA, last:
 
 
 def told(verdict: Verdict, plant: Plant, window: Window, start: int) -> Verdict:
-    """Add what is told of a model beside its verdict: the fit at other horizons, and how white its residuals are."""
+    """Add diagnostics to a verdict: the fit at other horizons and the whiteness of residuals."""
     unseen = Unseen(plant, window, start)
     seconds = unseen.dt * (len(unseen.y) - 1)
     fits = {h: fit_at(unseen, h) for h in TOLD_S if h <= seconds + unseen.dt}
@@ -138,18 +138,18 @@ def told(verdict: Verdict, plant: Plant, window: Window, start: int) -> Verdict:
 
 
 def _missing(fit: dict[str, float], still: dict[str, float], omega: float) -> str:
-    """Say what the fit lacks: the threshold over all states, and on either axis more than holding still; or nothing."""
+    """Describe why the fit fails: below the threshold, or an axis no better than persistence; empty if it passes."""
     if mean(fit) <= omega:
         return f"more than {omega:.0f} % is needed"
     for states in AXES.values():
         model, held = mean(fit, states), mean(still, states)
         if model <= held:
-            return f"{states[0]} {states[1]} … {model:.0f} % is no better than holding still, {held:.0f} %"
+            return f"{states[0]} {states[1]} … {model:.0f} % is no better than persistence, {held:.0f} %"
     return ""
 
 
 def _steady(known: Window) -> str:
-    """Say how little moved where that was too little to identify by; nothing where no row was measured."""
+    """Describe the motion if it is too small to identify a model; empty otherwise or without measured rows."""
     rows = known.columns(tuple(_QUIET))[known.ok]
     if not len(rows) or ((moved := rows.std(axis=0)) >= list(_QUIET.values())).any():
         return ""
@@ -161,7 +161,7 @@ def _judge(fit: dict[str, float], missing: str, known: Window) -> tuple[Outcome,
     if mean(fit) <= _LOST:
         return Outcome.DIVERGED, "the free run diverges; trying again"
     if steady := _steady(known):
-        return Outcome.NOT_IDENTIFIABLE, f"not identifiable here: {steady} excites nothing; wait for a turn"
+        return Outcome.NOT_IDENTIFIABLE, f"not identifiable: {steady} does not excite the dynamics; wait for a turn"
     if not missing:
-        return Outcome.VERIFIED, "above the threshold and better than holding still"
+        return Outcome.VERIFIED, "above the threshold and better than persistence"
     return Outcome.BELOW_THRESHOLD, f"{missing}; trying another window"

@@ -1,4 +1,4 @@
-"""Is what a model leaves over noise? The autocorrelation of its one-step residuals.
+"""Whiteness test of the one-step residuals of a model by their autocorrelation.
 
 Source: Ljung 1999, section 16.6 (residual analysis).
 """
@@ -6,14 +6,14 @@ Source: Ljung 1999, section 16.6 (residual analysis).
 import numpy as np
 
 LAGS = 20  # samples
-_BOUND = 1.96  # of white noise, 95 %, over the root of its count
+_BOUND = 1.96  # 95 % bound of white noise, times the root of the count
 
 
 def whiteness(y: np.ndarray, y_hat: np.ndarray) -> np.ndarray:
-    """Return the share of autocorrelations of y - y_hat within white noise's 95 % band, per column, 0..1.
+    """Return the fraction of autocorrelations of y - y_hat within the 95 % band of white noise, per column, 0..1.
 
     Args:
-        y, y_hat: measured and predicted, (n, k); rows with nan, as every fresh start, are left out
+        y, y_hat: measured and predicted, (n, k); rows with nan, such as every start, are excluded
     """
     e = (y - y_hat)[np.isfinite(y_hat).all(axis=1)]
     e = e[np.abs(e).sum(axis=1) > 0]

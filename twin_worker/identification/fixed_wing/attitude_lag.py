@@ -1,4 +1,4 @@
-"""How an angle follows its command: a second-order lag, identified by the free run of the whole stretch.
+"""Second-order lag between an angle and its command, identified from the free run over the segment.
 
 y'' = wn^2 (c + b - y) - 2 zeta wn y'
 """
@@ -6,21 +6,21 @@ y'' = wn^2 (c + b - y) - 2 zeta wn y'
 import numba as nb
 import numpy as np
 
-STEP = 0.1  # of the rows [s]
+STEP = 0.1  # interval of the rows [s]
 _INNER = 4
 _USUAL = np.array([3.0, 0.9, 0.0])  # wn [rad/s], zeta [-], b [rad]
 _SPREAD = np.array([2.0, 0.4, 0.03])  # of the prior
 _LOW, _HIGH = np.array([0.5, 0.3, -0.2]), np.array([12.0, 2.5, 0.2])
-_NOISE = 0.02  # usual miss [rad]
-_TOGETHER = 10  # rows whose misses count as one: they are alike
-_FAR = 3.0  # a miss beyond so many times the usual counts less [-]
+_NOISE = 0.02  # standard deviation of the residual [rad]
+_TOGETHER = 10  # correlated rows that count as one
+_FAR = 3.0  # Huber limit, in standard deviations [-]
 _STEPS = 8
-_PACE = (1e-3, 1e-3, 1e-4)  # of the numerical slope
+_PACE = (1e-3, 1e-3, 1e-4)  # steps of the numerical derivatives
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
 def follow(command: np.ndarray, y: np.ndarray, lag: np.ndarray, out: np.ndarray) -> None:
-    """Run the lag over commands, (n,) [rad], into `out`, (n,); where the command is nan it begins anew from `y`."""
+    """Simulate the lag over commands, (n,) [rad], into `out`, (n,); after a nan command it restarts from `y`."""
     wn, zeta, bias = lag[0], lag[1], lag[2]
     h = STEP / _INNER
     at, rate, lost = y[0], 0.0, True
@@ -37,12 +37,12 @@ def follow(command: np.ndarray, y: np.ndarray, lag: np.ndarray, out: np.ndarray)
 
 
 def identify(command: np.ndarray, y: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
-    """Find wn, zeta, b that bring the free run nearest to what was flown, (3,).
+    """Estimate wn, zeta, b that minimise the free-run error, (3,).
 
     Args:
         command: (n,) [rad], nan where missing
-        y: the angle, (n,) [rad], nan where missing
-        near: where to begin, e.g. what was found a little earlier
+        y: measured angle, (n,) [rad], nan where missing
+        warm_start: start of the search, for example an earlier estimate
     """
     weight = 1.0 / _NOISE / np.sqrt(_TOGETHER)
     y, out = np.where(np.isfinite(y), y, 0.0), np.empty(len(y))
@@ -75,7 +75,7 @@ def identify(command: np.ndarray, y: np.ndarray, near: np.ndarray | None = None)
 
 
 def _cost(miss: np.ndarray, lag: np.ndarray, weight: float) -> float:
-    """Return Huber's cost of the misses and of the way from the prior."""
+    """Return the Huber cost of the residuals plus the cost of the deviation from the prior."""
     far = _FAR * weight * _NOISE
     size = np.abs(miss)
     huber = np.where(size < far, size**2, far * (2 * size - far)).sum()

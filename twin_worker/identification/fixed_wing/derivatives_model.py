@@ -1,7 +1,7 @@
-"""The coupled model of a fixed wing: derivatives and mean wind, identified from one window of flight.
+"""Derivatives model of a fixed wing: stability and control derivatives and mean wind, identified from one window.
 
-Exact kinematics and the mean wind in body axes couple both axes; linearising the same model loses most of its worth.
-What a verified model said of an earlier stretch holds the parameters of the next, partly forgotten.
+Exact kinematics and the mean wind in body axes couple both axes; the linearised model has a much lower fit.
+The information of the last verified model, partly discounted, is the prior of the next window.
 """
 
 from dataclasses import dataclass
@@ -16,24 +16,25 @@ from fleet.window import Window
 from twin_worker.identification.fixed_wing.derivatives_prior import prior
 from twin_worker.identification.fixed_wing.output_error import Found, Problem, search, segments_of
 
-DISCOUNT = 0.12  # information in a residual, one of every four samples: gusts colour them [-]
-COLD, WARM = 8, 1  # most steps of a first and of a repeated search
-_FORGET, _FORGET_OFFSETS, _FORGET_WIND = 0.7, 0.5, 0.7  # share of earlier information that is kept, per stretch [-]
+DISCOUNT = 0.12  # effective fraction of residuals, one in four samples: gusts correlate them [-]
+COLD, WARM = 8, 1  # maximum steps of a first and of a repeated search
+# retained fraction of earlier information per window [-]
+_FORGET, _FORGET_OFFSETS, _FORGET_WIND = 0.7, 0.5, 0.7
 
 
 @dataclass(frozen=True)
 class Coupled:
-    """One identified aircraft.
+    """Identified derivatives model of one aircraft.
 
     Attributes:
         par: parameters of `fleet.physics.wrench`, (37,)
-        at: U0, W0 they belong to, (2,) [m/s]
-        information: what the data said of them, (37, 37)
-        mean, precision: what was held before, (37,) and (37, 37)
+        trim_velocity: U0, W0 of the parameters, (2,) [m/s]
+        fisher_information: information from the data, (37, 37)
+        prior_mean, prior_precision: prior of this window, (37,) and (37, 37)
         weight: inverse residual variances, (9,)
-        airframe: mean and precision of what was known before any flight
-        t0, t1: the stretch it came from [s since 1970]
-        steps: of the search
+        airframe_prior: mean and precision from the airframe alone
+        t0, t1: identification window [s since 1970]
+        steps: search steps
     """
 
     par: np.ndarray
@@ -53,11 +54,11 @@ class Coupled:
         return np.linalg.inv(self.information + self.precision)
 
     def fly(self, x0: np.ndarray, delta: np.ndarray, dt: float) -> np.ndarray:
-        """Run free from x0 with inputs as they act, (n, 4); give the states, (n, 9), nan once it left its envelope."""
+        """Simulate from x0 with actuator states, (n, 4); return states, (n, 9), nan after leaving the envelope."""
         return self.fly_each(x0[None], np.zeros(1, np.int64), len(delta), delta, dt)
 
     def fly_each(self, starts: np.ndarray, begins: np.ndarray, length: int, delta: np.ndarray, dt: float) -> np.ndarray:
-        """Run free from several rows, `length` rows each; arguments as for `fleet.physics.dynamics.free_runs`."""
+        """Simulate from several rows, `length` rows each; arguments as for `fleet.physics.dynamics.free_runs`."""
         out = np.empty((len(delta), 9))
         free_runs(starts, begins, length, delta, self.par, self.at, dt, out)
         return out
@@ -66,16 +67,16 @@ class Coupled:
 def identify(
     window: Window, wind: np.ndarray, airframe: Airframe, last: Coupled | None = None, near: Coupled | None = None
 ) -> Coupled:
-    """Identify an aircraft from one window.
+    """Identify a derivatives model from one window.
 
     Args:
-        window: the stretch
+        window: identification data
         wind: mean wind, NED, the direction it blows to, (2,) or (3,) [m/s]
-        airframe: what is known of the aircraft before it has flown, or a class
-        last: the last verified model; it holds the parameters by what it knows from before this window
-        near: a model of nearly this stretch, where the search starts; it holds nothing
+        airframe: prior of the aircraft or of its class
+        prior_model: the last verified model; its information from before this window is the prior
+        warm_start: model of a similar window that starts the search; not a prior
     Raises:
-        ValueError: when too little of the window is whole, or nothing descends; wait for more.
+        ValueError: if the window has too few gap-free rows, or the search fails; wait for more data.
     """
     segments = segments_of(window.ok, window.dt)
     if not len(segments):
@@ -89,7 +90,7 @@ def identify(
         found = search(problem, mean, (mean, precision), COLD, None)
     if near is not None and not _good(found):
         found = search(problem, mean, (mean, precision), COLD, None)
-    if last is not None and not _good(found):  # what an earlier flight said misleads: begin anew
+    if last is not None and not _good(found):  # the earlier model misleads: restart without it
         return identify(window, wind, airframe)
     if not _good(found):
         raise ValueError("identify: found no free run that stays in its envelope, needs one; wait for calmer flight")
@@ -106,9 +107,9 @@ def _good(found: Found) -> bool:
 def _held(
     window: Window, wind: np.ndarray, airframe: Airframe, last: Coupled | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return mean and precision the parameters are held by, U0 W0, and what the airframe alone says.
+    """Return prior mean and precision of the parameters, U0 W0, and the prior from the airframe alone.
 
-    Of what the last model's data said, the share from before this window counts, and fades: none is counted twice.
+    Only the information of the last model from before this window counts, discounted, so that no data count twice.
     """
     if last is None:
         ok = window.ok

@@ -1,6 +1,6 @@
-"""What is held of an aircraft's derivatives before it has flown: its airframe's, or a class's, and how firmly.
+"""Prior of an aircraft's derivatives before its first flight, from its airframe or its class.
 
-Classes are scaled so that lift carries weight at the speed flown: with k = V / U0 and l = b / span of the aircraft,
+Classes are scaled so that lift equals weight at the flown speed: with k = V / U0 and l = b / span of the aircraft,
 forces per velocity grow with k, moments per deflection with l, per rate with k, per velocity with k l.
 """
 
@@ -12,7 +12,7 @@ from fleet.airframes import Airframe, derivatives
 from fleet.frames import G
 from fleet.physics.wrench import NAMES, OFFSETS
 
-_DOUBT = {  # beyond a share of the derivative itself, times the airframe's own `doubt`
+_DOUBT = {  # added to the derivative's magnitude; the sum is scaled by `doubt` of the airframe
     "X": {"0": 2.0, "u": 0.2, "w": 0.3, "de": 1.2, "dt": 1.0, "ww": 0.05},
     "Z": {"0": 3.0, "u": 0.3, "w": 0.3, "q": 0.3, "de": 1.0},
     "M": {"0": 3.0, "u": 0.05, "w": 0.01, "q": 0.1, "de": 0.1, "dt": 1.0},
@@ -22,16 +22,16 @@ _DOUBT = {  # beyond a share of the derivative itself, times the airframe's own 
 }
 _FLOOR = {f"{row}_{per}": doubt for row, doubts in _DOUBT.items() for per, doubt in doubts.items()}
 _ACROSS = {"L_r": ("L_p", 0.3), "N_p": ("L_p", 0.3), "L_dr": ("L_da", 0.1), "N_da": ("L_da", 0.1)}
-_WIND = 2.0  # doubt of a wind that telemetry was asked for [m/s]
-_SPANS = 0.3, 20.0  # believable [m]
+_WIND = 2.0  # standard deviation of the wind estimate [m/s]
+_SPANS = 0.3, 20.0  # valid range [m]
 
 
 def prior(airframe: Airframe, at: np.ndarray, trim: np.ndarray, wind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and standard deviation of the parameters of `fleet.physics.wrench`, each (37,).
 
     Args:
-        airframe: what is known of the aircraft, or a class; one without a span is scaled as its speed suggests
-        at: U0, W0, mean air-relative velocity forward and down, (2,) [m/s]
+        airframe: the aircraft or its class; without a span it is scaled by its speed
+        trim_velocity: U0, W0, mean air-relative velocity forward and down, (2,) [m/s]
         trim: mean inputs delta_a delta_e delta_r delta_t, (4,)
         wind: mean wind, NED, the direction it blows to, (2,) or (3,) [m/s]
     """
@@ -58,7 +58,7 @@ def prior(airframe: Airframe, at: np.ndarray, trim: np.ndarray, wind: np.ndarray
 
 
 def _scale(name: str, k: float, l: float) -> float:
-    """Return the factor from the class's speed and span to the aircraft's."""
+    """Return the scale factor from speed and span of the class to those of the aircraft."""
     force, per = name[0] in "XYZ", name[2:]
     if per in ("q", "p", "r"):
         return k * k / l if force else k

@@ -1,4 +1,4 @@
-"""What the airframe does with bank, pitch and throttle in the large: three ridge regressions on smoothed flight.
+"""Turn rate, angle of attack and excess power: three regressions with priors on smoothed flight data.
 
 psi_dot = k g tan phi / V + b               theta - gamma = a_0 + a_n (n (V_0 / V)^2 - 1)
 V_dot + g h_dot / V = c_0 + c_t (delta_t - t_0) + c_v (V - V_0) + c_n (n^2 - 1)
@@ -11,18 +11,19 @@ import numpy as np
 from fleet.frames import G
 from twin_worker.identification.fixed_wing.attitude_lag import STEP
 
-_OVER = 20  # rows each mean is over
-_TURN = np.array([1.0, 0.0]), np.array([0.1, 0.02]), 0.03  # usual k [-] and b [rad/s], spread, noise
-_LIFT = np.array([0.0, 0.06]), np.array([1e3, 0.1]), 0.02  # usual a_0, a_n [rad]
-_POWER = np.array([0.0, np.nan, -0.10, -0.15]), np.array([30.0, 1.0, 0.03, 0.15]), 0.35  # usual c, SI
-_GLIDE, _STEEPER = 9.0, 1.3  # usual lift over drag; slope of thrust over throttle, beyond proportional [-]
-_BANK = 1.3  # beyond, load factors are noise [rad]
+_OVER = 20  # rows of each mean
+# mean of k [-] and b [rad/s], standard deviation, noise
+_TURN = np.array([1.0, 0.0]), np.array([0.1, 0.02]), 0.03
+_LIFT = np.array([0.0, 0.06]), np.array([1e3, 0.1]), 0.02  # the same of a_0, a_n [rad]
+_POWER = np.array([0.0, np.nan, -0.10, -0.15]), np.array([30.0, 1.0, 0.03, 0.15]), 0.35  # the same of c, SI
+_GLIDE, _STEEPER = 9.0, 1.3  # lift-to-drag ratio; slope of thrust over throttle relative to proportional [-]
+_BANK = 1.3  # bank limit: larger load factors are noise [rad]
 
 
 @dataclass(frozen=True)
 class Flight:
-    """One stretch in rows of `STEP`, all (n,): true airspeed, height, climb, angles, throttle;
-    then what was asked for: climb and airspeed by the route, angles by the autopilot [m/s, m, rad, 0..1].
+    """Data in rows of `STEP`, all (n,): true airspeed, height, climb rate, angles, throttle;
+    then commands: climb rate and airspeed of the route, angles of the autopilot [m/s, m, rad, 0..1].
     """
 
     V: np.ndarray
@@ -43,7 +44,7 @@ class Flight:
 
 @dataclass(frozen=True)
 class Ridge:
-    """A regression held by what is usual: value (k,), covariance (k, k), standard deviation of what is left."""
+    """Result of a regression with a prior: value (k,), covariance (k, k), residual standard deviation."""
 
     value: np.ndarray
     cov: np.ndarray
@@ -51,7 +52,7 @@ class Ridge:
 
 
 def ridge(X: np.ndarray, y: np.ndarray, prior: tuple[np.ndarray, np.ndarray, float]) -> Ridge:
-    """Regress y (n,) on X (n, k); rows overlap, so that `_OVER` of them count as one."""
+    """Regress y (n,) on X (n, k) with a Gaussian prior; rows overlap, so that `_WINDOW_ROWS` of them count as one."""
     usual, spread, noise = prior
     inverse = X.T @ X / _OVER / noise**2 + np.diag(spread**-2.0)
     cov = np.linalg.inv(inverse)
@@ -60,13 +61,13 @@ def ridge(X: np.ndarray, y: np.ndarray, prior: tuple[np.ndarray, np.ndarray, flo
 
 
 def mean(x: np.ndarray) -> np.ndarray:
-    """Return the moving mean over `_OVER` steps, (n - _OVER,)."""
+    """Return the moving mean over `_WINDOW_ROWS` steps, (n - _WINDOW_ROWS,)."""
     total = np.concatenate([[0.0], np.cumsum(x)])
     return ((total[_OVER:] - total[:-_OVER]) / _OVER)[: len(x) - _OVER]
 
 
 def slope(x: np.ndarray) -> np.ndarray:
-    """Return the slope over `_OVER` steps, (n - _OVER,) [1/s]."""
+    """Return the slope over `_WINDOW_ROWS` steps, (n - _WINDOW_ROWS,) [1/s]."""
     return (x[_OVER:] - x[:-_OVER]) / (_OVER * STEP)
 
 
@@ -76,20 +77,20 @@ def load(phi: np.ndarray) -> np.ndarray:
 
 
 def turning(flight: Flight) -> Ridge:
-    """Identify k and b of the turn."""
+    """Estimate k and b of the turn rate."""
     X = mean(G * np.tan(np.clip(flight.phi, -_BANK, _BANK)) / np.maximum(flight.V, 5.0))
     return ridge(np.column_stack([X, np.ones(len(X))]), slope(np.unwrap(flight.psi)), _TURN)
 
 
 def lifting(flight: Flight, V_0: float) -> Ridge:
-    """Identify a_0 and a_n of the angle of attack."""
+    """Estimate a_0 and a_n of the angle of attack."""
     alpha = flight.theta - np.arcsin(np.clip(flight.h_dot / np.maximum(flight.V, 5.0), -0.6, 0.6))
     X = mean(load(flight.phi) * (V_0 / np.maximum(flight.V, 5.0)) ** 2 - 1.0)
     return ridge(np.column_stack([np.ones(len(X)), X]), mean(alpha), _LIFT)
 
 
 def _budget(flight: Flight, t_0: float, V_0: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return what c_0 c_t c_v c_n are multiplied by, (n, 4), and the excess power that was had, (n,) [m/s2]."""
+    """Return the regressors of c_0 c_t c_v c_n, (n, 4), and the measured excess power, (n,) [m/s2]."""
     V = mean(flight.V)
     y = slope(0.5 * flight.V**2 + G * flight.h) / np.maximum(V, 5.0)
     n = mean(load(flight.phi) ** 2 - 1.0)
@@ -97,17 +98,17 @@ def _budget(flight: Flight, t_0: float, V_0: float) -> tuple[np.ndarray, np.ndar
 
 
 def missed(flight: Flight, c: np.ndarray, t_0: float, V_0: float) -> np.ndarray:
-    """Return the excess power that was had beyond what c, (4,), foretells, (n,) [m/s2]."""
+    """Return measured minus predicted excess power for c, (4,), (n,) [m/s2]."""
     X, y = _budget(flight, t_0, V_0)
     return y - X @ c  # type: ignore[no-any-return]
 
 
 def power(flight: Flight, t_0: float, V_0: float) -> Ridge:
-    """Identify c_0, c_t, c_v, c_n of the specific excess power, by instruments.
+    """Estimate c_0, c_t, c_v, c_n of the specific excess power with instrumental variables.
 
-    TECS answers every gust with throttle, so that plain regression finds gusts where it looks for power: it came out
-    with a third to two thirds of the true c_t. What the route asks for (height, speed, bank) knows of no gust: the
-    regressors are first projected on that.
+    TECS reacts to every gust with throttle, which biases least squares: it returns one to two thirds of the true c_t.
+    The route commands (height, speed, bank) do not depend on gusts and are the instruments: the regressors are first
+    projected on them.
 
     Source: Soderstrom & Stoica 1989, chapter 8 (instrumental variables in closed loop).
     """
@@ -115,7 +116,8 @@ def power(flight: Flight, t_0: float, V_0: float) -> Ridge:
     asked = np.column_stack([np.ones(len(y)), mean(flight.climb_c), mean(flight.V_c) - V_0, X[:, 3]])
     usual, spread, noise = _POWER
     usual = usual.copy()
-    usual[1] = _STEEPER * G / _GLIDE / max(t_0, 0.15)  # level flight takes t_0 against the drag, thrust grows faster
+    # t_0 balances drag in level flight; thrust grows faster
+    usual[1] = _STEEPER * G / _GLIDE / max(t_0, 0.15)
     if np.isfinite(asked).all():
         X = asked @ np.linalg.lstsq(asked, X, rcond=1e-6)[0]
         return ridge(X, y, (usual, spread, noise))

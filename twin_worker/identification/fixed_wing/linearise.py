@@ -1,4 +1,4 @@
-"""The coupled model as the paper's matrices: A B about the trim of a window, longitudinal and lateral, C = I, D = 0.
+"""Linearise the derivatives model about the trim of a window: A B, longitudinal and lateral, C = I, D = 0.
 
 Source: Huang 2021, eq. 2-4; Beard & McLain 2012, section 5.5.
 """
@@ -22,11 +22,11 @@ _H = 1e-4  # step of the input derivatives, in which the model is linear [-]
 
 
 def linearise(plant: Coupled, window: Window) -> tuple[Linear, Linear]:
-    """Export the paper's matrices, discrete at the window's sample time; u v w are through the air, on any heading.
+    """Return discrete matrices at the sample time of the window; u v w are through the air, on any heading.
 
     Args:
-        plant: the coupled model
-        window: flight whose mean speed, attitude and inputs are the trim point
+        plant: the derivatives model
+        window: flight data; mean speed, attitude and inputs are the trim point
     """
     ok, dt = window.ok, window.dt
     x, u = window.x[ok].mean(axis=0), window.u[ok].mean(axis=0)
@@ -49,7 +49,7 @@ def linearise(plant: Coupled, window: Window) -> tuple[Linear, Linear]:
 
 
 def _axis(slopes: np.ndarray, x: np.ndarray, u: np.ndarray, axis: tuple, dt: float) -> Linear:
-    """Cut one axis out of [F G x'] and make it discrete, exp([[A B c] [0 0 0]] dt); c moves into the trim."""
+    """Extract one axis from [F G x'] and discretise it, exp([[A B c] [0 0 0]] dt); c moves into the trim."""
     names, inputs = axis
     rows, columns = [STATES.index(name) for name in names], [INPUTS.index(name) for name in inputs]
     n, m = len(rows), len(columns)

@@ -1,9 +1,9 @@
-"""Second step, coupled: derivatives and mean wind of a whole aircraft from the error of free runs.
+"""Output-error estimation of derivatives and mean wind from free runs of both axes.
 
-    J = discount sum e' W e + (par - par0)' Lambda (par - par0) + sum_s (x_s - x_bar_s)' K (x_s - x_bar_s)
+    J = f sum e' W e + (par - par0)' Lambda (par - par0) + sum_s (x_s - x_bar_s)' K (x_s - x_bar_s)
 
-over segments of free run, whose start states x_s are unknown, too, and are eliminated from every step by their Schur
-complement. Gauss-Newton steps, damped; W from the residuals themselves.
+over free-run segments; f is the effective fraction of residuals. The start states x_s are also unknown; every step
+eliminates them by their Schur complement. Damped Gauss-Newton steps; W is estimated from the residuals.
 
 Source: Jategaonkar 2015, chapter 4 (output error, multiple shots); Ljung 1999, section 10.2 (damping).
 """
@@ -16,25 +16,25 @@ import numpy as np
 from fleet.physics.wrench import N_PAR
 from twin_worker.identification.fixed_wing.output_error_kernel import GROUP, N_COLUMN, sweep
 
-SIGMA = np.array([0.08, 0.08, 0.08, 0.005, 0.005, 0.005, 0.004, 0.004, 0.008])  # least residual of each state
+SIGMA = np.array([0.08, 0.08, 0.08, 0.005, 0.005, 0.005, 0.004, 0.004, 0.008])  # minimum residual of each state
 SEGMENT_S = 10.0  # free run [s]
-LEAST_S = 2.0  # shorter pieces between gaps are left out [s]
-LINE = 6  # samples of the line a segment's start state is read off [-]
-_DONE = 1e-3  # relative descent that ends the search [-]
-_TRIES = 6  # dampings tried for one step
+LEAST_S = 2.0  # shorter segments between gaps are ignored [s]
+LINE = 6  # samples of the line fit of a segment's start state [-]
+_DONE = 1e-3  # relative descent that stops the search [-]
+_TRIES = 6  # maximum damping values per step
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What a search starts from.
+    """Data of one estimation.
 
     Attributes:
         y: states, u v w over the ground, (n, 9)
-        delta: inputs as they act, (n, 4)
+        delta: actuator states, (n, 4)
         segments: first and last row of each, (m, 2)
-        at: U0, W0, (2,) [m/s]
+        trim_velocity: U0, W0, (2,) [m/s]
         dt: sample time [s]
-        discount: information in a residual; gusts colour them [-]
+        effective_fraction: effective fraction of residuals, which gusts correlate [-]
     """
 
     y: np.ndarray
@@ -47,14 +47,14 @@ class Problem:
 
 @dataclass(frozen=True)
 class Found:
-    """Where a search ended.
+    """Result of an estimation.
 
     Attributes:
         par: parameters, (37,)
-        information: what the data said of them, start states eliminated, (37, 37)
+        fisher_information: information from the data, start states eliminated, (37, 37)
         weight: inverse residual variances, (9,)
         steps: Gauss-Newton steps that descended
-        cost: of the end point, nan where even the start left its envelope or its slopes did
+        cost: final cost; nan if the start or its sensitivities left the envelope
     """
 
     par: np.ndarray
@@ -65,7 +65,7 @@ class Found:
 
 
 def segments_of(ok: np.ndarray, dt: float) -> np.ndarray:
-    """Cut unbroken rows into free runs of a whole number of groups, (m, 2)."""
+    """Split gap-free rows into free runs of an integer number of groups, (m, 2)."""
     longest, least = (int(seconds / dt) // GROUP * GROUP for seconds in (SEGMENT_S, LEAST_S))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ok, [False]]).astype(int)))
     pieces = []
@@ -78,7 +78,7 @@ def segments_of(ok: np.ndarray, dt: float) -> np.ndarray:
 
 
 def line_start(y: np.ndarray) -> np.ndarray:
-    """Read the first state off a straight line through the first samples, (9,)."""
+    """Return the first state from a line fit through the first samples, (9,)."""
     n = min(LINE, len(y))
     return _line(n) @ y[:n]
 
@@ -89,7 +89,7 @@ def _line(n: int) -> np.ndarray:
 
 
 class _Search:
-    """The cost about one point, and the step down from it."""
+    """Cost, residuals and normal equations at one point."""
 
     def __init__(self, problem: Problem, par0: np.ndarray, Lambda: np.ndarray) -> None:
         self.problem, self.par0, self.Lambda = problem, par0, Lambda
@@ -102,7 +102,7 @@ class _Search:
         self.trial, self.nothing = np.empty_like(self.e), np.empty((0, 9, N_COLUMN))
 
     def fly(self, par: np.ndarray, starts: np.ndarray, W: np.ndarray, slopes: bool) -> float:
-        """Return the cost at a point; with `slopes` the residuals and sensitivities are kept."""
+        """Return the cost at a point; with `slopes` store residuals and sensitivities."""
         one = self.problem
         e, J = (self.e, self.J) if slopes else (self.trial, self.nothing)
         squares = sweep(par, starts, one.segments, one.y, one.delta, one.at, one.dt, np.sqrt(W), e, J)
@@ -110,7 +110,7 @@ class _Search:
         return one.discount * squares + float(off @ self.Lambda @ off + (self.K * away**2).sum())
 
     def weights(self, W: np.ndarray) -> np.ndarray:
-        """Take W from the residuals; they and their slopes are scaled along."""
+        """Estimate W from the residuals; rescale residuals and sensitivities."""
         fresh = 1.0 / np.maximum((self.e**2).mean(axis=0) / W, SIGMA**2)
         ratio = np.sqrt(fresh / W)
         self.e *= ratio
@@ -118,16 +118,16 @@ class _Search:
         return fresh
 
     def cost(self, par: np.ndarray, starts: np.ndarray) -> float:
-        """Return the cost of the residuals that are kept."""
+        """Return the cost of the stored residuals."""
         off, away = par - self.par0, starts - self.prior
         return self.problem.discount * float((self.e**2).sum()) + float(
             off @ self.Lambda @ off + (self.K * away**2).sum()
         )
 
     def normal(self, par: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return information and slope of the parameters, start states eliminated, and what gives those back.
+        """Return information and gradient of the parameters, start states eliminated, and the back-substitution.
 
-        That is of each segment the move of its start, less what a move of the parameters takes, (m, 9, 37 + 1).
+        The back-substitution is the step of each start state and its derivative by the parameter step, (m, 9, 37 + 1).
         """
         d = self.problem.discount
         m = len(starts)
@@ -148,17 +148,17 @@ class _Search:
 def search(
     problem: Problem, par: np.ndarray, prior: tuple[np.ndarray, np.ndarray], steps: int, weight: np.ndarray | None
 ) -> Found:
-    """Descend from `par` by at most so many damped Gauss-Newton steps.
+    """Minimise the cost from `par` by at most `steps` damped Gauss-Newton steps.
 
     Args:
         problem: the data
-        par: where to start, (37,)
-        prior: where the parameters are held without data, (37,), and how firmly, inverse covariance (37, 37)
-        steps: most steps that descend
-        weight: W of an earlier search of like data; None: from the data, refreshed twice
+        par: start, (37,)
+        prior: prior mean, (37,), and inverse covariance, (37, 37)
+        steps: maximum steps that descend
+        weight: W of an earlier search on similar data; None: from the data, updated twice
     """
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # slopes may explode where the free run does not yet
+        with np.errstate(over="ignore", invalid="ignore"):  # sensitivities may overflow before the free run does
             return _descend(_Search(problem, *prior), par, steps, weight)
     except np.linalg.LinAlgError:
         return Found(par, np.zeros((N_PAR, N_PAR)), SIGMA**-2, 0, float("nan"))

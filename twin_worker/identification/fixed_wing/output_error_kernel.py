@@ -1,11 +1,11 @@
-"""One pass over a window: residuals of free runs and their sensitivities, segment by segment.
+"""Residuals of free runs and their sensitivities over one window, segment by segment.
 
-    S' = F S + d x' / d par,  S = d x / d(par, x0):  over a group of samples F is held,
-    S <- Phi S + Gamma d x' / d par,  Phi = exp(F h),  Gamma = integral of it
+    S' = F S + d x' / d par,  S = d x / d(par, x0):  F is constant over a group of samples,
+    S <- Phi S + Gamma d x' / d par,  Phi = exp(F h),  Gamma = integral of Phi
 
-Residuals are taken once a group: gusts colour them, so that neighbours say the same.
+There is one residual per group, because gusts correlate neighbouring residuals.
 
-Source: Jategaonkar 2015, section 4.6 (output error, sensitivity equations); exact for F held.
+Source: Jategaonkar 2015, section 4.6 (output error, sensitivity equations); exact for constant F.
 """
 
 import numpy as np
@@ -14,14 +14,14 @@ from fleet.physics.dynamics import N_X, jacobian, lost, step
 from fleet.physics.kernel import bare, kernel
 from fleet.physics.wrench import N_AERO, N_PAR, ROW, WIND
 
-GROUP = 4  # samples a residual; 2 ** DOUBLINGS
+GROUP = 4  # samples per residual; 2 ** _DOUBLINGS
 _DOUBLINGS = 2
 N_COLUMN = N_PAR + N_X
 
 
 @bare
 def _times(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
-    """Fill in a b, (9, n), of a (9, 9) and b (9, n); a row of `a` by name is kept in registers, indexed it is not."""
+    """Compute a b, (9, n), of a (9, 9) and b (9, n); named elements of a row stay in registers, indexed ones do not."""
     for i in range(N_X):
         a0, a1, a2, a3, a4, a5, a6, a7, a8 = a[i]
         for j in range(b.shape[1]):
@@ -31,9 +31,9 @@ def _times(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
 
 @kernel
 def _transition(F: np.ndarray, dt: float, Phi: np.ndarray, Gamma: np.ndarray, work: np.ndarray) -> None:
-    """Fill in Phi = exp(F GROUP dt) and its integral: over one sample as Runge-Kutta of order four has them, doubled.
+    """Compute Phi = exp(F GROUP dt) and its integral: fourth-order Runge-Kutta over one sample, then doubling.
 
-    Phi = I + F Gamma to the last digit, or what stands still would creep: S = -F^-1 G must stay.
+    Phi = I + F Gamma must be exact, otherwise the equilibrium S = -F^-1 G would drift.
     """
     square, cube, keep = work[0], work[1], work[2]
     _times(F, F, square)
@@ -55,7 +55,7 @@ def _transition(F: np.ndarray, dt: float, Phi: np.ndarray, Gamma: np.ndarray, wo
 def _carry(
     S: np.ndarray, Phi: np.ndarray, Gamma: np.ndarray, term: np.ndarray, by_wind: np.ndarray, out: np.ndarray
 ) -> None:
-    """Fill in the sensitivities a group later."""
+    """Compute the sensitivities one group later."""
     _times(Phi, S, out)
     for i in range(N_X):
         for a in range(N_AERO):
@@ -78,21 +78,21 @@ def sweep(
     e: np.ndarray,
     J: np.ndarray,
 ) -> float:
-    """Fly every segment and collect residuals e = (y - y_hat) weight; with a J of any rows their sensitivities, too.
+    """Simulate every segment; store residuals e = (y - y_hat) weight and, if J has rows, their sensitivities.
 
     Args:
         par: parameters, (37,)
         starts: start state of each segment, (m, 9)
-        segments: first and last row of each, a whole number of groups apart, (m, 2)
+        segments: first and last row of each, an integer number of groups apart, (m, 2)
         y: measured states, (n, 9)
-        delta: inputs as they act, (n, 4)
-        at: U0, W0, (2,) [m/s]
+        delta: actuator states, (n, 4)
+        trim_velocity: U0, W0, (2,) [m/s]
         dt: sample time [s]
         weight: square roots of the weights, (9,)
-        e: residuals, filled in group after group, (groups, 9)
-        J: d y_hat / d(par, x0) weight, filled in, (groups, 9, 46), or with no rows
+        e: output, residuals by group, (groups, 9)
+        J: output, d y_hat / d(par, x0) weight, (groups, 9, 46), or no rows
     Returns:
-        the sum of squares; inf where a segment left every envelope
+        the sum of squares; inf if a segment leaves the envelope
     """
     x, half = np.empty(N_X), np.empty(N_X)
     work, matrices = np.empty((3, N_X)), np.empty((5, N_X, N_X))

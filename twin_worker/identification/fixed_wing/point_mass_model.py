@@ -1,4 +1,4 @@
-"""Identify the hybrid: two lags, turn, lift and power, from what was flown in the last two minutes."""
+"""Identify the point-mass model: two lags, turn, lift and power, from the last two minutes of flight."""
 
 from dataclasses import dataclass
 
@@ -10,18 +10,18 @@ from twin_worker.identification.fixed_wing import attitude_lag, energy_balance
 from twin_worker.identification.fixed_wing.energy_balance import Flight, Ridge
 from twin_worker.telemetry.history import History
 
-SEEN_S = 120.0  # flight the numbers come from [s]
-LEAST_S = 20.0  # shortest [s]
-_SMOOTH = 51  # rows the demanded height is smoothed over
+SEEN_S = 120.0  # identification window [s]
+LEAST_S = 20.0  # minimum window [s]
+_SMOOTH = 51  # smoothing of the commanded height [rows]
 
 
 @dataclass(frozen=True)
 class Hybrid:
-    """What was identified.
+    """Identified point-mass model.
 
     Attributes:
-        body: as `fleet.physics.point_mass` flies it, (N_BODY,)
-        power: its excess power, with covariance
+        parameters: parameters of `fleet.physics.point_mass`, (N_BODY,)
+        excess_power: regression of the excess power, with covariance
         t: end of the data [s since 1970]
     """
 
@@ -31,11 +31,11 @@ class Hybrid:
 
 
 def flight_of(good: Window, history: History, scale: float) -> Flight:
-    """Lay what was flown in rows of `lags.STEP`, newest last.
+    """Resample the flight in rows of `attitude_lag.STEP`, newest last.
 
     Args:
-        good: unbroken telemetry
-        history: telemetry as it came: airspeed and commands
+        window: telemetry without gaps
+        history: telemetry as received, with airspeed and commands
         scale: true over reported airspeed [-]
     """
     at, V = airspeed_of(good, history, scale)
@@ -54,7 +54,7 @@ def flight_of(good: Window, history: History, scale: float) -> Flight:
 
 
 def airspeed_of(good: Window, history: History, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows of `lags.STEP`, newest last, (n,) [s], and the true airspeed at each, (n,) [m/s]; as `flight_of`."""
+    """Return times at `attitude_lag.STEP`, newest last, (n,) [s], and true airspeed, (n,) [m/s]."""
     at = good.t[-1] - attitude_lag.STEP * np.arange(int(good.seconds / attitude_lag.STEP) + 1)[::-1]
     t_air, air = history.look("air", at[0] - 2.0)
     if len(t_air) > 1 and float(air[:, 0].max()) > 3.0:
@@ -63,7 +63,7 @@ def airspeed_of(good: Window, history: History, scale: float) -> tuple[np.ndarra
 
 
 def _climb(h_c: np.ndarray) -> np.ndarray:
-    """Return the smoothed slope of the demanded height, (n,) [m/s]; a step counts as a climb."""
+    """Return the smoothed slope of the commanded height, (n,) [m/s]; a step counts as a climb."""
     wide = np.pad(h_c, _SMOOTH // 2, mode="edge")
     return np.clip(
         np.gradient(np.convolve(wide, np.ones(_SMOOTH) / _SMOOTH, "valid")[: len(h_c)], attitude_lag.STEP), -5.0, 5.0
@@ -71,7 +71,7 @@ def _climb(h_c: np.ndarray) -> np.ndarray:
 
 
 def _commands(history: History, at: np.ndarray) -> np.ndarray:
-    """Return what the autopilot reports to aim at, held for at most a second, nan where missing, (n, 5)."""
+    """Return the reported commands, zero-order hold for at most 1 s, nan where missing, (n, 5)."""
     t, x = history.look("command", at[0] - 2.0)
     if not len(t):
         return np.full((len(at), 5), np.nan)
@@ -82,13 +82,13 @@ def _commands(history: History, at: np.ndarray) -> np.ndarray:
 
 
 def identify(good: Window, history: History, scale: float, near: Hybrid | None = None) -> Hybrid:
-    """Identify from the newest `SEEN_S` of unbroken telemetry.
+    """Identify from the newest `FIT_WINDOW_S` of gap-free telemetry.
 
     Args:
-        good, history, scale: as for `flight_of`
-        near: what was identified a little earlier, where the search begins
+        window, history, scale: as for `point_mass_data`
+        warm_start: earlier model, start of the search
     Raises:
-        ValueError: with less than `LEAST_S`.
+        ValueError: with less than `MIN_FIT_S` of telemetry; wait for more.
     """
     good = good.part(max(len(good) - int(SEEN_S / good.dt), 0), len(good))
     if good.seconds < LEAST_S:

@@ -1,4 +1,4 @@
-"""The hybrid with effects put in: lags behind a faulty servo anew, power with what the effects add to it."""
+"""Point-mass model with effects: new lags for faulty servos, power increments from added forces."""
 
 from dataclasses import dataclass, replace
 
@@ -12,21 +12,21 @@ from twin_worker.identification.fixed_wing.point_mass_model import Hybrid, fligh
 from twin_worker.numerics.ridge_regression import ridge
 from twin_worker.telemetry.history import History
 
-_LEAST_S = 10.0  # flight that anything is corrected on [s]
-_RIDGE = 0.05  # pull of an increment towards zero, as a share of its term's length
-_DOUBT = 0.3  # of an increment
+_LEAST_S = 10.0  # minimum flight for a correction [s]
+_RIDGE = 0.05  # penalty of an increment, as a fraction of its term's norm
+_DOUBT = 0.3  # relative standard deviation of an increment
 
 
 @dataclass(frozen=True)
 class Added:
-    """What effects do, row by row of what was flown.
+    """Increments of the effects, one row per row of the flight.
 
     Attributes:
-        force: X Y Z added, (n, 3) [m/s2]
+        force: added X Y Z, (n, 3) [m/s2]
         air: u v w, (n, 3) [m/s]
         phi: bank, (n,) [rad]
         throttle: (n,) [-]
-        faulty: whether servos of aileron and elevator are
+        servo_faulty: fault of the aileron and elevator servos
     """
 
     force: np.ndarray
@@ -37,14 +37,14 @@ class Added:
 
 
 def extended(known: Hybrid, since: Window, history: History, scale: float, added: Added) -> Hybrid:
-    """Put effects in.
+    """Apply effects to a model.
 
     Args:
-        known: what was identified before the onset
-        since: flight since then
-        history: telemetry as it came
-        scale: true over reported airspeed, as it is now [-]
-        added: what the effects do
+        model: model identified before the onset
+        window: flight since the onset
+        history: telemetry as received
+        scale: present true over reported airspeed [-]
+        increments: increments of the effects
     """
     body = known.body.copy()
     power = _power(body, added)
@@ -65,7 +65,7 @@ def _lag(flown: Flight, column: int, near: np.ndarray) -> np.ndarray:
 
 
 def _power(body: np.ndarray, added: Added) -> np.ndarray:
-    """Give what is added to c_0 c_t c_v c_n: force along the flight, regressed on what they are multiplied by, (4,)."""
+    """Return the increments of c_0 c_t c_v c_n: force along the path, regressed on their regressors, (4,)."""
     V = np.maximum(np.linalg.norm(added.air, axis=1), 1.0)
     along = (added.force * added.air).sum(axis=1) / V
     n = load(added.phi)

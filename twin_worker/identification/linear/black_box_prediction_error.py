@@ -1,8 +1,8 @@
-"""Second step without physics: refine A, B, C (K, c, x0) of any order by the prediction error, Gauss-Newton damped.
+"""Refine black-box A, B, C (K, c, x0) of any order by the prediction error with damped Gauss-Newton steps.
 
 Output error and innovations form are one run of x' = F x + G w, y_hat = C x: w = (u, 1) with F = A, or
-w = (u, 1, y) with F = A - K C. All entries are free; the directions that only turn the state cost nothing, and the
-damping leaves them alone. A step that would carry a pole out of the unit circle is not taken.
+w = (u, 1, y) with F = A - K C. All entries are free. Directions that only transform the state do not change the cost,
+and the damping suppresses them. A step that moves a pole out of the unit circle is rejected.
 
 J = sum_k e' e,  e = y - y_hat over the measured rows of one long run; D = 0.
 Source: Huang 2021, eq. 16-17; Ljung 1999, sections 7.3 and 10.2; McKelvey, Helmersson 2004 (free parametrisation).
@@ -16,18 +16,18 @@ import scipy.linalg
 
 from twin_worker.identification.linear.state_space import StateSpace
 
-_BLOCK = 64  # samples between two products of many rows [-]
-_CAP = 1e4  # a run that leaves this has diverged [scaled units]
+_BLOCK = 64  # samples per block product [-]
+_CAP = 1e4  # divergence limit of a run [scaled units]
 
 
 @nb.njit(cache=True, nogil=True)
 def normal_equations(
     F: np.ndarray, G: np.ndarray, C: np.ndarray, x0: np.ndarray, y: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sum squared errors, gradient and Gauss-Newton matrix of one run; parameters in the order [F G] C x0.
+    """Compute squared errors, gradient and Gauss-Newton matrix of one run; parameters in the order [F G] C x0.
 
     F (n, n); G (n, m); C (l, n); x0 (n,); y (N, l), nan where not measured; w (N, m).
-    The squares (l,) are inf where the run diverged.
+    The squares (l,) are inf if the run diverges.
     """
     n, m, l = len(F), G.shape[1], len(C)
     q = n + m
@@ -76,7 +76,7 @@ def normal_equations(
 def squared_errors(
     F: np.ndarray, G: np.ndarray, C: np.ndarray, x0: np.ndarray, y: np.ndarray, w: np.ndarray
 ) -> np.ndarray:
-    """Return only the squared errors of the same run, (l,)."""
+    """Return only the squared errors of `normal_equations`, (l,)."""
     squares, x = np.zeros(len(C)), x0.copy()
     for k in range(len(y)):
         if np.isfinite(y[k]).all():
@@ -90,7 +90,7 @@ def squared_errors(
 
 @dataclass(frozen=True)
 class _Task:
-    """The data, and where each matrix lies in the parameter vector."""
+    """Data, and layout of the matrices in the parameter vector."""
 
     y: np.ndarray  # nan where not measured
     w: np.ndarray
@@ -101,7 +101,7 @@ class _Task:
 
     @property
     def sizes(self) -> np.ndarray:
-        """Where C and x0 begin."""
+        """Return the first index of C and of x0."""
         dynamic = self.n * (self.n + self.w.shape[1])
         return np.array([dynamic, dynamic + self.y.shape[1] * self.n])
 
@@ -149,15 +149,15 @@ def refine_black_box(
     pushed: bool = False,
     steps: int = 30,
 ) -> StateSpace:
-    """Refine every matrix of a model by damped Gauss-Newton; never worse than its start on these data.
+    """Refine every matrix of a model by damped Gauss-Newton; the cost on these data never increases.
 
     Args:
         model: start, any order
         y, u: scaled outputs (N, l) and inputs (N, m)
-        ok: rows that count, (N,) bool; the others are run through but not fitted (output error only)
+        ok: fitted rows, (N,) bool; other rows are simulated but not fitted (output error only)
         innovations: refine the one-step prediction (with K) instead of the free run
-        pushed: with a constant push c on the state
-        steps: most Gauss-Newton steps
+        with_bias: include a constant state bias c
+        steps: maximum Gauss-Newton steps
     """
     task = _task(model, y, u, ok, watches=innovations, pushed=pushed)
     par = task.pack(model)
@@ -182,7 +182,7 @@ def refine_black_box(
 
 
 def _step(g: np.ndarray, H: np.ndarray, mu: float) -> np.ndarray:
-    """Solve the damped normal equations, evenly scaled."""
+    """Solve the damped normal equations after diagonal scaling."""
     even = 1 / np.sqrt(np.diag(H) + 1e-9 * np.trace(H) / len(H) + 1e-30)
     scaled = even[:, None] * H * even
     scaled[np.diag_indices_from(scaled)] += mu

@@ -1,4 +1,4 @@
-"""The paper's two steps on one window: subspace for a start, prediction error for the refinement."""
+"""Two-step identification of the paper on one window: subspace estimate, then prediction-error refinement."""
 
 from dataclasses import dataclass
 
@@ -11,12 +11,12 @@ from twin_worker.identification.linear.prediction_error_method import refine
 from twin_worker.identification.linear.subspace import subspace
 
 AXES = tuple(STATES)
-_FIRM = 0.3  # doubt about a verified model, as a share of the doubt about any small fixed wing [-]
+_FIRM = 0.3  # prior standard deviation of a verified model, relative to that of a generic fixed wing [-]
 
 
 @dataclass(frozen=True)
 class Axis:
-    """One identified axis in scaled units: x' = A x + B u + c with D = [A B c], x = (y - mean) / scale.
+    """Identified axis in scaled units: x' = A x + B u + c with D = [A B c], x = (y - mean) / scale.
 
     Attributes:
         states, inputs: names
@@ -41,7 +41,7 @@ class Axis:
         return np.concatenate([self.y_mean, self.u_mean])
 
     def scaled(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
-        """Return the window's outputs (N, n) and inputs (N, m) in the model's units."""
+        """Return outputs (N, n) and inputs (N, m) of a window in the scaled units of the model."""
         y = (window.columns(self.states) - self.y_mean) / self.y_scale
         return y, (window.columns(self.inputs) - self.u_mean) / self.u_scale
 
@@ -78,11 +78,11 @@ def identify_axis(axis: str, window: Window, length_s: float, last: Axis | None 
         axis: `longitudinal` or `lateral`
         window: identification data
         length_s: free-run length of the prediction-error step [s]
-        last: the last verified model, where the parameters are held without data
+        prior_model: the last verified model, prior mean of the parameters
     Returns:
         the first-step (subspace) and the refined model
     Raises:
-        ValueError: when the window is too broken for the subspace step.
+        ValueError: if the window has too few gap-free rows for the subspace step; wait for more.
     """
     states, inputs = STATES[axis], INPUTS[axis]
     y, u, ok = window.columns(states), window.columns(inputs), window.ok
@@ -108,7 +108,7 @@ def identify_axis(axis: str, window: Window, length_s: float, last: Axis | None 
 
 
 def _tame(D: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Start from the prior mean where the first step is not finite or explodes within a free run."""
+    """Return the first-step model, or the prior mean if that model is not finite or unstable."""
     n = len(D)
     if np.isfinite(D).all() and np.abs(np.linalg.eigvals(D[:, :n])).max() < 1.02:
         return D

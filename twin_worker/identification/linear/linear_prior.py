@@ -1,4 +1,4 @@
-"""What is known of any small fixed wing before it has flown: kinematics exactly, aerodynamics roughly.
+"""Prior of a generic small fixed wing: exact kinematics, approximate aerodynamics.
 
 Rates of change per unit of each state and input, at 25 m/s; forces grow with airspeed, control with its square.
 Source: Beard & McLain 2012, section 5.5 (linear models) with the Aerosonde of appendix E; gravity and rotation exact.
@@ -12,7 +12,7 @@ STATES = {"longitudinal": ("u", "w", "q", "theta"), "lateral": ("phi", "psi", "p
 INPUTS = {"longitudinal": ("delta_e", "delta_t", "bank"), "lateral": ("delta_a", "delta_r")}
 _AT = 25.0  # airspeed of the table [m/s]
 
-# (row, column, derivative at 25 m/s, power of airspeed it grows with)
+# (row, column, derivative at 25 m/s, exponent of airspeed)
 _AERODYNAMICS = (
     ("u", "u", -0.15, 0.0),
     ("u", "w", 0.30, 0.0),
@@ -34,9 +34,9 @@ _AERODYNAMICS = (
     ("r", "delta_r", 5.0, 2.0),
     ("v", "v", -1.0, 0.0),
 )
-_FLOOR = {"u": 0.3, "w": 0.6, "q": 1.0, "p": 1.5, "r": 1.0, "v": 0.5}  # doubt of an entry not in the table [1/s]
-_SHARE = 0.4  # doubt of an entry in the table, as a share of it [-]
-_KINEMATIC = {"theta": 0.05, "phi": 0.05, "psi": 0.05}  # doubt of the rows that kinematics knows [1/s]
+_FLOOR = {"u": 0.3, "w": 0.6, "q": 1.0, "p": 1.5, "r": 1.0, "v": 0.5}  # sigma of other entries [1/s]
+_SHARE = 0.4  # relative standard deviation of an entry in the table [-]
+_KINEMATIC = {"theta": 0.05, "phi": 0.05, "psi": 0.05}  # standard deviation of kinematic rows [1/s]
 _OFFSET = {"u": 2.0, "w": 3.0, "q": 3.0, "p": 3.0, "r": 2.0, "v": 2.0, "theta": 0.05, "phi": 0.05, "psi": 0.05}
 
 
@@ -67,14 +67,14 @@ def prior(axis: str, U0: float, W0: float, dt: float) -> tuple[np.ndarray, np.nd
 def _doubt(row: str, column: str, slope: float | None) -> float:
     """Return the standard deviation of one continuous entry; per m/s for velocities, per rad or rad/s for the rest."""
     if column == "psi":
-        return 1e-6  # no force knows where north is
+        return 1e-6  # forces do not depend on heading
     if column == "1":
         return _OFFSET[row]
     if row in _KINEMATIC:
         return _KINEMATIC[row] * (0.02 if column in ("u", "v", "w") else 1.0)
     if slope is not None:
         return _SHARE * abs(slope) + 0.2 * _FLOOR[row]
-    # a rate row feels a velocity weakly, a velocity row feels a rate or an angle strongly
+    # rates depend weakly on velocities; velocities depend strongly on rates and angles
     weight = {"uvw": 1.0, "pqr": 0.3}["uvw" if column in ("u", "v", "w") else "pqr"]
     if row in ("u", "v", "w") and column not in ("u", "v", "w"):
         weight = 4.0

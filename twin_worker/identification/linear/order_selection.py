@@ -1,10 +1,9 @@
-"""Which order, and is there more than A, B and C? Tried on held-out thirds of the data, never on anything else.
+"""Selection of model order and structure by three-fold cross-validation.
 
-Every order is started by subspace identification with several horizons, its inputs are fitted to the free run, the
-best start is refined by output error; with and without a constant push, with and without feedthrough. The score that
-turn out best over the thirds they have not seen are made again from all data: a committee, whose median run is steadier
-than any one of them where data are few and noisy. Where one model is wanted, it is the smallest member that is about as
-near to that run as any: one lucky fold does not decide.
+Every order starts from subspace identification with several horizons. B is fitted to the free run, and the best start
+is refined by output error, with and without a state bias, with and without feedthrough. The structures with the best
+fit on held-out folds are refitted to all data. They form an ensemble, whose median run has less variance than a single
+model on short or noisy data. The selected model is the smallest member close to the median run.
 """
 
 from collections.abc import Iterable, Iterator
@@ -16,22 +15,22 @@ from twin_worker.identification.linear.black_box_prediction_error import fit_inp
 from twin_worker.identification.linear.state_space import StateSpace
 from twin_worker.identification.linear.subspace import candidates, instructive
 
-PASTS = (6, 10, 15, 25)  # horizons tried [samples]
+PASTS = (6, 10, 15, 25)  # tried past horizons [samples]
 _THIRDS = 3
-_SCORE = 20  # members of the committee
-_AS_NEAR = 2.0  # squared distance, as a multiple of the nearest member's [-]
-_LEAST = 30  # samples for the state at the start of a held-out third
+_SCORE = 20  # members of the ensemble
+_AS_NEAR = 2.0  # largest squared distance, relative to the nearest member [-]
+_LEAST = 30  # minimum samples to estimate the start state of a fold
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a model was made.
+    """Structure of a model.
 
     Attributes:
         order: number of states
-        feedthrough: the input acts on the output of its own sample (the state feels it a sample sooner)
-        pushed: with a constant on the state
-        refined: by output error; else only its inputs were fitted
+        feedthrough: the input acts on the output of the same sample
+        with_bias: with a constant state bias
+        refined: refined by output error; otherwise only B is fitted
     """
 
     order: int
@@ -42,12 +41,12 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Choice:
-    """What was chosen.
+    """Result of the order selection.
 
     Attributes:
-        model: the smallest member about as near to the committee's median run as any
-        recipe: how that was made
-        committee: the models that did best on data they had not seen, refitted to all
+        model: the smallest member close to the median run of the ensemble
+        structure: structure of that model
+        ensemble: the models with the best fit on held-out data, refitted to all data
     """
 
     model: StateSpace
@@ -56,15 +55,15 @@ class Choice:
 
 
 def choose(y: np.ndarray, u: np.ndarray, *, orders: Iterable[int] = range(1, 11), feedthrough: bool = False) -> Choice:
-    """Identify models whose order the data choose.
+    """Identify models and select their order by cross-validation.
 
     Args:
         y: outputs, zero mean and unit scale, (N, l)
-        u: inputs, likewise, (N, m)
-        orders: orders to try
-        feedthrough: also try models whose input acts at once, so that D is not zero; never for data from a closed loop
+        u: inputs, zero mean and unit scale, (N, m)
+        orders: candidate orders
+        feedthrough: also try models with D; not valid for closed-loop data
     Raises:
-        ValueError: when the data are too short or too poor for any order.
+        ValueError: if the data are too short or not exciting enough for any order.
     """
     n, orders = len(y), tuple(orders)
     instructive(y, u, np.ones(n, bool))
@@ -80,7 +79,7 @@ def choose(y: np.ndarray, u: np.ndarray, *, orders: Iterable[int] = range(1, 11)
 
 
 def _ranked(y: np.ndarray, u: np.ndarray, orders: tuple[int, ...], through: tuple[bool, ...]) -> list[Recipe]:
-    """Put the recipes in the order of how well they run over thirds they have not seen, the best first."""
+    """Rank the structures by the fit of free runs on held-out folds, best first."""
     n = len(y)
     fits: dict[Recipe, list[float]] = {}
     for fold in range(_THIRDS):
@@ -98,14 +97,14 @@ def _ranked(y: np.ndarray, u: np.ndarray, orders: tuple[int, ...], through: tupl
 def _models(
     y: np.ndarray, u: np.ndarray, ok: np.ndarray, orders: tuple[int, ...], through: tuple[bool, ...]
 ) -> Iterator[tuple[Recipe, StateSpace]]:
-    """Make a model of every recipe from the rows that are ok."""
+    """Fit a model of every structure to the rows marked ok."""
     for feedthrough in through:
-        w = np.vstack([u[1:], u[-1:]]) if feedthrough else u  # D is B of an input that comes a sample sooner
+        w = np.vstack([u[1:], u[-1:]]) if feedthrough else u  # D is B of the input advanced by one sample
         found = []
         for past in PASTS:
             try:
                 found.append(candidates(y, w, ok, past=past, future=max(past - 2, 6)))
-            except ValueError:  # too long a past for so few rows
+            except ValueError:  # too few rows for this past horizon
                 continue
         for order in orders:
             starts = [states.model(order).stabilised() for states in found if order <= len(states.x)]
@@ -124,12 +123,12 @@ def _squares(model: StateSpace, y: np.ndarray, u: np.ndarray, ok: np.ndarray) ->
 
 
 def _through(model: StateSpace, u0: np.ndarray) -> StateSpace:
-    """Return the same model for inputs that are not advanced: its state is x(k) - B u(k)."""
+    """Convert a model of advanced inputs to a model with feedthrough: its state is x(k) - B u(k)."""
     return replace(model, B=model.A @ model.B, D=model.C @ model.B, x0=model.x0 - model.B @ u0)
 
 
 def _fit(model: StateSpace, y: np.ndarray, u: np.ndarray) -> float:
-    """Run over a held-out third: mean fit of the outputs, at least -100 [%]."""
+    """Return the mean fit of the outputs over a held-out fold, at least -100 [%]."""
     first = min(max(_LEAST, len(y) // 10), len(y))
     y_hat = model.run(u, model.begin(y[:first], u[:first], len(y)))
     miss = np.linalg.norm(y - y_hat, axis=0) / np.maximum(np.linalg.norm(y - y.mean(axis=0), axis=0), 1e-9)

@@ -1,6 +1,7 @@
-"""Second step: refine [A B c] by the prediction error of free runs, with Gauss-Newton steps and a prior.
+"""Refine [A B c] by the prediction error of free runs, with Gauss-Newton steps and a prior.
 
-J = sum_k e' W e / discount + (par - par0)' Lambda (par - par0),  e = y - y_hat,  y_hat a free run of one segment.
+J = sum_k e' W e + (par - par0)' Lambda (par - par0),  e = y - y_hat,  y_hat a free run of one segment,
+W = effective_fraction / residual variance.
 Source: Huang 2021, eq. 16-17 (Newton-Raphson on J = e'e); Ljung 1999, section 10.2 (Gauss-Newton, damping).
 """
 
@@ -8,12 +9,12 @@ import numba as nb
 import numpy as np
 import scipy.linalg
 
-_WORST = 20.0  # errors count as no larger, scaled units
+_WORST = 20.0  # errors are clipped to this [scaled units]
 
 
 @nb.njit(cache=True, nogil=True)
 def free_run(D: np.ndarray, x0: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
-    """Run x' = A x + B u + c from x0, D = [A B c] (n, n + m + 1), u (N, m), out (N, n) with out[0] = x0."""
+    """Simulate x' = A x + B u + c from x0, D = [A B c] (n, n + m + 1), u (N, m), out (N, n) with out[0] = x0."""
     n, m = out.shape[1], u.shape[1]
     out[0] = x0
     for k in range(len(u) - 1):
@@ -30,10 +31,10 @@ def free_run(D: np.ndarray, x0: np.ndarray, u: np.ndarray, out: np.ndarray) -> N
 def normal_equations(
     D: np.ndarray, y: np.ndarray, u: np.ndarray, ok: np.ndarray, W: np.ndarray, length: int
 ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Sum cost, gradient, Gauss-Newton matrix and residual square sums over segments of `length` samples.
+    """Compute cost, gradient, Gauss-Newton matrix and squared residual sums over segments of `length` samples.
 
-    Each segment starts at its measured state; S = d y_hat / d par follows S' = A S + d(D z)/d par. A run that leaves
-    +-50 has diverged: each of its measured rows from there on costs the largest error, `_WORST`, and has no slope.
+    Each segment starts at its measured state; S = d y_hat / d par satisfies S' = A S + d(D z)/d par. A run outside
+    +-50 has diverged: each later measured row costs the maximum error, `_MAX_ERROR`, with zero gradient.
     D (n, q); y (N, n); u (N, m); ok (N,) bool; W (n,) weights.
     """
     n, q = D.shape
@@ -103,13 +104,13 @@ def refine(
     Args:
         D0: start, scaled units, (n, n + m + 1)
         y, u, ok: scaled outputs (N, n), inputs (N, m), measured rows (N,)
-        prior: where the parameters are held without data, (n, n + m + 1)
-        precision: inverse variance of that, (n, n + m + 1)
+        prior: prior mean, (n, n + m + 1)
+        precision: inverse prior variance, (n, n + m + 1)
         length: free-run length [samples]
-        discount: share of a residual that is new information; gust-coloured residuals repeat themselves [-]
-        steps: most Gauss-Newton steps
+        effective_fraction: effective fraction of residuals, which gusts correlate [-]
+        steps: maximum Gauss-Newton steps
     Returns:
-        the refined [A B c]; the start where no step descends
+        the refined [A B c]; the start if no step descends
     """
     par, par0, Lambda = D0.ravel().copy(), prior.ravel(), precision.ravel()
     shape, W = D0.shape, np.full(len(D0), 1.0)
@@ -119,14 +120,14 @@ def refine(
     for step in range(steps):
         if state is None:
             cost, g, H, squares = normal_equations(par.reshape(shape), y, u, ok, W, length)
-            if step in (0, 2):  # weights from the residuals themselves, then the cost counts anew
+            if step in (0, 2):  # new weights from the residuals, then a new cost
                 W = discount / np.maximum(squares[:-1] / max(squares[-1], 1.0), 1e-4)
                 cost, g, H, squares = normal_equations(par.reshape(shape), y, u, ok, W, length)
             best = cost + float(Lambda @ (par - par0) ** 2)
             state = g, H
         g, H = state
         lhs = H + np.diag(Lambda + mu * (np.diag(H) + Lambda))
-        even = 1 / np.sqrt(np.diag(lhs))  # variances differ by many orders
+        even = 1 / np.sqrt(np.diag(lhs))  # variances differ by orders of magnitude
         scaled = even[:, None] * lhs * even
         trial = par + even * scipy.linalg.solve(scaled, even * (g - Lambda * (par - par0)), assume_a="pos")
         cost, g, H, _ = normal_equations(trial.reshape(shape), y, u, ok, W, length)

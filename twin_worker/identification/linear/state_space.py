@@ -1,6 +1,6 @@
-"""`StateSpace`: a discrete linear model of any order, and what can be done with one: run, predict, turn, stabilise.
+"""`StateSpace`: a discrete linear model of any order with simulation, prediction, transformation, stabilisation.
 
-x' = A x + B u + K e + c,  y = C x + D u + e;  D = 0 wherever an autopilot closes the loop.
+x' = A x + B u + K e + c,  y = C x + D u + e;  D = 0 in closed loop with an autopilot.
 """
 
 from dataclasses import dataclass, replace
@@ -9,22 +9,22 @@ import numpy as np
 
 from twin_worker.identification.linear.prediction_error_method import free_run
 
-_EDGE = 0.9995  # poles are drawn back to here [-]
-_ECHO = 0.01  # weight of the echo against the fit [-]
-_CAP = 1e6  # a run that leaves this has diverged, and stays there [scaled units]
+_EDGE = 0.9995  # largest pole radius after stabilisation [-]
+_ECHO = 0.01  # weight of the observability Gramian against the fit [-]
+_CAP = 1e6  # bound of the observability rows [scaled units]
 
 
 @dataclass(frozen=True)
 class StateSpace:
-    """One model in the units of the data it came from.
+    """Discrete linear model in the units of its data.
 
     Attributes:
         A: (n, n)
         B: (n, m)
         C: (l, n)
-        K: gain of the one-step prediction error; zeros: output error, (n, l)
-        c: constant push on the state, (n,)
-        x0: state at the first sample it was fitted to, (n,)
+        K: innovation gain, (n, l); zeros for output error
+        c: constant state bias, (n,)
+        x0: state at the first fitted sample, (n,)
         D: (l, m)
     """
 
@@ -38,7 +38,7 @@ class StateSpace:
 
     @classmethod
     def of(cls, A: np.ndarray, B: np.ndarray, C: np.ndarray, **more: np.ndarray) -> "StateSpace":
-        """Make a model whose other parts are zero where they are not given."""
+        """Create a model; omitted matrices are zero."""
         (l, n), m = C.shape, B.shape[1]
         zeros = {"K": np.zeros((n, l)), "c": np.zeros(n), "x0": np.zeros(n), "D": np.zeros((l, m))}
         return cls(A, B, C, **(zeros | more))
@@ -54,14 +54,14 @@ class StateSpace:
         return float(np.abs(np.linalg.eigvals(self.A)).max())
 
     def run(self, u: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
-        """Simulate y (N, l) under u (N, m) from x0 (n,), the model's own where none is given."""
+        """Simulate y (N, l) under u (N, m) from x0 (n,), by default the x0 of the model."""
         x = np.empty((len(u), self.order))
         step = np.hstack([self.A, self.B, self.c[:, None]])
         free_run(step, np.asarray(self.x0 if x0 is None else x0, float), np.ascontiguousarray(u, float), x)
         return x @ self.C.T + u @ self.D.T
 
     def one_step(self, y: np.ndarray, u: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
-        """Predict every y (N, l) from what came before it."""
+        """Predict every y (N, l) from the samples before it."""
         watched = StateSpace(
             A=self.A - self.K @ self.C,
             B=np.hstack([self.B - self.K @ self.D, self.K]),
@@ -74,14 +74,14 @@ class StateSpace:
         return watched.run(np.hstack([u, y]), x0)
 
     def begin(self, y: np.ndarray, u: np.ndarray, length: int) -> np.ndarray:
-        """Estimate the state at the first of these samples: the state that explains them, (n,).
+        """Estimate the state at the first sample by regularised least squares, (n,).
 
-        Of states that explain them alike, the one whose echo through the whole run is weakest: an unsure state must
-        not grow into a large error later.
+        The observability Gramian of the complete run is the regulariser: it prevents an uncertain state from growing
+        into a large error later.
 
         Args:
-            y, u: the first few outputs (k, l) and inputs (k, m) of the run
-            length: samples of the whole run
+            y, u: the first outputs (k, l) and inputs (k, m) of the run
+            length: samples of the complete run
         """
         rest = y - self.run(u, np.zeros(self.order))
         seen = np.empty((len(y), *self.C.shape))
@@ -96,23 +96,23 @@ class StateSpace:
         return np.linalg.lstsq(lhs, rows.T @ rest.ravel(), rcond=1e-12)[0]
 
     def turned(self, T: np.ndarray) -> "StateSpace":
-        """Return the same model with the state T x."""
+        """Return the equivalent model with state T x."""
         back = np.linalg.inv(T)
         return StateSpace(T @ self.A @ back, T @ self.B, self.C @ back, T @ self.K, T @ self.c, T @ self.x0, self.D)
 
     def outputs_as_states(self) -> "StateSpace":
-        """Turn the state so that C = I.
+        """Transform the state so that C = I.
 
         Raises:
-            ValueError: when there are not as many states as outputs.
+            ValueError: if the numbers of states and outputs differ; identify with order = outputs.
         """
         if self.C.shape[0] != self.order:
             found = f"found {self.order} states and {self.C.shape[0]} outputs"
-            raise ValueError(f"similarity to C = I: {found}, expected as many; identify with order = outputs")
+            raise ValueError(f"similarity to C = I: {found}, expected equal numbers; identify with order = outputs")
         return self.turned(self.C + 1e-9 * np.eye(self.order))
 
     def stabilised(self) -> "StateSpace":
-        """Mirror the poles outside the unit circle and draw all of them to inside it."""
+        """Mirror poles from outside the unit circle to its inside and limit their radius."""
         if self.radius <= _EDGE:
             return self
         poles, modes = np.linalg.eig(self.A)

@@ -1,8 +1,8 @@
-"""First step: a state-space model straight from the data, by predictor-based subspace identification.
+"""Predictor-based subspace identification of a state-space model.
 
-The paper projects future outputs orthogonally to the inputs (Huang 2021, eq. 5-15; `projection.py`), which is
-biased when an autopilot closes the loop. This is the closed-loop consistent form of the same idea: the past enters
-through a vector autoregression, so that the innovations stay uncorrelated with it.
+The paper projects future outputs orthogonally to the inputs (Huang 2021, eq. 5-15; `subspace_open_loop.py`), which is
+biased when an autopilot closes the loop. This form is consistent in closed loop: a vector autoregression models the
+past, so that the innovations are uncorrelated with it.
 
 Source: Chiuso 2007, "The role of vector autoregressive modeling in predictor-based subspace identification",
 Automatica 43, 1034-1048 (PBSIDopt); D = 0.
@@ -16,18 +16,18 @@ from twin_worker.identification.linear.state_space import StateSpace
 
 PAST = 12  # samples of the past in the regression [-]
 FUTURE = 8  # block rows of the observability matrix [-]
-_ALIKE = 1e-8  # least share of a column that the others do not explain [-]
+_ALIKE = 1e-8  # minimum fraction of a column that is independent of the others [-]
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """States of every order at once: the model of order n is made of the first n.
+    """States of all orders: the model of order n uses the first n.
 
     Attributes:
         x: sqrt(S) V', most important first, (most, N')
-        singular: what each of them carries, (most,)
+        singular_values: singular value of each state, (most,)
         y, u: outputs and inputs of the same samples, (N', l), (N', m)
-        rows: which samples these are, (N',)
+        rows: indices of these samples, (N',)
     """
 
     x: np.ndarray
@@ -40,7 +40,7 @@ class Candidates:
         """Solve x' = A x + B u + K e, y = C x + e for the first `order` states.
 
         Raises:
-            ValueError: when there are not so many.
+            ValueError: if there are fewer states; lower the order or widen the past.
         """
         if not 1 <= order <= len(self.x):
             raise ValueError(f"subspace: found order {order}, expected 1..{len(self.x)}; lower it or widen the past")
@@ -60,13 +60,13 @@ def candidates(
 
     Args:
         y: outputs, zero mean and unit scale, (N, l)
-        u: inputs, likewise, (N, m)
-        ok: rows that were measured, (N,) bool
+        u: inputs, zero mean and unit scale, (N, m)
+        ok: measured rows, (N,) bool
         past: samples in the vector autoregression, at least `future`
         future: block rows of the observability matrix
         ridge: regularisation per sample [-]
     Raises:
-        ValueError: when too few unbroken rows are left; wait for a longer window.
+        ValueError: if there are too few gap-free rows; wait for a longer window.
     """
     n = y.shape[1]
     k = n + u.shape[1]
@@ -89,16 +89,16 @@ def candidates(
 def pbsid(
     y: np.ndarray, u: np.ndarray, order: int, *, ok: np.ndarray | None = None, past: int = PAST, future: int = FUTURE
 ) -> StateSpace:
-    """Identify a model of any order from data that may come from a closed loop.
+    """Identify a model of any order from open-loop or closed-loop data.
 
     Args:
         y: outputs, zero mean and unit scale, (N, l)
-        u: inputs, likewise, (N, m)
+        u: inputs, zero mean and unit scale, (N, m)
         order: number of states, at most outputs times `future`
-        ok: rows that were measured, (N,) bool; all where not given
+        ok: measured rows, (N,) bool; default all
         past, future: horizons [samples]
     Raises:
-        ValueError: when the data are too short or too poor for that; the sentence says what to change.
+        ValueError: if the data are too short or not exciting enough; the message contains the remedy.
     """
     ok = np.ones(len(y), bool) if ok is None else ok
     instructive(y, u, ok)
@@ -106,13 +106,13 @@ def pbsid(
 
 
 def instructive(y: np.ndarray, u: np.ndarray, ok: np.ndarray) -> None:
-    """Insist on data from which something can be learnt.
+    """Check that the data are finite and sufficiently exciting.
 
     Raises:
-        ValueError: when columns are not finite, constant or copies, or rows are missing.
+        ValueError: if columns are not finite, constant or linearly dependent, or rows are missing.
     """
     if not len(y) == len(u) == len(ok):
-        raise ValueError(f"subspace: found {len(y)} outputs, {len(u)} inputs, {len(ok)} marks; give as many of each")
+        raise ValueError(f"subspace: found {len(y)} outputs, {len(u)} inputs, {len(ok)} marks; pass equal numbers")
     for name, data in (("output", y[ok]), ("input", u[ok])):
         if not np.isfinite(data).all():
             column = int(np.argmin(np.isfinite(data).all(axis=0)))
@@ -129,17 +129,17 @@ def instructive(y: np.ndarray, u: np.ndarray, ok: np.ndarray) -> None:
 
 
 def subspace(y: np.ndarray, u: np.ndarray, ok: np.ndarray, ridge: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
-    """Identify x' = A x + B u + K e, y = x + e of order n = number of outputs, from flights as they come.
+    """Identify x' = A x + B u + K e, y = x + e of order n = number of outputs.
 
     Args:
         y: outputs, zero mean and unit scale, (N, n)
-        u: inputs, likewise; one that never moves gets next to no effect, (N, m)
-        ok: rows that were measured, (N,) bool
+        u: inputs, zero mean and unit scale; a constant input gets almost no effect, (N, m)
+        ok: measured rows, (N,) bool
         ridge: regularisation per sample [-]
     Returns:
         A (n, n), B (n, m)
     Raises:
-        ValueError: when too few unbroken rows are left; wait for a longer window.
+        ValueError: if there are too few gap-free rows; wait for a longer window.
     """
     model = candidates(y, u, ok, ridge=ridge).model(y.shape[1]).outputs_as_states()
     return model.A, model.B

@@ -1,7 +1,7 @@
-"""The paper's first step: future outputs projected orthogonally to the inputs, for open loop data.
+"""Subspace identification by orthogonal projection of future outputs, for open-loop data.
 
-In a closed loop the inputs carry the noise of past outputs and A is biased: `subspace.py` is not. Kept so that the
-paper can be reproduced and the bias be shown.
+In closed loop the inputs depend on the noise of past outputs, which biases A; `subspace.py` has no such bias. This
+module reproduces the paper and demonstrates the bias.
 
 Source: Huang 2021, eq. 5-15; Verhaegen 1994 (ordinary MOESP); D = 0.
 """
@@ -18,16 +18,16 @@ DEPTH = 12  # q: block rows of the Hankel matrices [-]
 def projection(
     y: np.ndarray, u: np.ndarray, order: int, *, ok: np.ndarray | None = None, depth: int = DEPTH
 ) -> StateSpace:
-    """Identify a model by the paper's orthogonal projection.
+    """Identify a model by orthogonal projection as in the paper.
 
     Args:
         y: outputs, zero mean and unit scale, (N, l)
-        u: inputs, likewise, (N, m)
+        u: inputs, zero mean and unit scale, (N, m)
         order: number of states, at most outputs times (`depth` - 1)
-        ok: rows that were measured, (N,) bool; all where not given
+        ok: measured rows, (N,) bool; default all
         depth: q of the paper [samples]
     Raises:
-        ValueError: when the data are too short or too poor for that; the sentence says what to change.
+        ValueError: if the data are too short or not exciting enough; the message contains the remedy.
     """
     ok = np.ones(len(y), bool) if ok is None else ok
     instructive(y, u, ok)
@@ -38,7 +38,7 @@ def projection(
     if whole.sum() < 2 * depth * (l + m):
         raise ValueError(f"projection: found {whole.sum()} unbroken rows, needs {2 * depth * (l + m)}; wait for more")
     Y, U = (_hankel(data, depth)[:, whole] for data in (y, u))  # eq. 9
-    # eq. 11-13: what is left of Y beside U; from the triangular factor, the projector itself would be N x N
+    # eq. 11-13: projection of Y orthogonal to U by the triangular factor; the projector itself would be N x N
     R = np.asarray(np.linalg.qr(np.vstack([U, Y]).T, mode="r")).T
     left, singular, _ = np.linalg.svd(R[depth * m :, depth * m :])
     O = left[:, :order] * np.sqrt(singular[:order])  # eq. 14
@@ -48,6 +48,6 @@ def projection(
 
 
 def _hankel(data: np.ndarray, depth: int) -> np.ndarray:
-    """Stack every row with those that follow it: (N, k) to (depth k, N - depth + 1)."""
+    """Return the block Hankel matrix: (N, k) to (depth k, N - depth + 1)."""
     windows = np.lib.stride_tricks.sliding_window_view(data, depth, axis=0)  # (N', k, depth)
     return windows.transpose(2, 1, 0).reshape(depth * data.shape[1], -1)

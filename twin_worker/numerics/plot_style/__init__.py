@@ -1,4 +1,4 @@
-"""Style of the figures."""
+"""Figure style."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from fleet.report.ink import GRID, INK, MUTED
 
 
 def house(ax: Any, title: str) -> None:
-    """Return a panel its title and the colours of the page."""
+    """Apply title and page colours to a panel."""
     ax.set_title(title, fontsize=9, color=INK)
     ax.tick_params(labelsize=8, colors=MUTED)
     ax.grid(color=GRID, lw=0.6)

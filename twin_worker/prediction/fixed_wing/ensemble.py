@@ -1,4 +1,4 @@
-"""The hybrid flown many times: what is not known of air and airframe is drawn, and the bundle's spread is the doubt.
+"""Ensemble of point-mass rollouts with random air and airframe parameters; its spread is the uncertainty.
 
 Source: Evensen 2009, chapter 2 (Monte Carlo error propagation).
 """
@@ -12,22 +12,22 @@ from twin_worker.prediction.closed_loop import Situation, Start
 from twin_worker.prediction.fixed_wing.point_mass_rollout import begin, over_ground, rest
 
 MEMBERS = 24
-_LEAST = 0.5  # share of them that must stay in their envelope [-]
+_LEAST = 0.5  # minimum fraction of members that stay in their envelope [-]
 _POSITION = 0.4  # standard deviation of the position at the start [m]
 _VELOCITY = 0.1  # of the ground velocity [m/s]
 _AIRSPEED = 0.35  # of the airspeed [m/s]
 _ALPHA = 0.01  # of the angle of attack [rad]
 _LAG = 0.12  # of the lags' bandwidths, relative [-]
-_ROUGH = 2.5  # on the roughness of the air: the wind filter's noise is wide, for sideslip [-]
-_POWER = 1.5  # on the standard deviations of the power: a closed loop tells it badly [-]
+_ROUGH = 2.5  # factor on the turbulence: the noise of the wind filter includes sideslip [-]
+_POWER = 1.5  # factor on the standard deviations of power, which is poorly identifiable in closed loop [-]
 
 
 def draw(
     now: Situation, start: Start, found: Hybrid, chance: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, ...]:
-    """Draw body, air and start of each member for `chance`, (m, seconds, 4); see `fleet.physics.point_mass.bundle`.
+    """Draw parameters, air and start of members for `noise`, (m, seconds, 4); see `fleet.physics.point_mass.bundle`.
 
-    The first member is the likeliest flight itself: nothing is drawn for it.
+    The first member is the mean, without random deviations.
     """
     members = len(chance)
     state, air = begin(now, start.good)
@@ -52,15 +52,15 @@ def draw(
 def spread(
     now: Situation, start: Start, found: Hybrid, ahead: np.ndarray, rng: np.random.Generator, *, members: int = MEMBERS
 ) -> np.ndarray | None:
-    """Fly the bundle; return its standard deviations along, cross and vertical about the first member, (k, 3) [m].
+    """Simulate the ensemble; return standard deviations along, cross, vertical about the first member, (k, 3) [m].
 
-    None where too many members leave their envelope.
+    Return None if too many members leave their envelope.
 
     Args:
-        now, start, found: as for `fly_hybrid`
+        context, initial, model: as for `fly_point_mass`
         ahead: look-ahead times in whole steps of `fleet.physics.point_mass.COARSE`, rising, (k,) [s]
-        rng: source of chance
-        members: how many fly
+        rng: random number generator
+        members: number of members
     """
     chance = rng.standard_normal((members, int(ahead[-1]) + 1, 4))
     chance[0] = 0.0

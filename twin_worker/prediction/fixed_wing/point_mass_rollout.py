@@ -1,4 +1,4 @@
-"""Fly the hybrid ahead from where the aircraft is now."""
+"""Rollout of the point-mass model from the present state of the aircraft."""
 
 from math import asin
 
@@ -10,11 +10,11 @@ from twin_worker.estimation.wind_filter import DRIFT, DRIFT_S, GUST, GUST_S
 from twin_worker.identification.fixed_wing.point_mass_model import Hybrid, airspeed_of
 from twin_worker.prediction.closed_loop import Flown, Situation, Start, at_times
 
-_SPEED_ROWS = 8  # rows of 0.1 s that the airspeed at the start is the mean of
-_LOOK_ROWS = 60  # rows of the window they come from
-_GROUND_ROWS, _CLIMB_ROWS = 3, 12  # rows of 0.04 s behind ground velocity and climb
-_STEEPEST = 0.5  # sine of the steepest path at the start [-]
-_NEAREST = 10.0  # least height the wind's profile is taken from [m]
+_SPEED_ROWS = 8  # rows of 0.1 s in the mean airspeed at the start
+_LOOK_ROWS = 60  # rows of the window that they use
+_GROUND_ROWS, _CLIMB_ROWS = 3, 12  # rows of 0.04 s in the means of ground velocity and climb
+_STEEPEST = 0.5  # largest sine of the path angle at the start [-]
+_NEAREST = 10.0  # minimum reference height of the wind profile [m]
 _NO_CHANCE = np.empty((0, 4))
 
 
@@ -32,7 +32,7 @@ def start_of(now: Situation, good: Window) -> np.ndarray:
 
 
 def air_of(now: Situation, start: np.ndarray) -> np.ndarray:
-    """Return mean wind, drift and biases of the air, (N_AIR,); what is left of the ground velocity is not in it yet."""
+    """Return mean wind, drift and biases, (N_AIR,), without the unexplained ground velocity."""
     air = np.zeros(H.N_AIR)
     air[H.W_N : H.DRIFT_E + 1] = now.wind.state[0][2:6]
     air[H.SCALE], air[H.D_PSI] = now.wind.scale, now.wind.heading_bias
@@ -46,7 +46,7 @@ def air_of(now: Situation, start: np.ndarray) -> np.ndarray:
 
 
 def rest(start: np.ndarray, air: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return what neither airspeed nor mean wind explains of the ground velocity v (..., 2), NED [m/s].
+    """Return the ground velocity v (..., 2) minus airspeed and mean wind, NED [m/s].
 
     Args:
         start: (..., N_START)
@@ -74,17 +74,17 @@ def begin(now: Situation, good: Window) -> tuple[np.ndarray, np.ndarray]:
 
 
 def over_ground(start: np.ndarray, air: np.ndarray) -> np.ndarray:
-    """Return the ground velocity that a start and its air make, north and east, (2,) [m/s]."""
+    """Return the ground velocity of a start state and its air, north and east, (2,) [m/s]."""
     return air[[H.REST_N, H.REST_E]] - rest(start, air, np.zeros(2))
 
 
 def fly_hybrid(now: Situation, start: Start, found: Hybrid, ahead: np.ndarray) -> Flown:
-    """Fly the identified hybrid from there; beyond its envelope, if that is far, the path is nan.
+    """Simulate the identified point-mass model; the path is nan beyond its envelope.
 
     Args:
-        now, start: the situation, and where its flights start
-        found: what was identified
-        ahead: wanted look-ahead times, rising, (k,) [s]
+        context, initial: inputs of the prediction and start of the rollout
+        model: identified model
+        ahead: requested look-ahead times, rising, (k,) [s]
     """
     ctl, par, legs = start.control
     state, air = begin(now, start.good)

@@ -1,6 +1,6 @@
-"""What flight tells of a multirotor: fly its twin over the last minute from many starts, keep what strays least.
+"""Fit of the multirotor model: minimise the rollout error from many starts over the last minute.
 
-Its tilt tells more: thrust's pull minus acceleration is drag, and drag knows the wind.
+Drag and wind come from the tilt: horizontal thrust minus acceleration is drag, which depends on the airspeed.
 Source: drag as in Mahony, Kumar & Corke 2012 (linear in airspeed).
 """
 
@@ -14,18 +14,18 @@ from twin_worker.prediction.multirotor.rollout import Onboard, Rotor, Way, fly_s
 from twin_worker.prediction.multirotor.route import lay
 from twin_worker.telemetry.track import STEP, Track
 
-_LEAST_S = 2.0  # shortest track a flight ahead starts from [s]
-_BACK_S = 60.0  # flight the twin is compared with [s]
-_EVERY_S, _OVER_S = 4.0, 10.0  # between its starts, and how far each looks [s]
-_LAGS = (0.7, 1.0, 1.4, 2.0, 2.8)  # natural frequencies tried [rad/s]
-_SHARES = (0.6, 0.8, 0.9, 1.0, 1.1, 1.25)  # of the limits, tried
-_PAUSES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)  # time lost at each stop, tried [s]
-_TRIED = (("share", _SHARES), ("pause", _PAUSES), ("wn", _LAGS), ("push", _SHARES))  # one of them each time
-_DOUBT = 20.0  # cost of a share e times the allowed one, as the sum of so many metres missed [m]
+_LEAST_S = 2.0  # minimum track before a rollout [s]
+_BACK_S = 60.0  # compared flight [s]
+_EVERY_S, _OVER_S = 4.0, 10.0  # interval of starts, length of a rollout [s]
+_LAGS = (0.7, 1.0, 1.4, 2.0, 2.8)  # tried natural frequencies [rad/s]
+_SHARES = (0.6, 0.8, 0.9, 1.0, 1.1, 1.25)  # tried fractions of the limits
+_PAUSES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)  # tried delays at each stop [s]
+_TRIED = (("share", _SHARES), ("pause", _PAUSES), ("wn", _LAGS), ("push", _SHARES))  # one per call
+_DOUBT = 20.0  # cost of a fraction e times the limit, as a sum of errors [m]
 
 
 def compare(track: Track, seq: np.ndarray, board: Onboard, rotor: Rotor) -> Rotor:
-    """Fly the twin over the last minute from many starts, and keep what strays least: lag, speed, acceleration."""
+    """Fit lag, speed, acceleration and stop delay to the last minute by the rollout error from many starts."""
     rotor = _blown(track, board, rotor)
     starts = _starts(track, seq, board)
     if len(starts) < 3:
@@ -47,7 +47,7 @@ def compare(track: Track, seq: np.ndarray, board: Onboard, rotor: Rotor) -> Roto
 
 
 def _starts(track: Track, seq: np.ndarray, board: Onboard) -> list[int]:
-    """Choose rows to start from: on this route, moving, with ten seconds of flight after them."""
+    """Return the start rows: on this route, moving, with ten seconds of flight after them."""
     over, every = int(_OVER_S / STEP), int(_EVERY_S / STEP)
     first = max(int(np.searchsorted(track.t, board.since + _LEAST_S)), len(track) - int(_BACK_S / STEP), 20)
     rows = range(len(track) - 1 - over, first, -every)
@@ -68,14 +68,14 @@ def _strays(track: Track, k: int, laid: np.ndarray, seq: int, way: Way) -> float
 
 
 def _blown(track: Track, board: Onboard, rotor: Rotor) -> Rotor:
-    """See drag and wind in the tilt: thrust's pull minus acceleration is k (v - w), linear in k and k w."""
+    """Fit drag and wind to the tilt: horizontal thrust minus acceleration is k (v - w), linear in k and k w."""
     rows = np.arange(len(track) - 1, max(len(track) - int(_BACK_S / STEP), 10), -5)
     rows = rows[track.ok[rows] & np.isfinite(track.euler[rows]).all(axis=1)]
     if len(rows) < 40:
         return rotor
     euler = track.euler[rows]
     cf, sf, ct, st, cp, sp = (g(euler[:, i]) for i in range(3) for g in (np.cos, np.sin))
-    down = np.column_stack([cf * st * cp + sf * sp, cf * st * sp - sf * cp, cf * ct])  # z of the body in NED
+    down = np.column_stack([cf * st * cp + sf * sp, cf * st * sp - sf * cp, cf * ct])  # body z axis in NED
     slope = (track.v[rows] - track.v[rows - 10]) / (10 * STEP)
     thrust = (G - slope[:, 2]) / np.maximum(down[:, 2], 0.5)
     v = track.v[rows, :2] - 0.5 * STEP * 10 * slope[:, :2]

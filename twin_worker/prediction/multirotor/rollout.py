@@ -1,6 +1,6 @@
-"""The twin of what hovers: it follows the route as fast as its autopilot lets it, behind a lag seen in flight.
+"""Kinematic model of hovering aircraft: follow the route at the limits of the autopilot, with an identified lag.
 
-Its few numbers come from its own flight, see `rotor_fit`.
+The parameters are identified from flight, see `multirotor.fit`.
 Source: ArduCopter and PX4 limits as in `fleet.autopilots.copter`.
 """
 
@@ -21,25 +21,25 @@ from twin_worker.telemetry.track import STEP, Track
 HOLD_MODES = ("LOITER", "POSHOLD", "BRAKE", "AUTO.LOITER", "QLOITER", "HOLD", "POSCTL")
 RETURN_MODES = ("RTL", "AUTO.RTL", "SMART_RTL")
 _ZETA = 0.9
-_TRANSITION = 4.0  # acceleration of a quadplane between hovering and flying [m/s2]
-_TOLD_S = 15.0  # an item that was reported is in force for so long [s]
-_STILL = 0.8  # slower than this it waits [m/s]
+_TRANSITION = 4.0  # acceleration of a quadplane in transition [m/s2]
+_TOLD_S = 15.0  # maximum age of a reported item [s]
+_STILL = 0.8  # stationary below this speed [m/s]
 
 
 @dataclass(frozen=True)
 class Rotor:
-    """What flight has told of a multirotor.
+    """Identified multirotor model.
 
     Attributes:
-        wn: natural frequency of its lag [rad/s]
-        share: made of the allowed speed [-]
-        push: made of the allowed acceleration [-]
-        pause: time lost at each stop beyond the wait that the mission asks for [s]
-        v_air: airspeed at its largest tilt; nan: not seen [m/s]
-        wind: NED, where it blows to, (2,) [m/s]
-        miss: mean miss over 10 s of past flight [m]; nan before any
-        starts: how many flights that is
-        turn: comparisons so far
+        wn: natural frequency of the lag [rad/s]
+        speed_fraction: flown over allowed speed [-]
+        accel_fraction: flown over allowed acceleration [-]
+        stop_delay_s: delay at each stop in addition to the wait of the mission [s]
+        max_tilt_airspeed: airspeed at the largest tilt; nan if unknown [m/s]
+        wind: NED, the direction it blows to, (2,) [m/s]
+        mean_error: mean error over 10 s of past flight [m]; nan before the first fit
+        n_starts: number of rollouts in that mean
+        n_comparisons: number of fits so far
     """
 
     wn: float = 2.0
@@ -55,20 +55,20 @@ class Rotor:
     def __str__(self) -> str:
         if not self.starts:
             return "not yet compared with flight"
-        return f"lag {self.wn:.1f} rad/s, {self.share:.0%} of the allowed speed, strays {self.miss:.1f} m in 10 s"
+        return f"lag {self.wn:.1f} rad/s, {self.share:.0%} of the speed limit, mean error {self.miss:.1f} m over 10 s"
 
 
 @dataclass(frozen=True)
 class Onboard:
-    """What is known of a multirotor's autopilot.
+    """Route and parameters of a multirotor's autopilot.
 
     Attributes:
         items: mission, item 0 is home
-        shift: what was added to every item's number for that
+        seq_offset: offset added to every item number, so that item 0 is home
         params: parameters
-        limit: what they allow
-        absent: limits that none of them gives
-        since: when route, mode and parameters last changed [s since 1970]
+        limit: limits from the parameters
+        absent: limits without a received parameter
+        changed_t: last change of route, mode or parameters [s since 1970]
     """
 
     items: tuple[Item, ...]
@@ -81,13 +81,13 @@ class Onboard:
 
 
 def onboard(mission: Mission | None, params: dict[str, float], autopilot: str, since: float, **more) -> Onboard:
-    """Read what a multirotor's autopilot has on board.
+    """Return the configuration of a multirotor's autopilot.
 
     Args:
         mission, params: as received
         autopilot: as `Status.autopilot`
-        since: when they last changed [s since 1970]
-        more: origin of the twin's frame, track flown so far, prefix of the parameters
+        since: last change of mission or parameters [s since 1970]
+        options: `origin` of the twin's frame, `flown` track, `prefix` of the parameters
     """
     origin, flown, prefix = more["origin"], more["flown"], more.get("prefix", "")
     items = mission.items if mission else ()
@@ -100,7 +100,7 @@ def onboard(mission: Mission | None, params: dict[str, float], autopilot: str, s
 
 
 def _usual_speed(flown: Track, otherwise: float) -> float:
-    """Return the speed it cruises at, where no parameter tells: nine tenths of the time it was no faster."""
+    """Return the cruise speed from flight, the 90 % quantile of the ground speed."""
     level = np.hypot(*flown.v[flown.ok, :2].T)
     moving = level[level > 1.5]
     return float(np.quantile(moving, 0.9)) if len(moving) > 5.0 / STEP else otherwise
@@ -109,16 +109,16 @@ def _usual_speed(flown: Track, otherwise: float) -> float:
 def fly_route(
     track: Track, seq: np.ndarray, board: Onboard, rotor: Rotor, ahead: np.ndarray
 ) -> tuple[np.ndarray | None, str]:
-    """Fly the mission ahead from the end of the track; None where there is nothing to fly. Say what is wrong with it.
+    """Predict the mission from the end of the track; return path or None, and the problems of the mission.
 
     Args:
         track: newest flight
-        seq: mission item in force at each of its rows, nan unknown
-        board, rotor: what is known of autopilot and aircraft
-        ahead: wanted look-ahead times, (k,) [s]
+        seq: current mission item of each row, nan if unknown
+        config, model: configuration of the autopilot, and the identified model
+        ahead: requested look-ahead times, (k,) [s]
     """
     if not isfinite(seq[-1]):
-        return None, "the mission item in force is not reported (MISSION_CURRENT)"
+        return None, "the current mission item is not reported (MISSION_CURRENT)"
     at = int(seq[-1]) + board.shift
     laid, wrong = lay(board.items, at, board.origin, track.p[-1], board.params)
     if not len(laid):
@@ -127,13 +127,13 @@ def fly_route(
 
 
 def fly_home(track: Track, board: Onboard, rotor: Rotor, ahead: np.ndarray) -> np.ndarray | None:
-    """Return to launch from the end of the track; None where home is not known."""
+    """Predict a return to launch from the end of the track; None if home is unknown."""
     laid = home_again(board.items, board.origin, track.p[-1], board.params)
     return fly_segments(track, laid, -1, Way(board, rotor), ahead) if len(laid) else None
 
 
 def hold_still(track: Track, board: Onboard, rotor: Rotor, ahead: np.ndarray) -> np.ndarray:
-    """Come to a stop and stay there."""
+    """Predict a stop and hold."""
     p, v = track.p[-1], track.v[-3:].mean(axis=0)
     if np.linalg.norm(v) < 0.5:
         p = track.p[-15:].mean(axis=0)
@@ -142,25 +142,25 @@ def hold_still(track: Track, board: Onboard, rotor: Rotor, ahead: np.ndarray) ->
 
 @dataclass(frozen=True)
 class Way:
-    """Autopilot and aircraft together."""
+    """Autopilot configuration and multirotor model."""
 
     board: Onboard
     rotor: Rotor
 
     @property
     def limit(self) -> Limits:
-        """Return the limits as the aircraft makes them."""
+        """Return the limits scaled by the identified fractions."""
         limit, share, push = self.board.limit, self.rotor.share, self.rotor.push
         return limit._replace(speed=limit.speed * share, acc=limit.acc * push, acc_corner=limit.acc_corner * push)
 
     @property
     def par(self) -> np.ndarray:
-        """Return what the kernel is told besides the segments."""
+        """Return the parameters of the kernel."""
         return np.array([self.board.limit.jerk, self.rotor.wn, _ZETA, self.rotor.v_air, *self.rotor.wind])
 
 
 def fly_segments(track: Track, laid: np.ndarray, seq: int, way: Way, ahead: np.ndarray) -> np.ndarray:
-    """Fly laid segments ahead from the end of the track with item `seq` in force; return the path, (k, 3) [m]."""
+    """Simulate route segments from the end of the track with current item `seq`; return the path, (k, 3) [m]."""
     segments = paced(laid, way.limit)
     stops = (segments[:, copter.HOLD] > 0) & np.isfinite(segments[:, copter.HOLD])
     segments[stops, copter.HOLD] += way.rotor.pause
@@ -173,7 +173,7 @@ def fly_segments(track: Track, laid: np.ndarray, seq: int, way: Way, ahead: np.n
 
 
 def _begin(track: Track, segments: np.ndarray, seq: int, wn: float) -> np.ndarray:
-    """Put the reference where the aircraft is: on the nearest segment of the item in force, at its speed."""
+    """Return the reference state on the nearest segment of the current item, at the speed of the aircraft."""
     p, v = track.p[-1], track.v[-3:].mean(axis=0)
     a, b = segments[:, copter.A_N : copter.A_N + 3], segments[:, copter.B_N : copter.B_N + 3]
     way = b - a
@@ -183,7 +183,7 @@ def _begin(track: Track, segments: np.ndarray, seq: int, wn: float) -> np.ndarra
     off = np.linalg.norm(a + t * s[:, None] - p, axis=1)
     off[segments[:, copter.SEQ] != seq] += 1e6
     k = int(np.argmin(off))
-    if off[k] % 1e6 > 2.0 and length[k] > 2.0:  # not on its line: it flies to the end from where it is
+    if off[k] % 1e6 > 2.0 and length[k] > 2.0:  # off the line: fly directly to its end
         segments[k, copter.A_N : copter.A_N + 3] = p
         way = b[k] - p
         length[k], s[k] = float(np.linalg.norm(way)), 0.0
@@ -201,14 +201,14 @@ def _begin(track: Track, segments: np.ndarray, seq: int, wn: float) -> np.ndarra
 
 
 def _waited(track: Track, b: np.ndarray) -> float:
-    """Tell for how long it has stood at `b` [s]."""
+    """Return how long the aircraft has been stationary at `b` [s]."""
     moving = (np.linalg.norm(track.v, axis=1) > _STILL) | (np.linalg.norm(track.p - b, axis=1) > 3.0)
     last = np.flatnonzero(moving)
     return STEP * (len(track) - 1 - (int(last[-1]) if len(last) else -1))
 
 
 def items_in_force(t: np.ndarray, leg: tuple[np.ndarray, np.ndarray], mission: Mission | None) -> np.ndarray:
-    """Return mission item in force at times `t`, nan unknown, (n,): as reported, else as it came with the mission."""
+    """Return the current mission item at times `t`, (n,): reported, else from the mission; nan if unknown."""
     seq = held(*leg, t, _TOLD_S)[:, 0]
     if mission is not None and mission.seq >= 0:
         seq = np.where(np.isfinite(seq), seq, float(mission.seq))
@@ -216,7 +216,7 @@ def items_in_force(t: np.ndarray, leg: tuple[np.ndarray, np.ndarray], mission: M
 
 
 def item_in_force(now: float, leg: tuple[np.ndarray, np.ndarray], mission: Mission | None) -> float:
-    """Return the same at one time."""
+    """Return the current mission item at one time, as `items_in_force`."""
     t, seq = leg
     k = int(t.searchsorted(now, side="right")) - 1
     if k >= 0 and not now - t[k] > _TOLD_S:
@@ -225,13 +225,13 @@ def item_in_force(now: float, leg: tuple[np.ndarray, np.ndarray], mission: Missi
 
 
 def said(board: Onboard, rotor: Rotor) -> str:
-    """Say what the flight ahead rests on."""
+    """Describe the model and its missing limits."""
     absent = f"; {len(board.absent)} limits not received ({', '.join(board.absent[:3])} …)" if board.absent else ""
     return f"route flown by a kinematic twin: {rotor}{absent}"
 
 
 def with_wings(board: Onboard) -> Onboard:
-    """Let a quadplane fly what lies between take-off and landing at the speed of its wings."""
+    """Set the limits of a quadplane to fixed-wing flight between take-off and landing."""
     given = [board.params[name] for name in ("AIRSPEED_CRUISE", "TRIM_ARSPD_CM") if name in board.params]
     speed = next((v * (0.01 if v > 300 else 1.0) for v in given if isfinite(v) and v > 0), board.limit.speed)
     radius = board.params.get("WP_RADIUS", 60.0)

@@ -1,4 +1,4 @@
-"""A multirotor's route as straight segments: what take-off, circles, landing and return come to."""
+"""Multirotor route as straight segments, with take-off, circles, landing and return."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ from fleet.autopilots.copter import Limits
 from fleet.contract import Item
 from fleet.frames import Origin
 
-STOP = 1e-3  # a wait that only means: stop there [s]
+STOP = 1e-3  # minimal wait that marks a stop [s]
 _NUDGE_E7 = 108  # 1.2 m north [1e-7 deg]
-_LEGS = 24  # most legs unrolled
-_ROWS = 90  # most segments
+_LEGS = 24  # maximum legs of the route
+_ROWS = 90  # maximum segments
 _CORNERS = 12  # segments of one circle
 _LOW_M = 10.0  # height below which a landing is slow [m]
 _RETURN, _JUMP = 20, 177  # MAV_CMD
@@ -26,13 +26,13 @@ _CIRCLE_M, _CIRCLE_RATE = 10.0, 20.0  # ArduCopter's default CIRCLE_RADIUS and C
 
 @dataclass
 class _Laid:
-    """Segments laid so far, and where they end."""
+    """Builder of route segments."""
 
     at: np.ndarray  # (3,) NED [m]
     rows: list[np.ndarray]
 
     def to(self, b: np.ndarray, seq: float, hold: float = 0.0, speed: float = 0.0) -> None:
-        """Lay a segment to `b`; one without length is laid only to wait there."""
+        """Add a segment to `b`; skip a segment of zero length without a wait."""
         if np.linalg.norm(b - self.at) < 0.3 and not hold:
             return
         row = np.zeros(copter.N_SEGMENT)
@@ -43,7 +43,7 @@ class _Laid:
 
 
 def numbered_from_one(items: Sequence[Item], home: Origin) -> tuple[Item, ...]:
-    """Put home before a mission that has none (PX4), as ArduPilot does: every number is one more."""
+    """Insert home as item 0 of a PX4 mission, as ArduPilot does; increment every item number."""
     first = Item(seq=0, command=16, frame=0, lat_e7=home.lat_e7, lon_e7=home.lon_e7, alt_m=home.alt_mm * 1e-3)
     moved = [
         msgspec.structs.replace(i, seq=i.seq + 1, param1=i.param1 + (i.command == _JUMP)) for i in items if i.seq >= 0
@@ -54,39 +54,40 @@ def numbered_from_one(items: Sequence[Item], home: Origin) -> tuple[Item, ...]:
 def lay(
     items: Sequence[Item], seq: int, origin: Origin, p: np.ndarray, params: Mapping[str, float]
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Lay the route from item `seq` on as segments whose speed is only the commanded one, 0 for none.
+    """Convert the route from item `seq` on to segments with the commanded speed, 0 if there is none.
 
     Args:
         items: mission, item 0 is home
-        seq: item in force
-        origin: of the twin's NED frame
-        p: where the aircraft is, NED, (3,) [m]
+        seq: current item
+        origin: origin of the twin's NED frame
+        p: position of the aircraft, NED, (3,) [m]
         params: autopilot parameters
     Returns:
-        segments (n, N_SEGMENT), and what was wrong with the mission
+        segments (n, N_SEGMENT), and the problems of the mission
     """
     way = m.route(_apart(items), seq=seq, origin=origin, params=params, limit=_LEGS)
     if len(way.legs) and int(way.legs[0, m.KIND]) == m.LAND and np.isfinite(way.start).all():
-        way.start[2] = p[2]  # it comes in at the height it has
+        way.start[2] = p[2]  # approach at the present height
     waits = {item.seq: item.param1 for item in items if item.command in (16, 82) and 0 < item.param1 < 1e5}
     returns = {item.seq for item in items if item.command == _RETURN}
     laid = _Laid(way.start if np.isfinite(way.start).all() else np.array(p, float), [])
     home = _home(items, origin)
     for leg in way.legs:
         if leg[m.SEQ] < 0 or len(laid.rows) > _ROWS:
-            break  # after its last item a multirotor stays where it is
+            break  # a multirotor holds position after the last item
         if int(leg[m.SEQ]) in returns:
             _go_home(laid, home, params, leg[m.SEQ])
         else:
             _lay_leg(laid, leg, waits.get(int(leg[m.SEQ]), 0.0), home[2], params)
     if laid.rows:
         laid.rows[-1][copter.HOLD] = inf
-    said = tuple(s for s in way.sentences if "ground speed" not in s)  # a multirotor's speeds are over ground
+    # multirotor speeds are ground speeds
+    said = tuple(s for s in way.sentences if "ground speed" not in s)
     return np.array(laid.rows).reshape(-1, copter.N_SEGMENT), said
 
 
 def _apart(items: Sequence[Item]) -> list[Item]:
-    """Move a waypoint right above the one before it a little: on wings it is no leg, on rotors it is."""
+    """Offset a waypoint directly above the previous one: a leg for a multirotor, none for a fixed wing."""
     out: list[Item] = []
     for item in sorted(items, key=lambda i: i.seq):
         last = out[-1] if out else None
@@ -102,7 +103,7 @@ def _home(items: Sequence[Item], origin: Origin) -> np.ndarray:
         [*(i for i in items if i.seq == 0), Item(seq=1, command=_RETURN)], seq=1, origin=origin, params={"RTL_ALT": 0}
     )
     home = way.legs[0, m.P_N : m.P_D + 1].copy() if len(way.legs) else np.zeros(3)
-    home[2] += 100.0  # the route's return is 100 m above home
+    home[2] += 100.0  # `fleet.mission.route` returns 100 m above home
     return home
 
 
@@ -112,7 +113,7 @@ def _lay_leg(laid: _Laid, leg: np.ndarray, wait: float, ground: float, params: M
         laid.to(np.array([*laid.at[:2], b[2]]), seq, STOP)
     elif kind == m.LAND:
         laid.to(np.array([*b[:2], laid.at[2]]), seq, STOP, leg[m.VA_C])
-        if laid.rows:  # a quadplane brakes for it more gently than it sets off
+        if laid.rows:  # the quadplane decelerates more gently than it accelerates
             laid.rows[-1][copter.ACC] = max(params.get("Q_TRANS_DECEL", 0.0), 0.0)
         _down(laid, ground, seq)
     elif kind == m.LOITER_TURNS:
@@ -123,7 +124,7 @@ def _lay_leg(laid: _Laid, leg: np.ndarray, wait: float, ground: float, params: M
 
 
 def _down(laid: _Laid, ground: float, seq: float) -> None:
-    """Sink to the ground, the last ten metres slowly."""
+    """Add a descent to the ground, the last ten metres at landing speed."""
     if laid.at[2] < ground - _LOW_M:
         laid.to(np.array([*laid.at[:2], ground - _LOW_M]), seq)
     laid.to(np.array([*laid.at[:2], ground]), seq, inf, -1.0)  # -1: landing speed
@@ -140,7 +141,7 @@ def _go_home(laid: _Laid, home: np.ndarray, params: Mapping[str, float], seq: fl
 
 
 def _circle(laid: _Laid, leg: np.ndarray, params: Mapping[str, float]) -> None:
-    """Lay a circle as a polygon, from where it is reached; ArduCopter's CIRCLE_RATE gives its speed."""
+    """Add a circle as a polygon from its entry point; the speed is from ArduCopter's CIRCLE_RATE."""
     b, turns = leg[m.P_N : m.P_D + 1], min(max(leg[m.TURNS], 1.0), 20.0)
     radius = leg[m.RADIUS] or params.get("CIRCLE_RADIUS_M", params.get("CIRCLE_RADIUS", 100 * _CIRCLE_M) * 0.01)
     d, wide = (1.0 if radius >= 0 else -1.0), min(max(abs(radius), 1.0), 1e4)
@@ -153,7 +154,7 @@ def _circle(laid: _Laid, leg: np.ndarray, params: Mapping[str, float]) -> None:
 
 
 def home_again(items: Sequence[Item], origin: Origin, p: np.ndarray, params: Mapping[str, float]) -> np.ndarray:
-    """Lay the way of a return to launch from `p`, NED (3,) [m]; empty where home is not known."""
+    """Return the segments of a return to launch from `p`, NED (3,) [m]; empty if home is unknown."""
     laid = _Laid(np.array(p, float), [])
     if any(item.seq == 0 for item in items):
         _go_home(laid, _home(items, origin), params, -1.0)
@@ -161,7 +162,7 @@ def home_again(items: Sequence[Item], origin: Origin, p: np.ndarray, params: Map
 
 
 def stop_from(p: np.ndarray, v: np.ndarray, limit: Limits) -> np.ndarray:
-    """Lay the way of a multirotor told to hold: straight on until it stands."""
+    """Return the segment of a hold command: straight ahead until stationary."""
     speed = float(np.linalg.norm(v))
     way = speed * speed / (2 * limit.acc) + speed * limit.acc / (2 * limit.jerk) if speed > 0.5 else 0.0
     laid = _Laid(np.array(p, float), [])
@@ -170,7 +171,7 @@ def stop_from(p: np.ndarray, v: np.ndarray, limit: Limits) -> np.ndarray:
 
 
 def paced(laid: np.ndarray, limit: Limits) -> np.ndarray:
-    """Return the segments with the limits on them: speed, acceleration, speed at each end."""
+    """Apply the limits to the segments: speed, acceleration and end speed of each."""
     out = laid.copy()
     way = out[:, copter.B_N : copter.B_N + 3] - out[:, copter.A_N : copter.A_N + 3]
     length = np.linalg.norm(way, axis=1)
