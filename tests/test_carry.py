@@ -142,7 +142,7 @@ def test_a_published_model_flies_at_once_and_about_as_well(twin: Twin, cold: Twi
 
 def test_the_last_prediction_of_another_is_said_to_be_that_and_trusted_less(twin: Twin) -> None:
     fresh, last = Twin(1), twin.prediction
-    assert go_on(fresh, last) and fresh.base is not None and fresh.base.sentence.endswith("continued from another worker")
+    assert go_on(fresh, last) and fresh.base is not None and fresh.base.sentence.endswith("from another worker")
     before, after = last.tube.numpy(), fresh.base.tube.numpy()
     assert (after >= before).all() and (after[0] > before[0]).any()
     assert fresh.base.horizon_s == max(last.horizon_s - fresh.pace.predict, 0.0)
