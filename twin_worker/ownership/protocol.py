@@ -266,7 +266,7 @@ class Claiming:
         return False
 
     def _ask(self, wanted: dict[str, list[int]]) -> list[int]:
-        """Request snapshots from all owners at the same time; return the aircraft whose owner does not respond."""
+        """Request snapshots from all owners at once; return the aircraft whose owner does not respond in time."""
         now, uavs = time.monotonic(), {uav for mine in wanted.values() for uav in mine}
         with self._lock:
             self._asked_for = {uav: self._asked_for.get(uav, now) for uav in uavs}

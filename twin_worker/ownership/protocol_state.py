@@ -75,7 +75,7 @@ class Claims:
         self._ticked = float("nan")
         self._weighed: tuple[object, dict[int, str]] = ((), {})  # inputs of the last assignment, and its result
 
-    # --- what is heard -----------------------------------------------------------------------------------------------
+    # --- reception ---------------------------------------------------------------------------------------------------
 
     def appeared(self, worker: str, ids: range, incarnation: int) -> None:
         """Add a worker with a token."""
@@ -148,7 +148,7 @@ class Claims:
             self.seen = {uav: rank for uav, rank in self.seen.items() if rank.epoch <= latest_ms}
         return {uav: self.take(uav, wall_ms) for uav in [uav for uav in self.held if uav not in self.seen]}
 
-    # --- what to do --------------------------------------------------------------------------------------------------
+    # --- decisions ---------------------------------------------------------------------------------------------------
 
     def plan(self, now: float) -> Plan:
         """Return the aircraft this worker should own and does not."""

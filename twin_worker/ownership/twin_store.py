@@ -83,7 +83,7 @@ class Twins:
         self._said: dict[int, dict[type, Message]] = {}  # from gateways, of aircraft owned by others
         self._fence = Fence()
 
-    # --- what is heard -----------------------------------------------------------------------------------------------
+    # --- reception ---------------------------------------------------------------------------------------------------
 
     def hear(self, message: Message) -> bool:
         """Queue a message for its twin; return whether there is one."""
@@ -114,7 +114,7 @@ class Twins:
         with self.lock:
             return [held for _, held in sorted(self.held.items()) if held.ready]
 
-    # --- how they come -----------------------------------------------------------------------------------------------
+    # --- acquisition -------------------------------------------------------------------------------------------------
 
     def expect(self, uavs: Iterable[int]) -> None:
         """Queue messages of these aircraft before their twins arrive."""
@@ -215,7 +215,7 @@ class Twins:
             if held.arrived != held.arrived and twin.history.newest > 0:
                 held.arrived = time.monotonic()
 
-    # --- how they go -------------------------------------------------------------------------------------------------
+    # --- release -----------------------------------------------------------------------------------------------------
 
     def drop(self, uavs: Iterable[int]) -> None:
         """Release these aircraft."""

@@ -89,35 +89,35 @@ class Twin:
     ledger: Ledger = field(default_factory=Ledger)
     rotor: Rotor = field(default_factory=Rotor)
     grey: Grey = field(default_factory=Grey)
-    modes: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=_MODES))  # changes, (when, name)
+    modes: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=_MODES))  # mode changes, (time, name)
     origin: Origin | None = None
     status: Status | None = None
     mission: Mission | None = None
     params: Params | None = None
     servos: ServoMap = field(default_factory=lambda: servo_map({}))
-    learnt: Learnt = field(default_factory=Learnt)  # of the autopilot, from flight
-    instead: Instead | None = None  # what a copy of this twin flies to answer a what-if
-    plant: Plant | None = None  # the model in force
-    near: Coupled | None = None  # newest coupled model, believed or not: the next search begins there
-    last: Coupled | None = None  # newest coupled model believed: it holds the parameters of the next
-    hybrid: Hybrid | None = None  # identified and believed
-    near_hybrid: Hybrid | None = None  # identified last, believed or not
-    strays: float = float("nan")  # how far it strays over 20 s held out, over the way [-]
+    learnt: Learnt = field(default_factory=Learnt)  # controller parameters identified from flight
+    instead: Instead | None = None  # route override for a what-if; only on copies
+    plant: Plant | None = None  # active model
+    near: Coupled | None = None  # newest derivatives model, verified or not: initial value of the next estimation
+    last: Coupled | None = None  # newest verified derivatives model: prior of the next estimation
+    hybrid: Hybrid | None = None  # active point-mass model
+    near_hybrid: Hybrid | None = None  # newest point-mass model, active or not
+    strays: float = float("nan")  # point-mass error at the end of a 20 s hold-out, over path length [-]
     contest: Contest = field(default_factory=Contest)
-    spread: np.ndarray | None = None  # of the newest ensemble, along, cross, vertical, (k, 3) [m]
+    spread: np.ndarray | None = None  # spread of the newest ensemble: along, cross, vertical, (k, 3) [m]
     earned: Earned = field(default_factory=Earned)
     marks: deque[Mark] = field(default_factory=lambda: deque(maxlen=MOST))  # of the last minutes
-    extended: Extension | None = None  # what a diagnosis has put into the models in force
-    learn_from: float = -np.inf  # nothing is learnt from telemetry before [s since 1970]
+    extended: Extension | None = None  # diagnosed effects added to the active models
+    learn_from: float = -np.inf  # start of the data used for identification [s since 1970]
     verdict: Verdict = field(default_factory=_unheard)
     pool: list[Believed] = field(default_factory=list)
-    in_force: Verdict | None = None  # the verdict `plant` was believed on
+    in_force: Verdict | None = None  # verdict of the active model
     model: Model | None = None
     prediction: Prediction | None = None
-    base: Prediction | None = None  # the newest that was flown ahead
+    base: Prediction | None = None  # newest rollout
     pace: Pace = field(default_factory=Pace)
-    quota: Quota | None = None  # of the driver, where there is one
-    control: Control | None = None  # the controller twin that flew it
+    quota: Quota | None = None  # set by the driver; None: unlimited
+    control: Control | None = None  # controller model of the newest prediction
     control_t: float = -np.inf  # and when that was last told
     state: State = State.WAITING
     tries: int = 0
@@ -129,24 +129,24 @@ class Twin:
     turned_t: float = -np.inf  # data time of the last turn of the loop
     wind_t: float = -np.inf
     identify_t: float = -np.inf
-    afresh_t: float = -np.inf  # last identified without a model to begin at
+    afresh_t: float = -np.inf  # last identification without a warm start
     predict_t: float = -np.inf
     renew_t: float = -np.inf
     score_t: float = -np.inf
-    flown_t: float = -np.inf  # models last flown in closed loop
-    told_t: float = -np.inf  # model last published
-    hybrid_t: float = -np.inf  # hybrid last identified
-    checked_t: float = -np.inf  # hybrid last flown over what was held out
-    spread_t: float = -np.inf  # ensemble last flown
-    put_off: float | None = None  # when an ensemble was due that others were preferred to [s since 1970]
-    achievable_t: float = -np.inf  # mission last judged
-    turning_t: float = np.inf  # since when predictions are a turn rate alone
-    stood: Origin | None = None  # where it last stood disarmed
-    peak: float = -np.inf  # greatest height above home since it was disarmed [m]
-    lost: bool = False  # nothing is heard
-    back_t: float = -np.inf  # link last back
-    broken: bool = False  # much is heard, but no positions
-    over: bool = False  # it has coasted up to its horizon
+    flown_t: float = -np.inf  # last closed-loop run of the models
+    told_t: float = -np.inf  # last published model
+    hybrid_t: float = -np.inf  # last point-mass identification
+    checked_t: float = -np.inf  # last hold-out check of the point-mass model
+    spread_t: float = -np.inf  # last ensemble
+    put_off: float | None = None  # due time of a deferred ensemble [s since 1970]
+    achievable_t: float = -np.inf  # last feasibility check of the mission
+    turning_t: float = np.inf  # start of the predictions by turn rate alone
+    stood: Origin | None = None  # last position at rest and disarmed
+    peak: float = -np.inf  # maximum height above home since disarmed [m]
+    lost: bool = False  # link lost
+    back_t: float = -np.inf  # last link recovery
+    broken: bool = False  # telemetry without positions
+    over: bool = False  # coasting has exceeded the confidence horizon
     bad: int = 0
 
     def may(self, work: Work) -> bool:
