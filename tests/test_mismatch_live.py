@@ -117,7 +117,9 @@ def test_what_is_seen_once_says_so_and_where():
     unknown = made(outcome=Outcome.UNKNOWN)
     first = answered(watch, 1200.0, unknown)
     assert first.outcome is Found.SUSPECTED and first.causes[0].channel == "pitch"
-    assert first.sentence.startswith("detected once, not confirmed: a mismatch no effect") and word(first) == "suspected"
+    assert (
+        first.sentence.startswith("detected once, not confirmed: a mismatch no effect") and word(first) == "suspected"
+    )
     assert answered(watch, 1210.0, unknown).outcome is Found.UNKNOWN
 
 
@@ -250,7 +252,9 @@ def test_a_defect_met_by_one_aircraft_leaves_the_diagnosis_of_the_others(looking
     assert list(live.turn(held)) == []
     assert [job.uav for job in hand.jobs] == [2]
     (said,) = live.failed([1, 2])
-    assert said.startswith("uav-1: diagnosis failed with an internal error (AttributeError") and "retried in 60 s" in said
+    assert (
+        said.startswith("uav-1: diagnosis failed with an internal error (AttributeError") and "retried in 60 s" in said
+    )
 
 
 def test_a_defect_in_taking_an_answer_is_that_aircrafts_alone_and_passes(looking, monkeypatch):

@@ -241,8 +241,9 @@ class Worker:
                 self._publish(found, held[found.uav])
             self._undiagnosed = ""
         except Exception as error:  # an error in the diagnosis must not stop the predictions
-            retry = f"retried in {_OFF_S:.0f} s, report it"
-            self._undiagnosed = f"diagnosis failed with an internal error ({error}); {retry}"
+            self._undiagnosed = (
+                f"diagnosis failed with an internal error ({error}); retried in {_OFF_S:.0f} s, report it"
+            )
             self._diagnose_from = time.monotonic() + _OFF_S
             _log.exception(self._undiagnosed)
 
