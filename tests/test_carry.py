@@ -54,16 +54,16 @@ def test_a_twin_is_a_few_megabytes_at_most(twin: Twin) -> None:
 
 
 def test_another_aircraft_s_twin_is_refused(twin: Twin) -> None:
-    with pytest.raises(ValueError, match=r"uav-2: found another thing carried, expected its twin; it is taken over c"):
+    with pytest.raises(ValueError, match=r"uav-2: found another object, expected its twin; it starts without"):
         unpacked(packed(Load(twin)), 2)
-    with pytest.raises(ValueError, match="found another thing"):
+    with pytest.raises(ValueError, match="found another object"):
         unpacked(pack([1, 2], CARRIED), 1)
 
 
 def test_telemetry_of_other_columns_is_refused(twin: Twin) -> None:
     narrow = copy.deepcopy(twin)
     narrow.history.put("velocity", np.array([1e9]), np.zeros((1, 2)))
-    with pytest.raises(ValueError, match="uav-1: found telemetry of other columns, expected ours; it is taken over"):
+    with pytest.raises(ValueError, match="uav-1: found other telemetry columns, expected ours; it starts without"):
         unpacked(packed(Load(narrow)), 1)
 
 
@@ -115,7 +115,7 @@ def test_random_bytes_are_refused_or_harmless(data: bytes) -> None:
 
 
 def test_what_nobody_named_is_not_carried() -> None:
-    with pytest.raises(TypeError, match=r"complex: is not carried; name it"):
+    with pytest.raises(TypeError, match=r"complex: is not serialisable; add it"):
         pack([1j], CARRIED)
 
 
@@ -142,7 +142,7 @@ def test_a_published_model_flies_at_once_and_about_as_well(twin: Twin, cold: Twi
 
 def test_the_last_prediction_of_another_is_said_to_be_that_and_trusted_less(twin: Twin) -> None:
     fresh, last = Twin(1), twin.prediction
-    assert go_on(fresh, last) and fresh.base is not None and fresh.base.sentence.endswith("another worker, renewed")
+    assert go_on(fresh, last) and fresh.base is not None and fresh.base.sentence.endswith("from another worker")
     before, after = last.tube.numpy(), fresh.base.tube.numpy()
     assert (after >= before).all() and (after[0] > before[0]).any()
     assert fresh.base.horizon_s == max(last.horizon_s - fresh.pace.predict, 0.0)

@@ -202,7 +202,7 @@ def test_a_flight_of_another_autopilot_is_predicted_on_its_own_mission(router: s
         return p.state is State.PREDICTING and p.method in ("dynamics", "hybrid", "both")
 
     with connect(router) as bus, process("twin_worker", "--uavs", f"{uav}-{uav + 99}", "--router", router) as worker:
-        wait(lambda: "may hold" in worker.stdout.readline(), worker)
+        wait(lambda: "serves UAV ids" in worker.stdout.readline(), worker)
         bus.subscribe(Prediction, lambda message, _: predicted.append(message))
         bus.subscribe(Model, lambda message, _: models.append(message))
         link = f"replay:{flight}?speed=30"

@@ -38,10 +38,10 @@ def test_an_undisturbed_flight_tells_only_its_mission(flown):
 def test_mode_mission_and_parameters_void_it_at_once(twin):
     now = twin.history.newest
     (made,) = predictions(drive(twin, [status(twin, mode="LOITER")]))
-    assert (made.event, made.event_t) == (Event.MODE, now) and "LOITER, before AUTO" in made.event_said
+    assert (made.event, made.event_t) == (Event.MODE, now) and "LOITER, previously AUTO" in made.event_said
     other = Mission(uav=1, t=now + 0.1, items=(item(0), item(1, north=900.0)), complete=True)
     (made,) = predictions(drive(twin, [other]))
-    assert made.event is Event.MISSION and "(2 items, before 14)" in made.event_said
+    assert made.event is Event.MISSION and "(2 items, previously 14)" in made.event_said
     more = msgspec.structs.replace(twin.params, t=now + 0.2, values=twin.params.values | {"NAVL1_PERIOD": 31.0})
     (made,) = predictions(drive(twin, [more]))
     assert made.event is Event.PARAMETERS and "NAVL1_PERIOD is 31, it was" in made.event_said

@@ -74,7 +74,7 @@ def test_an_unknown_vehicle_is_guessed_and_said(heard, vehicle):
     told = [msgspec.structs.replace(m, vehicle=vehicle) if isinstance(m, Status) else m for m in heard[:300]]
     made = predictions(drive(twin, told))
     assert {p.method for p in made} == {"imm"}
-    assert f"vehicle {vehicle}: no law known" in made[-1].sentence
+    assert f"vehicle {vehicle}: no controller model available" in made[-1].sentence
 
 
 # --- wings without a model -------------------------------------------------------------------------------------------
@@ -154,7 +154,7 @@ def test_a_recorded_quadplane_hangs_flies_and_lands(recordings: Path):
     assert methods(40.0, 50.0) == {"copter"} and methods(180.0, 255.0) == {"copter"}
     assert methods(70.0, 93.5) == {"greybox"} and "dynamics" in methods(100.0, 170.0)
     assert methods(264.0, 300.0) <= {"imm"}
-    assert any("hangs on its rotors" in p.sentence for p in made)
+    assert any("hovering on rotors" in p.sentence for p in made)
     models = [r for r in results if isinstance(r, Model)]
     assert models and all(m.window_t0 - start > 55.0 for m in models)  # never a row of the hover
     t, x = twins[9].history.rows("position")

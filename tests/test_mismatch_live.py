@@ -117,7 +117,9 @@ def test_what_is_seen_once_says_so_and_where():
     unknown = made(outcome=Outcome.UNKNOWN)
     first = answered(watch, 1200.0, unknown)
     assert first.outcome is Found.SUSPECTED and first.causes[0].channel == "pitch"
-    assert first.sentence.startswith("seen once, not confirmed: a mismatch no effect") and word(first) == "suspected"
+    assert (
+        first.sentence.startswith("detected once, not confirmed: a mismatch no effect") and word(first) == "suspected"
+    )
     assert answered(watch, 1210.0, unknown).outcome is Found.UNKNOWN
 
 
@@ -230,7 +232,7 @@ def test_a_defect_of_the_diagnosis_leaves_the_predictions_and_is_said(holder, mo
     for m in f.messages(f.turn(6.0), uav=2):
         holder.bus.publish(m)
     holder.turn()
-    assert made_ and "diagnosis met a defect (broken); it is tried again in 60 s" in holder.state().sentence
+    assert made_ and "diagnosis failed with an internal error (broken); retried in 60 s" in holder.state().sentence
     holder.diagnosis._hand = hand = Hand()
     holder.turn()
     assert not hand.jobs  # not yet
@@ -250,7 +252,9 @@ def test_a_defect_met_by_one_aircraft_leaves_the_diagnosis_of_the_others(looking
     assert list(live.turn(held)) == []
     assert [job.uav for job in hand.jobs] == [2]
     (said,) = live.failed([1, 2])
-    assert said.startswith("uav-1: its diagnosis met a defect (AttributeError") and "tried again in 60 s" in said
+    assert (
+        said.startswith("uav-1: diagnosis failed with an internal error (AttributeError") and "retried in 60 s" in said
+    )
 
 
 def test_a_defect_in_taking_an_answer_is_that_aircrafts_alone_and_passes(looking, monkeypatch):
@@ -331,11 +335,11 @@ def test_a_job_that_dies_hangs_or_raises_is_told_and_the_next_is_worked_out():
         assert "odd_jobs.py" in said[odd_jobs.RAISES].details
         assert said[odd_jobs.ENDS].failed == "its process ended with exit code 3"
         assert said[odd_jobs.KILLED].failed == "its process was killed by signal 9"
-        assert said[odd_jobs.SPINS].failed == "found no answer after 2 s of processor time"
+        assert said[odd_jobs.SPINS].failed == "found no result after 2 s of CPU time"
         assert all((one.begin, one.end) == (1.0, 2.0) for one in said.values())
         assert not worked(hand, odd_jobs.FINE).failed
         hand._limit_s = 0.5  # of a process that lives already
-        assert worked(hand, odd_jobs.HANGS).failed == "found no answer after 0 s"
+        assert worked(hand, odd_jobs.HANGS).failed == "found no result after 0 s"
         hand._limit_s = 300.0
         assert not worked(hand, odd_jobs.FINE).failed
     finally:

@@ -61,11 +61,11 @@ def test_told_by_hand():
 def test_the_sentence_counts_what_the_data_said_and_names_what_the_prior_held():
     nothing = known(aircraft(0))
     alone = derivatives_of(nothing, "mine").sentence
-    assert alone.startswith("0 of 37 parameters told by the data, prior mine; held by the prior: X_0 X_u")
+    assert alone.startswith("0 of 37 parameters determined by the data, prior mine; from the prior: X_0 X_u")
     everything = replace(nothing, information=99.0 * nothing.precision)
-    assert derivatives_of(everything, "mine").sentence == "37 of 37 parameters told by the data, prior mine"
+    assert derivatives_of(everything, "mine").sentence == "37 of 37 parameters determined by the data, prior mine"
     still = identify(replace(WINDOW, u=WINDOW.u * [1, 1, 0, 1]), np.zeros(2), SMALL)
-    held = derivatives_of(still, "mine").sentence.partition("held by the prior: ")[2].split()
+    held = derivatives_of(still, "mine").sentence.partition("from the prior: ")[2].split()
     assert {"Y_dr", "L_dr", "N_dr"} <= set(held) and "L_da" not in held
 
 

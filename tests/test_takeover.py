@@ -227,7 +227,7 @@ def test_what_was_foreseen_is_renewed_until_the_turn_to_fly_comes(bus: MemoryBus
     for message in f.shifted([m for m in heard if isinstance(m, Sample) and m.position][-12:], 1.2, 1e9):
         worker._hear(message)
         worker.turn()
-    assert len(told) > 2 and all(made.sentence.endswith("another worker, renewed") for made in told)
+    assert len(told) > 2 and all(made.sentence.endswith("continued from another worker") for made in told)
 
 
 def test_many_messages_are_one_and_what_does_not_fit_is_left_out(heard: tuple[Message, ...]) -> None:

@@ -193,7 +193,10 @@ def test_a_defect_is_one_sentence_and_the_next_question_is_answered(holder, monk
     def broken(*_):
         raise ZeroDivisionError("a defect")
 
-    with monkeypatch.context() as m, pytest.raises(ValueError, match=r"uav-1 met a defect \(a defect\).*report it"):
+    with (
+        monkeypatch.context() as m,
+        pytest.raises(ValueError, match=r"uav-1: found an internal error \(a defect\).*report"),
+    ):
         m.setattr("twin_worker.service.queries.answer", broken)
         holder.bus.inquire(Prediction, 1, msgspec.msgpack.encode(WhatIf()))
     assert holder.bus.inquire(Prediction, 1, msgspec.msgpack.encode(WhatIf())) is not None

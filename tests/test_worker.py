@@ -280,7 +280,7 @@ def test_a_flood_sheds_the_oldest_and_says_so(bus, worker):
     for _ in range(INBOX + 7):
         bus.publish(status)
     assert worker.turn() == INBOX
-    assert "7 messages shed" in worker.state().sentence
+    assert "7 messages dropped" in worker.state().sentence
 
 
 def test_a_silent_aircraft_ages_by_the_wall_clock(bus, worker, clock):

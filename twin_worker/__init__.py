@@ -1,3 +1,3 @@
-"""Samples to judgement: identify, verify and predict each aircraft online."""
+"""Identify, verify and predict each aircraft online from its telemetry."""
 
-import fleet  # noqa: F401  before numpy and numba: it holds BLAS to one thread and names the compile cache
+import fleet  # noqa: F401  before numpy and numba: limits BLAS to one thread and sets the compile cache

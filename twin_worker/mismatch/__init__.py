@@ -1,1 +1,1 @@
-"""Live diagnosis: run in a process of its own, its result used in prediction."""
+"""Live mismatch diagnosis in a separate process, and its use in predictions."""

@@ -1,7 +1,7 @@
-"""Predict with what was named: go back to before the onset, put it in, and learn again from what came since.
+"""Adapt the twin's models to diagnosed effects: restart before the onset, add the effects, identify on the newer data.
 
-Nothing counts twice: of the flight before the onset only what was known then is kept, with the effect put in; all that
-came since is learnt from as ever, and what is learnt holds the effect already.
+No data count twice: of the flight before the onset only the checkpoint is used, with the effects added. Models
+identified on the data since then include the effects.
 """
 
 from copy import copy, deepcopy
@@ -25,19 +25,19 @@ from twin_worker.twin.state.checkpoint import Extension, Mark, before
 from twin_worker.twin.state.state import Believed, Twin
 from twin_worker.twin.steps.rollouts import paths
 
-_EARLIER_S = 2.0  # a mark so near to the onset may know of it already [s]
-_FLOWN_S = (20.0, 15.0, 10.0)  # newest flight both models fly, from several starts [s]
-_CLEARLY = 0.95  # share of the present one's miss below which the extended model is used [-]
-_DOUBT = 0.3  # of what an effect adds: a diagnosis' numbers and the baseline's are not exact [-]
-_RIDGE = 0.02  # pull of an increment towards zero, as a share of its term's length
-_HOLDS_S = 60.0  # flight over which what was put in fades as anything learnt earlier does [s]
-_ROWS = ((0, X, Z), (2, Z, M), (4, M, Y), (1, Y, L), (3, L, N), (5, N, WIND))  # of wrench: row, its derivatives
-_COLUMNS = {0: "da", 1: "de", 2: "dr", 3: "dt"}  # derivatives that each input has
+_EARLIER_S = 2.0  # a checkpoint nearer to the onset can contain the effect already [s]
+_FLOWN_S = (20.0, 15.0, 10.0)  # newest flight simulated with both models, from several starts [s]
+_CLEARLY = 0.95  # the adapted model is used if its error is below this share of the present error [-]
+_DOUBT = 0.3  # relative uncertainty of an effect's increments: diagnosis and baseline are not exact [-]
+_RIDGE = 0.02  # regularisation of an increment towards zero, as a share of its term's length
+_HOLDS_S = 60.0  # assumed data span of the adapted model; its weight fades as that of earlier data does [s]
+_ROWS = ((0, X, Z), (2, Z, M), (4, M, Y), (1, Y, L), (3, L, N), (5, N, WIND))  # row of the wrench, its derivatives
+_COLUMNS = {0: "da", 1: "de", 2: "dr", 3: "dt"}  # derivatives of each input
 
 
 @dataclass(frozen=True)
 class Tried:
-    """What became of it: whether the extended model predicts, and the mean misses both were judged by [m]."""
+    """Result of an adaptation: whether the adapted model is used, and the mean position errors compared [m]."""
 
     used: bool
     present: float
@@ -45,19 +45,19 @@ class Tried:
 
     @property
     def said(self) -> str:
-        """Say it."""
+        """Describe the result."""
         if not np.isfinite(self.extended):
-            return "not in the model that predicts: there is no flight to compare them on"
+            return "not used for predictions: there is no flight to compare the models on"
         missed = f"{self.extended:.1f} m against {self.present:.1f} m over the last {_FLOWN_S[0]:.0f} s"
-        return f"predictions are flown with it ({missed})" if self.used else f"the model as learnt predicts ({missed})"
+        return f"predictions use it ({missed})" if self.used else f"the identified model is used unchanged ({missed})"
 
 
 def extend(twin: Twin, push: Push, names: str) -> Tried:
-    """Put named effects into the models of a twin where that flies the newest seconds better; change it then.
+    """Add diagnosed effects to the models of a twin if this lowers the error over the newest flight.
 
     Args:
-        twin: changed in place, or left as it is
-        push: what the effects do
+        twin: changed in place only if the error is lower
+        outputs: of the effects
         names: of the effects
     """
     mark = before(twin.marks, push.onset - _EARLIER_S)
@@ -80,7 +80,7 @@ def extend(twin: Twin, push: Push, names: str) -> Tried:
 
 
 def _begun_anew(twin: Twin, push: Push, mark: Mark) -> Twin:
-    """Give a copy of the twin that knows of the effects, and nothing else of the flight before the onset but `mark`."""
+    """Return a copy of the twin that contains the effects, restarted from `checkpoint` at the onset."""
     other = copy(twin)
     other.contest, other.grid = copy(twin.contest), Grid()
     other.learn_from = push.onset
@@ -105,7 +105,7 @@ def _begun_anew(twin: Twin, push: Push, mark: Mark) -> Twin:
 
 
 def wind_since(twin: Twin, push: Push, mark: Mark) -> tuple[WindFilter, float]:
-    """Return the wind filter as it would be had it known of the effects at their onset, and its newest row's time."""
+    """Return the wind filter rerun with the effects from their onset on, and the time of its newest row."""
     wind = deepcopy(mark.wind)
     last = blow(wind, twin.history, mark.t, mark.t, push.onset)
     wind.jump(push.wind, 1.0 / push.scale, _DOUBT)
@@ -113,9 +113,9 @@ def wind_since(twin: Twin, push: Push, mark: Mark) -> tuple[WindFilter, float]:
 
 
 def extended_plant(plant: Coupled, push: Push, window: Window) -> Coupled:
-    """Return the model with the effects in it: derivatives by input as the servos let through, increments added.
+    """Return the model with the effects: derivatives by input scaled for servo faults, increments added.
 
-    Increments are regressed on the terms of THE wrench over what was flown: their slopes about the present trim.
+    Increments are regressed on the terms of the wrench over the recent flight: their slopes about the present trim.
     """
     par, added = _through_servos(plant.par, push), np.zeros(len(NAMES))
     flown = np.column_stack([_at(push.t, window, c) for c in range(6)])
@@ -140,7 +140,7 @@ def extended_plant(plant: Coupled, push: Push, window: Window) -> Coupled:
 
 
 def _through_servos(par: np.ndarray, push: Push) -> np.ndarray:
-    """Return the derivatives by commands, where faulty servos make  delta = g delta_c + o  of them."""
+    """Return the derivatives by commands, for faulty servos with  delta = g delta_c + o."""
     out = par.copy()
     for column, letters in _COLUMNS.items():
         u, moved = push.command[:, column], push.moved[:, column]
@@ -160,7 +160,7 @@ def _at(t: np.ndarray, window: Window, column: int) -> np.ndarray:
 
 
 def _miss(twin: Twin, seconds: float) -> float:
-    """Fly the newest seconds from their start by the way in use; return the mean miss [m], inf beyond the envelope."""
+    """Return the mean position error of the active method over the newest seconds [m]; inf outside the envelope."""
     window = twin.window(62.0 + seconds)
     if window is None or twin.why_no_route() or not window.ok[-round(seconds / window.dt) :].all():
         return np.nan

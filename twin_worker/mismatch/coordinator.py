@@ -1,4 +1,4 @@
-"""Diagnose the aircraft of one worker in turn, the most urgent first, without ever making a prediction wait."""
+"""Coordinate the diagnoses of a worker's aircraft, most urgent first, without delaying any prediction."""
 
 import logging
 from _thread import LockType
@@ -19,54 +19,54 @@ from twin_worker.twin.state.state import Twin
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
-ALL = -1  # instead of a UAV id
-Held = tuple[Twin, AbstractContextManager]  # a twin, and the lock it changes under
+ALL = -1  # in place of a UAV id
+Held = tuple[Twin, AbstractContextManager]  # a twin and its lock
 
 
 class Hand(Protocol):
-    """Whoever works out jobs, one at a time."""
+    """Executes diagnosis jobs, one at a time."""
 
     @property
     def free(self) -> bool:
-        """Return whether a job may be given now."""
+        """Return whether a job can be submitted now."""
 
     def give(self, job: Job) -> None:
-        """Begin a job."""
+        """Start a job."""
 
     def answer(self) -> Answer | None:
-        """Return an answer that has arrived; None while there is none."""
+        """Return a finished result; None if there is none."""
 
 
 class Live:
-    """The mismatches of the aircraft a worker holds.
+    """Mismatch diagnosis of the aircraft that a worker owns.
 
     Args:
-        hand: works the diagnoses out
-        bases: what aircraft are compared with, by UAV id, `ALL` for every other; without one, each with its own past
-        adapt: predict with what was named
+        executor: executes the diagnoses
+        baselines: comparison models by UAV id, `ALL_UAVS` for all others; by default each UAV's own past
+        adapt: adapt the prediction models to diagnosed effects
     """
 
     def __init__(self, hand: Hand, bases: Mapping[int, Baseline] = MappingProxyType({}), *, adapt: bool = True) -> None:
         self._hand, self._bases, self._adapt = hand, bases, adapt
         self.watches: dict[int, Watch] = {}
-        self._waiting: Answer | None = None  # for an aircraft whose lock is held
+        self._waiting: Answer | None = None  # its aircraft's lock is in use
 
     def watch(self, uav: int) -> Watch:
-        """Return what is known of one aircraft."""
+        """Return the diagnosis state of one aircraft."""
         if uav not in self.watches:
             base = self._bases.get(uav, self._bases.get(ALL))
             self.watches[uav] = Watch(UNKNOWN if base is None else base.card, base)
         return self.watches[uav]
 
     def turn(self, held: Sequence[Held]) -> Iterator[Mismatch]:
-        """Take an answer that has arrived, and begin the most urgent job where one may begin.
+        """Process a finished result, and submit the most urgent job if the executor is free.
 
-        A defect met by one aircraft is that aircraft's alone: it is said, logged, and left for a while.
+        An internal error affects only its own aircraft: it is reported and logged, and the aircraft is suspended.
         """
         twins = {twin.uav: (twin, lock) for twin, lock in held}
         if (answer := self._waiting or self._hand.answer()) is not None:
             self._waiting = answer if _locked(twins.get(answer.uav)) else None
-            if self._waiting is not None:  # it is identified just now: the telemetry of the others does not wait for it
+            if self._waiting is not None:  # identification holds the lock; do not block the telemetry of the others
                 return
             uav, t = answer.uav, answer.end
             yield from self._isolated(uav, t, lambda: self._take(answer, twins)) or ()
@@ -84,14 +84,14 @@ class Live:
                 self._hand.give(job)
 
     def failed(self, uavs: Iterable[int]) -> list[str]:
-        """Say what defects the diagnoses of these aircraft met last."""
+        """Return the newest internal errors in the diagnoses of these aircraft."""
         return [self.watches[uav].failed for uav in uavs if uav in self.watches and self.watches[uav].failed]
 
     def _urgency(self, twin: Twin) -> float | None:
         return self.watch(twin.uav).wants(twin)
 
     def _isolated(self, uav: int, t: float, do: Callable[[], T]) -> T | None:
-        """Do something for one aircraft at data time `t`; None where that met a defect."""
+        """Run an action for one aircraft at data time `t`; return None after an internal error."""
         try:
             return do()
         except Exception as error:
@@ -119,13 +119,13 @@ def _locked(held: Held | None) -> bool:
 
 
 def _adapted(twin: Twin, told: Mismatch, answer: Answer) -> Mismatch:
-    """Put what was named into the models of a twin, once; what is over is left to what was learnt since."""
+    """Adapt the models of a twin to the diagnosed effects, once; a cleared mismatch removes only the label."""
     if told.outcome is Found.NONE:
         twin.extended = None
     if told.outcome is not Found.NAMED or answer.pushes is None:
         return told
     names = " and ".join(one.name for one in told.causes)
     if twin.extended is not None and twin.extended.names == names:
-        return judged(told, "predictions are flown with it", used=True)
+        return judged(told, "predictions use it", used=True)
     tried = extend(twin, answer.pushes, names)
     return judged(told, tried.said, used=tried.used)

@@ -1,4 +1,4 @@
-"""What named effects do to an aircraft, row by row of what it flew: the numbers its models are extended by."""
+"""Compute the increments that diagnosed effects add to force, moment, servo deflection, wind and airspeed."""
 
 from dataclasses import dataclass
 
@@ -15,21 +15,21 @@ from twin_worker.diagnosis.model.simulate import STATE, Simulation
 from twin_worker.diagnosis.model.weather import fit_wind, wind
 
 _EVERY_S = 0.5  # between rows [s]
-_LONGEST_S = 60.0  # of the newest flight [s]
-_SETTLED = 200  # steps after which a servo has come where it goes
+_LONGEST_S = 60.0  # newest flight used [s]
+_SETTLED = 200  # steps until a servo reaches its final deflection
 
 
 @dataclass(frozen=True)
 class Push:
-    """Rows of the newest flight, and what the effects add at each.
+    """Outputs of diagnosed effects at rows of the newest flight.
 
     Attributes:
         t: (n,) [s since 1970]
         wrench: X Y Z [m/s2], L M N [rad/s2] added by effects on forces and mass, (n, 6)
-        command, moved: delta_a delta_e delta_r delta_t as commanded, and as a faulty servo lets them be, (n, 4)
+        command, actual: delta_a delta_e delta_r delta_t as commanded, and with servo faults, (n, 4)
         wind: added, NED (3,) [m/s]
-        scale: reported over true airspeed, as the faulty sensor has it [-]
-        onset: when the first of them began [s since 1970]
+        airspeed_scale: reported over true airspeed with the sensor fault [-]
+        onset: start of the first effect [s since 1970]
     """
 
     t: np.ndarray
@@ -42,7 +42,7 @@ class Push:
 
 
 def pushes(flight: Flight, base: Baseline, report: Report) -> Push | None:
-    """Reckon what the effects of a report do; None where none is named, or each has passed."""
+    """Compute the outputs of the effects in a report; None if none is named or all have ended."""
     guesses = [one.guess for one in report.findings if not one.guess.effect.variance]
     if report.outcome is not Outcome.NAMED or not guesses:
         return None
@@ -69,13 +69,13 @@ def pushes(flight: Flight, base: Baseline, report: Report) -> Push | None:
 
 
 def _lasting(guess: Guess, t: float) -> Guess:
-    """Return the effect as it stands at time t, for good."""
+    """Return the effect with its parameters at time t, held constant."""
     gate = float(guess.when.gate(np.array([t]))[0])
     return guess.at(gate * np.array(guess.par), ALWAYS)
 
 
 def _forces(base: Baseline, ground: float, guesses: list[Guess], flown: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return specific force and angular acceleration with these at work, (6, n)."""
+    """Return specific force and angular acceleration with these effects active, (6, n)."""
     x, command = flown
     n = x.shape[1]
     simulation = Simulation(base, [guesses] * n, np.zeros(n), ground)
@@ -85,7 +85,7 @@ def _forces(base: Baseline, ground: float, guesses: list[Guess], flown: tuple[np
 
 
 def moved(guesses: list[Guess], command: np.ndarray) -> np.ndarray:
-    """Return what faulty servos make of steady commands, (n, 4)."""
+    """Return the deflections of faulty servos for constant commands, (n, 4)."""
     out = command.copy()
     for guess in guesses:
         if guess.effect.stage is not Stage.DELTA or guess.effect.takes_lag:
@@ -104,7 +104,7 @@ def _settled(guess: Guess, u: float) -> float:
 
 
 def _wind(guesses: list[Guess], flight: Flight) -> np.ndarray:
-    """Return the wind added where the aircraft is, NED (3,) [m/s]."""
+    """Return the added wind at the aircraft's position, NED (3,) [m/s]."""
     h = float(flight.readings["h"][-1])
     flow = Flow(float(flight.t[-1]), h, h - flight.ground, Body())
     out = np.zeros(3)

@@ -1,4 +1,4 @@
-"""What one diagnosis is given and gives back, and the work itself: pure, so that any process may do it."""
+"""Input and result of one diagnosis job, and the job itself: a pure function that runs in any process."""
 
 import time
 from dataclasses import dataclass, replace
@@ -20,25 +20,25 @@ from twin_worker.diagnosis.model.weather import own_weather
 from twin_worker.mismatch.effect_increments import Push, pushes
 from twin_worker.telemetry.history import History
 
-NEWEST_S = 20.0  # newest flight whose residuals are watched [s]
-GREW = 1.5  # their mean square over that of the flight before, from which a diagnosis is worth its time [-]
-_LEAST_ROWS = 50  # of both, at one every 0.2 s
+NEWEST_S = 20.0  # newest flight whose residuals are monitored [s]
+GREW = 1.5  # mean square of the recent residuals over the earlier ones that triggers a diagnosis [-]
+_LEAST_ROWS = 50  # of both parts, one row every 0.2 s
 
 Rows = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class Job:
-    """One aircraft's recent flight.
+    """Recent flight of one aircraft.
 
     Attributes:
-        uav: whose
-        rows: telemetry as it came, by kind
+        uav: UAV id
+        rows: received telemetry, by kind
         params: autopilot parameters
         card: the aircraft
-        base: what it is compared with; None: its own past
-        until: end of that past [s since 1970]
-        whole: diagnose whatever the residuals say
+        baseline: comparison model; None: the aircraft's own past
+        past_end: end of that past [s since 1970]
+        full: diagnose without a residual check
     """
 
     uav: int
@@ -52,18 +52,18 @@ class Job:
 
 @dataclass(frozen=True)
 class Answer:
-    """What became of it.
+    """Result of one diagnosis job.
 
     Attributes:
-        uav: whose
-        begin, end: the flight it was done on [s since 1970]
-        grew: mean square of the newest residuals over those before, of the worst channel; nan where it cannot be told
-        report: the diagnosis; None where nothing called for one
-        pushes: what the effects found do to the aircraft, row by row
-        refused: why there is neither, or empty
-        failed: what defect of ours ended it without a result, or empty
-        details: where that was met, for the log
-        cpu_s: processor time it took [s]
+        uav: UAV id
+        begin, end: flight of the diagnosis [s since 1970]
+        residual_growth: mean square of the recent residuals over the earlier ones, worst channel; nan if undetermined
+        report: the diagnosis; None if the residuals did not require one
+        effect_outputs: what the diagnosed effects add to the aircraft's dynamics, row by row
+        refusal: reason for no diagnosis, or empty
+        defect: internal error that ended the job without a result, or empty
+        details: its traceback, for the log
+        cpu_s: CPU time used [s]
     """
 
     uav: int
@@ -79,7 +79,7 @@ class Answer:
 
 
 def rows_of(history: History, start: float, past: Rows | None = None) -> Rows:
-    """Copy what a diagnosis needs of a history from `start` on [s since 1970], behind what is kept of the past."""
+    """Copy the telemetry for a diagnosis from `start` on [s since 1970], appended to the stored past."""
     out = {}
     for kind in COLUMNS:
         t, x = history.rows(kind, start)
@@ -92,7 +92,7 @@ def rows_of(history: History, start: float, past: Rows | None = None) -> Rows:
 
 
 def failed(job: Job, why: str, *, cpu_s: float = 0.0, details: str = "") -> Answer:
-    """Answer a job that a defect has ended."""
+    """Return the result of a job that ended with an internal error."""
     return replace(_unanswered(job), failed=why, cpu_s=cpu_s, details=details)
 
 
@@ -102,7 +102,7 @@ def _unanswered(job: Job) -> Answer:
 
 
 def work(job: Job) -> Answer:
-    """Look at the newest residuals, and diagnose where they call for it; what cannot be is refused in a sentence."""
+    """Check the recent residuals and diagnose if they grew; a `ValueError` becomes a refusal."""
     begun = time.process_time()
     found = _unanswered(job)
     try:
@@ -126,12 +126,12 @@ def _work(job: Job, found: Answer) -> Answer:
         return found
     report = diagnose(flight, base)
     if job.base is None:
-        report = later(report, None, until)  # the newest seconds may be a climb: nothing is lost for good yet
+        report = later(report, None, until)  # the newest seconds can be a climb: no permanent loss yet
     return replace(found, report=report, pushes=pushes(flight, base, report))
 
 
 def growth(flight: Flight, base: Baseline) -> float:
-    """Return how much larger the newest residuals are than those before, mean square, of the channel that grew most."""
+    """Return the mean square of the recent residuals over the earlier ones, of the channel with the largest growth."""
     case = Case(flight, base)
     sight = Sight(case, own_weather(case))
     late = case.t > case.t[-1] - NEWEST_S

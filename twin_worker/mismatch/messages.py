@@ -1,4 +1,4 @@
-"""A diagnosis as it is published: times on the fleet clock, numbers finite."""
+"""Build the published mismatch message: times on the fleet clock, finite numbers."""
 
 from dataclasses import replace
 from math import inf, isfinite
@@ -9,16 +9,16 @@ from fleet.contract import Cause, Found, Mismatch
 from twin_worker.diagnosis.inference.report import Finding, Outcome, Report
 from twin_worker.diagnosis.inference.words import sentence
 
-_WILDEST = 100.0  # errors beyond are of a simulation that left the air, and tell nothing [m/s2]
+_WILDEST = 100.0  # larger errors come from a diverged simulation and are not published [m/s2]
 
 
 def message(uav: int, report: Report, begin: float, end: float) -> Mismatch:
     """Return the message of a report.
 
     Args:
-        uav: whose
-        report: times in it count from `begin`
-        begin, end: the flight it was made of [s since 1970]
+        uav: UAV id
+        report: its times count from `begin`
+        begin, end: flight of the diagnosis [s since 1970]
     """
     causes = tuple(_cause(one, begin) for one in report.findings)
     if report.outcome is Outcome.UNKNOWN:
@@ -42,7 +42,7 @@ def message(uav: int, report: Report, begin: float, end: float) -> Mismatch:
 
 
 def since(report: Report, shift: float) -> Report:
-    """Say the sentence anew, its times counted from `shift` seconds earlier."""
+    """Return the report with the times in its sentence shifted by `shift` [s]."""
     moved = [replace(one, guess=replace(one.guess, when=one.guess.when.moved(shift))) for one in report.findings]
     channel, segments = report.where
     where = channel, tuple((a + shift, b + shift) for a, b in segments)
@@ -51,14 +51,14 @@ def since(report: Report, shift: float) -> Report:
 
 
 def unconfirmed(found: Mismatch) -> Mismatch:
-    """Say that a second look must confirm it."""
+    """Mark a mismatch as suspected until a second diagnosis confirms it."""
     return msgspec.structs.replace(
-        found, outcome=Found.SUSPECTED, sentence=f"seen once, not confirmed: {found.sentence}"
+        found, outcome=Found.SUSPECTED, sentence=f"detected once, not confirmed: {found.sentence}"
     )
 
 
 def word(found: Mismatch | None) -> str:
-    """Say what was found in a few words for the fleet table; empty where nothing was."""
+    """Return a short summary for the fleet table; empty if there is no mismatch."""
     if found is None or found.outcome is Found.NONE:
         return ""
     names = " and ".join(_place(one) for one in found.causes if one.name != "unknown")
@@ -68,7 +68,7 @@ def word(found: Mismatch | None) -> str:
 
 
 def judged(found: Mismatch, said: str, *, used: bool) -> Mismatch:
-    """Say which model predicts."""
+    """Add to a mismatch whether predictions use the adapted model."""
     return msgspec.structs.replace(found, adapted=used, sentence=f"{found.sentence}; {said}")
 
 

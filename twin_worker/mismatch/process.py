@@ -1,9 +1,8 @@
-"""Where diagnoses are worked out: a process of their own that yields to everything else, within a share of a core.
+"""Run diagnoses in a separate low-priority process, within a share of one CPU core.
 
-A job and its answer are larger than a pipe holds, and a process that yields empties or fills it only when it gets to
-run: on a busy machine, or while the process starts, after seconds. So a thread sends and receives, and who gives a job
-never waits. A job that dies, takes too long or leaves by an exception is answered by a sentence, and the process is
-started again for the next.
+A job and its result exceed the pipe buffer, and the low-priority process can read or write seconds later on a busy
+machine. A thread therefore sends and receives, and `submit` never blocks. A job that crashes, times out or raises
+returns a result with the reason, and the process restarts for the next job.
 """
 
 import contextlib
@@ -19,22 +18,22 @@ from multiprocessing.context import SpawnProcess
 
 from twin_worker.mismatch.job import Answer, Job, failed, work
 
-SHARE = 0.2  # of one core, on average [-]
-LIMIT_CPU_S = 180.0  # processor time of one job; the first compiles, too [s]
-LIMIT_S = 900.0  # wall time of one job, which is longer only where it waits for what never comes [s]
-_NICE = 15  # how far it yields
-_PATIENCE_S = 1.0  # with the end of process and thread [s]
-_ENDING_S = 30.0  # for a process that has closed its pipe to end by itself; it yields in that, too [s]
+SHARE = 0.2  # average share of one core [-]
+LIMIT_CPU_S = 180.0  # CPU time of one job, including compilation [s]
+LIMIT_S = 900.0  # wall time of one job; longer only if it waits indefinitely [s]
+_NICE = 15  # increment of the nice value
+_PATIENCE_S = 1.0  # wait for the end of process and thread [s]
+_ENDING_S = 30.0  # wait for a process to exit after it closed its pipe; it runs at low priority [s]
 Work = Callable[[Job], Answer]
 
 
 class Background:
-    """One process that works out one job at a time.
+    """A process that executes one diagnosis job at a time.
 
     Args:
-        share: of one core that it may take on average [-]
-        work: what is done with a job; a function the process can import
-        limit_cpu_s: processor time of one job [s]
+        share: average share of one core [-]
+        function: runs one job; must be importable by the process
+        limit_cpu_s: CPU time of one job [s]
         limit_s: wall time of one job [s]
     """
 
@@ -44,25 +43,25 @@ class Background:
         self._share, self._work, self._limit_cpu_s, self._limit_s = share, work, limit_cpu_s, limit_s
         self._process: SpawnProcess | None = None
         self._pipe: Connection | None = None
-        self._thread: threading.Thread | None = None  # of the job in hand
+        self._thread: threading.Thread | None = None  # of the running job
         self._answer: Answer | None = None
         self._busy = self._closed = self._late = False
         self._free_at = 0.0  # monotonic [s]
-        self._lock = threading.Lock()  # held while the process starts or ends
+        self._lock = threading.Lock()  # protects start and end of the process
 
     @property
     def free(self) -> bool:
-        """Return whether a job may be given now."""
+        """Return whether a job can be submitted now."""
         return not self._busy and not self._closed and time.monotonic() >= self._free_at
 
     def give(self, job: Job) -> None:
-        """Begin a job; its answer comes with `answer`."""
+        """Start a job; `poll` returns its result."""
         self._busy, self._answer = True, None
         self._thread = threading.Thread(target=self._exchange, args=(job,), daemon=True, name="diagnosis")
         self._thread.start()
 
     def answer(self) -> Answer | None:
-        """Return an answer that has arrived; None while there is none."""
+        """Return a finished result; None if there is none."""
         found = self._answer
         if found is not None:
             self._free_at = time.monotonic() + found.cpu_s * (1.0 / self._share - 1.0)
@@ -70,14 +69,14 @@ class Background:
         return found
 
     def close(self) -> None:
-        """End the process: what it still works out nobody will receive."""
+        """End the process and discard its running job."""
         self._closed = True
         self._end()
         if self._thread is not None:
             self._thread.join(_PATIENCE_S)
 
     def _exchange(self, job: Job) -> None:
-        """Send a job and receive its answer; without one say why."""
+        """Send a job and receive its result; store a failed result if there is none."""
         begun, self._late = time.monotonic(), False
         guard = threading.Timer(self._limit_s, self._too_late)
         guard.daemon = True
@@ -89,7 +88,7 @@ class Background:
             found: Answer = pipe.recv()
         except (EOFError, OSError):
             why = self._why(self._end())
-        except Exception as error:  # what cannot be sent or read is a defect of that job alone
+        except Exception as error:  # data that cannot be pickled affect this job only
             self._end()
             why = f"{type(error).__name__}: {error}"
         finally:
@@ -100,14 +99,14 @@ class Background:
         self._answer = found
 
     def _started(self) -> Connection:
-        """Return the pipe to a process that lives.
+        """Return the pipe to a running process; start one if needed.
 
         Raises:
-            OSError: when no process can be started, or none is wanted any more.
+            OSError: when no process can be started, or the executor is closed; create another one.
         """
         with self._lock:
             if self._closed:
-                raise OSError("the diagnosis is closed")
+                raise OSError("diagnosis process: found it closed, expected open; create another one")
             if self._process is None or not self._process.is_alive() or self._pipe is None:
                 spawn = multiprocessing.get_context("spawn")
                 self._pipe, theirs = spawn.Pipe()
@@ -118,41 +117,41 @@ class Background:
             return self._pipe
 
     def _too_late(self) -> None:
-        """Kill a process that does not answer: whoever waits for it sees its pipe end."""
+        """Kill a process that exceeds the wall time; the reader then sees the end of its pipe."""
         self._late = True
         process = self._process
         if process is not None:
             process.kill()
 
     def _end(self) -> int | None:
-        """End the process and return its exit code; None where there was none."""
+        """End the process and return its exit code; None if there was none."""
         with self._lock:
             process, pipe = self._process, self._pipe
             self._process = self._pipe = None
         if process is None or pipe is None:
             return None
         if not self._closed:
-            process.join(_ENDING_S)  # one that is about to end tells its own exit code
+            process.join(_ENDING_S)  # a process about to exit reports its own exit code
         if process.is_alive():
             process.kill()
             process.join(_PATIENCE_S)
         if self._thread is None or self._thread is threading.current_thread() or not self._thread.is_alive():
-            pipe.close()  # else the thread still reads from it, until the end that it sees now
+            pipe.close()  # otherwise the thread still reads the pipe until its end
         return process.exitcode
 
     def _why(self, code: int | None) -> str:
-        """Say why there is no answer."""
+        """Describe why there is no result."""
         if self._late:
-            return f"found no answer after {self._limit_s:.0f} s"
+            return f"found no result after {self._limit_s:.0f} s"
         if code is not None and code == -getattr(signal, "SIGXCPU", 0):
-            return f"found no answer after {self._limit_cpu_s:.0f} s of processor time"
+            return f"found no result after {self._limit_cpu_s:.0f} s of CPU time"
         if code is not None and code < 0:
             return f"its process was killed by signal {-code}"
         return "its process could not be started" if code is None else f"its process ended with exit code {code}"
 
 
 def _serve(pipe: Connection, work: Work, limit_cpu_s: float) -> None:
-    """Work out jobs until the pipe ends, as it does when the parent is no more; Ctrl-C is the parent's business."""
+    """Execute jobs until the pipe closes, as it does when the parent ends; the parent handles Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(OSError):
         os.nice(_NICE)
@@ -163,16 +162,16 @@ def _serve(pipe: Connection, work: Work, limit_cpu_s: float) -> None:
             _limit_cpu(begun + limit_cpu_s)
             try:
                 found = work(job)
-            except Exception as error:  # a defect met by one job must not stop the others
+            except Exception as error:  # an error in one job must not stop the others
                 why, cpu_s = f"{type(error).__name__}: {error}", time.process_time() - begun
                 found = failed(job, why, cpu_s=cpu_s, details=traceback.format_exc())
             pipe.send(found)
 
 
 def _limit_cpu(seconds: float) -> None:
-    """Let the system end this process at so much processor time in all, also inside compiled code; no core dump."""
+    """Set the total CPU time limit of this process, also for compiled code; disable core dumps."""
     with contextlib.suppress(ImportError, OSError, ValueError):
-        import resource  # not on Windows, where the wall time alone limits a job
+        import resource  # not on Windows, where only the wall time limits a job
 
         for what, soft in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_CPU, int(seconds) + 1)):
             hard = resource.getrlimit(what)[1]

@@ -1,4 +1,4 @@
-"""What is known of one aircraft's mismatch: its baseline, what was found, and when to look again. Data time only."""
+"""Diagnosis state of one aircraft: its baseline, the newest mismatch, and next due time. Data time only."""
 
 from dataclasses import dataclass
 
@@ -14,30 +14,30 @@ from twin_worker.mismatch.messages import message, since, unconfirmed
 from twin_worker.twin.state.state import ROUTE_MODES, Twin
 from twin_worker.twin.state.vehicle_class import WINGS
 
-PAST_S = 105.0  # the own past that is what an aircraft is compared with [s]
-SEEN_S = 120.0  # flight that is diagnosed [s]
-LOOK_S, WHOLE_S = 8.0, 25.0  # between looks at the residuals, and between diagnoses whatever they say [s]
-LEAST_S = 45.0  # flight before anything is compared with a model [s]
-_AGAIN_S = 5.0  # before a finding is looked at again, to be confirmed [s]
+PAST_S = 105.0  # own past used as the comparison model [s]
+SEEN_S = 120.0  # flight used for a diagnosis [s]
+LOOK_S, WHOLE_S = 8.0, 25.0  # between residual checks, and between full diagnoses [s]
+LEAST_S = 45.0  # flight before the first comparison with a model [s]
+_AGAIN_S = 5.0  # before a finding is checked again for confirmation [s]
 _RETRY_S = 30.0  # after a refusal [s]
-_OFF_S, _OFF_MOST_S = 60.0, 3600.0  # after a defect, doubled each time, and at most [s]
-_SAME_S = 20.0  # two findings of one effect whose onsets lie farther apart are two [s]
-_GONE = 2  # looks in a row that find nothing, after which it is over
+_OFF_S, _OFF_MOST_S = 60.0, 3600.0  # after an internal error, doubled each time; upper limit [s]
+_SAME_S = 20.0  # findings of one effect with onsets further apart count as different [s]
+_GONE = 2  # consecutive diagnoses without a finding that clear a mismatch
 _SOUND = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST, Outcome.STARVED)
 
 
 @dataclass
 class Watch:
-    """One aircraft's mismatch.
+    """Diagnosis state of one aircraft.
 
     Attributes:
         card: the aircraft, or `card.UNKNOWN`
-        base: what its flight is compared with; None: its own past
-        past: telemetry of that past; None before there was enough
-        told: what was published last
-        why: why there is no baseline, or no diagnosis
-        failed: what defect of ours ended the newest diagnosis, or empty
-        failures: how many diagnoses in a row a defect has ended
+        baseline: comparison model; None: the aircraft's own past
+        past: telemetry of that past; None until it is long enough
+        published: newest published mismatch
+        reason: why there is no baseline or no diagnosis
+        defect: internal error of the newest diagnosis, or empty
+        failures: consecutive diagnoses that ended with an internal error
     """
 
     card: Card = UNKNOWN
@@ -47,17 +47,17 @@ class Watch:
     why: str = ""
     failed: str = ""
     failures: int = 0
-    begun: float = float("nan")  # when it was first heard [s since 1970]
+    begun: float = float("nan")  # first telemetry [s since 1970]
     past_t: float = float("-inf")  # end of the own past [s since 1970]
-    next_t: float = float("-inf")  # no look before [s since 1970]
-    off_until: float = float("-inf")  # nor before this, after a defect [s since 1970]
+    next_t: float = float("-inf")  # earliest next check [s since 1970]
+    off_until: float = float("-inf")  # end of the suspension after an internal error [s since 1970]
     whole_t: float = float("-inf")  # end of the newest flight diagnosed
-    last: Report | None = None  # the newest diagnosis, and its flight's begin
+    last: Report | None = None  # newest diagnosis; start of its flight below
     last_begin: float = 0.0
     none: int = 0
 
     def wants(self, twin: Twin) -> float | None:
-        """Return how urgent a look is; None where it is not due."""
+        """Return the urgency of a diagnosis; None if it is not due."""
         newest = twin.history.newest
         if newest < self.next_t - _RETRY_S - WHOLE_S:  # the clock jumped back
             self.__init__(self.card, self.base)  # type: ignore[misc]
@@ -94,7 +94,7 @@ class Watch:
         return self.told is not None and self.told.outcome in (Found.SUSPECTED, Found.UNKNOWN)
 
     def take(self, answer: Answer) -> Mismatch | None:
-        """Take an answer; return what is to be published, None where nothing is new."""
+        """Handle a result; return the mismatch to publish, None if nothing changed."""
         if answer.failed:
             self.give_up(answer.uav, answer.end, answer.failed)
             return None
@@ -114,18 +114,20 @@ class Watch:
         held = self.told is not None and self.told.outcome in (Found.NAMED, Found.UNKNOWN)
         self.none = self.none + 1 if told.outcome in (Found.NONE, Found.SUSPECTED) else 0
         if held and 0 < self.none < _GONE:
-            return None  # one look that sees less takes nothing back
+            return None  # a single diagnosis without the finding does not clear it
         self.told = told
         return told
 
     def give_up(self, uav: int, t: float, why: str) -> None:
-        """Leave the aircraft alone for a while: a defect ended its diagnosis at data time `t`; longer each time."""
+        """Suspend the diagnosis after an internal error at data time `t`, longer each time."""
         again_s = min(_OFF_S * 2.0**self.failures, _OFF_MOST_S)
         self.failures, self.off_until = self.failures + 1, t + again_s
-        self.failed = f"uav-{uav}: its diagnosis met a defect ({why}); it is tried again in {again_s:.0f} s, report it"
+        self.failed = (
+            f"uav-{uav}: diagnosis failed with an internal error ({why}); retried in {again_s:.0f} s, report it"
+        )
 
     def _confirmed(self, report: Report, begin: float) -> bool:
-        """Return whether the diagnosis before said the same."""
+        """Return whether the previous diagnosis agrees with this report."""
         if self.last is None:
             return False
         if report.outcome is Result.UNKNOWN:
@@ -144,7 +146,7 @@ class Watch:
 
     @staticmethod
     def _steady_s(twin: Twin) -> float:
-        """Return how long it has flown its mission without a break [s]."""
+        """Return the uninterrupted flight time on the mission [s]."""
         if twin.status is None or twin.status.mode not in ROUTE_MODES:
             return 0.0
         t = twin.history.rows("attitude", max(twin.since, twin.back_t, twin.history.newest - PAST_S - 5.0))[0]

@@ -1,4 +1,4 @@
-"""A cold takeover: a twin that was never handed over begins with the last minutes and the last published model."""
+"""Start a twin without a snapshot: from the last minutes of telemetry and the last published model."""
 
 import msgspec
 import numpy as np
@@ -10,14 +10,14 @@ from twin_worker.identification.fixed_wing.derivatives_prior import prior
 from twin_worker.twin.state.state import Believed, Twin
 from twin_worker.twin.steps.extrapolate import LATEST_S
 
-_TRIM = np.array([0.0, 0.0, 0.0, 0.5])  # inputs that nothing is known of
+_TRIM = np.array([0.0, 0.0, 0.0, 0.5])  # trim inputs, as none are published
 
 
 def revive(twin: Twin, model: Model) -> bool:
-    """Let a fresh twin believe a model that another worker published; tell whether it can.
+    """Restore a published model of another worker in a new twin; return whether this was possible.
 
-    The model comes without the hybrid and without what held its parameters: its whole covariance counts as told by the
-    data of its own stretch, so that no datum is counted twice when that stretch is identified again.
+    The message contains neither the point-mass model nor the prior. The complete covariance counts as information from
+    the model's own window, so that no data count twice when that window is identified again.
     """
     plant = _coupled(twin, model)
     if plant is None or model.in_force is None or model.in_force.outcome is not Outcome.VERIFIED:
@@ -33,13 +33,13 @@ def revive(twin: Twin, model: Model) -> bool:
 
 
 def wait(twin: Twin, share: float, *, fly: bool, learn: bool) -> None:
-    """Let the first work of its own wait for a share of its period, so that many taken over at once take turns.
+    """Delay the first work of a twin by a share of its period, so that many takeovers are spread over time.
 
     Args:
-        twin: that has heard what was said before
-        share: of a period, 0..1
-        fly: it has a prediction to renew meanwhile; otherwise it flies ahead at once
-        learn: it has a model meanwhile; otherwise it learns at once
+        twin: twin with past messages ingested
+        phase: share of a period, 0..1
+        has_prediction: a prediction can be propagated meanwhile; otherwise the first rollout runs at once
+        has_model: a model exists; otherwise the first identification runs at once
     """
     newest, pace = twin.history.newest, twin.pace
     twin.predict_t = newest - (1.0 - share) * pace.predict if fly else -np.inf
@@ -47,10 +47,9 @@ def wait(twin: Twin, share: float, *, fly: bool, learn: bool) -> None:
 
 
 def go_on(twin: Twin, made: Prediction) -> bool:
-    """Let a fresh twin renew the last prediction another worker published, until it has flown one of its own.
+    """Propagate the last published prediction of another worker until the twin has its own; return whether it is valid.
 
-    It keeps the origin of the local frame, too. Its path may have been flown up to one period before: the tube is as
-    wide as it would be so much later, where that is wider.
+    The twin adopts the origin of the local frame. The path can be up to one period old; the tube is widened.
     """
     try:
         ahead, tube = made.ahead.numpy(), made.tube.numpy()
@@ -66,14 +65,14 @@ def go_on(twin: Twin, made: Prediction) -> bool:
         made,
         tube=Array.of(np.maximum(tube, later)),
         horizon_s=max(made.horizon_s - age, 0.0),
-        sentence=f"{made.sentence}; the last of another worker, renewed",
+        sentence=f"{made.sentence}; continued from another worker",
     )
     twin.origin, twin.prediction, twin.base, twin.predict_t = made.ned_origin(), made, made, made.t
     return True
 
 
 def _coupled(twin: Twin, model: Model) -> Coupled | None:
-    """Return the coupled model of a message; None where it has none, or one that cannot be."""
+    """Return the derivatives model of a message; None if it has none or an invalid one."""
     told = model.derivatives
     if told is None or told.names != NAMES or told.prior != twin.airframe.name:
         return None

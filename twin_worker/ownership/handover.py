@@ -1,4 +1,4 @@
-"""One aircraft's whole twin as bytes, from worker to worker: who takes over goes on as the other would have."""
+"""Serialise the complete twin of one aircraft for a handover, so that its new owner continues without a gap."""
 
 from dataclasses import dataclass, field
 
@@ -43,13 +43,13 @@ from twin_worker.validation.forecast_shrinkage import Earned
 
 @dataclass
 class Load:
-    """What travels of one aircraft.
+    """Data of one aircraft in a handover.
 
     Attributes:
-        twin: everything that was heard and learnt
-        inbox: messages not yet taken in, oldest first
-        conflicts: its open conflicts
-        mismatch: what was found last; None: nothing
+        twin: complete state of the twin
+        inbox: queued messages, oldest first
+        traffic_alerts: its open traffic alerts
+        mismatch: newest mismatch; None: none
     """
 
     twin: Twin
@@ -84,25 +84,25 @@ CARRIED: Known = {
     "Book": Book,
     "Kept": (Kept, Special(Kept.whole, _kept)),
     "CubicSpline": (CubicSpline, Special(lambda one: (one.x, one.c), _spline)),
-    "Quota": (Quota, Special(lambda _: None, lambda _: None)),  # the next driver has its own
-    "Tables": (Tables, Special(lambda _: None, lambda _: load_tables())),  # everyone has them
+    "Quota": (Quota, Special(lambda _: None, lambda _: None)),  # the new driver has its own
+    "Tables": (Tables, Special(lambda _: None, lambda _: load_tables())),  # installed with every worker
 }
 
 
 def packed(load: Load) -> bytes:
-    """Return the bytes of what travels."""
+    """Encode a snapshot."""
     return pack(load, CARRIED)
 
 
 def unpacked(data: bytes, uav: int) -> Load:
-    """Return what travelled.
+    """Decode a snapshot.
 
     Raises:
-        ValueError: when the bytes are not that of this aircraft; take it over cold.
+        ValueError: when the bytes are not a twin of this aircraft; start it from published data instead.
     """
     load = unpack(data, CARRIED)
     if not isinstance(load, Load) or not isinstance(load.twin, Twin) or load.twin.uav != uav:
-        raise ValueError(f"uav-{uav}: found another thing carried, expected its twin; it is taken over cold")
+        raise ValueError(f"uav-{uav}: found another object, expected its twin; it starts without a snapshot")
     if not isinstance(load.twin.history, History) or not load.twin.history.sound():
-        raise ValueError(f"uav-{uav}: found telemetry of other columns, expected ours; it is taken over cold")
+        raise ValueError(f"uav-{uav}: found other telemetry columns, expected ours; it starts without a snapshot")
     return load

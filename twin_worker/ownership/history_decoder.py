@@ -1,7 +1,7 @@
-"""The past of one aircraft as a gateway tells it, read by compiled code, so that the others do not wait meanwhile.
+"""Decode the `History` message of one aircraft in compiled code, which releases the GIL for the other threads.
 
-`scan` walks the bytes of a `History` and finds where the rows of each kind lie; nothing is believed that does not have
-the shape and bytes it says.
+`scan` walks the bytes and finds the position of the rows of each kind. Rows whose shape does not match their byte
+count are skipped.
 """
 
 from struct import unpack_from
@@ -11,17 +11,17 @@ import numpy as np
 from fleet.contract import COLUMNS, DTYPES, Array, Rows, Sample
 from fleet.physics.kernel import bare, kernel
 
-PLAIN, WORD, BYTES, LIST, MAP, BAD = range(6)  # what there is in msgpack
-DTYPE, DIMENSIONS, LONG, WIDE, AT, SIZE = range(6)  # of one array: two sizes, where its bytes are, how many
-_LEAST, _MOST = 40, 1 << 31  # bytes that rows of one kind take at least; rows
+PLAIN, WORD, BYTES, LIST, MAP, BAD = range(6)  # msgpack kinds
+DTYPE, DIMENSIONS, LONG, WIDE, AT, SIZE = range(6)  # of one array: two sizes, offset, byte count
+_LEAST, _MOST = 40, 1 << 31  # minimum bytes of the rows of one kind; maximum number of rows
 _DOUBLE = 0xCB
 _PARTS = (tuple(COLUMNS), ("uav", "t", "samples"), ("t", "x"), ("dtype", "shape", "data"), DTYPES)
-TOP, ROWS, ARRAY, DTYPE_NAMES = np.cumsum([len(names) for names in _PARTS])[:-1].tolist()  # where each part begins
+TOP, ROWS, ARRAY, DTYPE_NAMES = np.cumsum([len(names) for names in _PARTS])[:-1].tolist()  # start of each group
 _F8 = DTYPES.index("<f8")
 
 
 def _names() -> np.ndarray:
-    """Lay all names in rows of bytes, (n, longest + 1) u1: the length comes first."""
+    """Return all names as rows of bytes, (n, longest + 1) u1, with the length first."""
     names = [name.encode() for part in _PARTS for name in part]
     out = np.zeros((len(names), 1 + max(map(len, names))), np.uint8)
     for row, name in zip(out, names, strict=True):
@@ -30,9 +30,9 @@ def _names() -> np.ndarray:
 
 
 def _heads() -> np.ndarray:
-    """Return for each first byte from 0xC0 on: what it begins, bytes of the number behind it, whether that counts."""
+    """Return for each first byte from 0xC0 on: kind, bytes of the next number, whether it is a count."""
     out = np.full((64, 3), (PLAIN, 0, 0), np.int64)
-    out[0x01] = out[0x07:0x0A] = (BAD, 0, 0)  # never used; strangers' own types
+    out[0x01] = out[0x07:0x0A] = (BAD, 0, 0)  # unused byte; extension types
     out[0x14:0x19] = (BAD, 0, 0)
     for first, what, sizes, counts in (
         (0x04, BYTES, (1, 2, 4), 1),
@@ -55,7 +55,7 @@ _SIZES = np.array([np.dtype(name).itemsize for name in DTYPES])
 
 @bare
 def number(b: np.ndarray, i: int, n: int) -> int:
-    """Read an unsigned big-endian number of n bytes."""
+    """Read an unsigned big-endian integer of n bytes."""
     out = 0
     for k in range(n):
         out = (out << 8) | int(b[i + k])
@@ -64,8 +64,8 @@ def number(b: np.ndarray, i: int, n: int) -> int:
 
 @bare
 def head(b: np.ndarray, i: int) -> tuple[int, int, int]:
-    """Read what begins at i: kind, then bytes, items, pairs or the value of a whole number, and where it goes on."""
-    if i < 0 or i >= len(b) - 9:  # a number is of nine bytes at most
+    """Read the header at i; return kind, its size (bytes, items or pairs) or integer value, and the next index."""
+    if i < 0 or i >= len(b) - 9:  # a number has at most nine bytes
         return BAD, 0, i
     c = int(b[i])
     i += 1
@@ -84,7 +84,7 @@ def head(b: np.ndarray, i: int) -> tuple[int, int, int]:
 
 @bare
 def leap(b: np.ndarray, i: int) -> int:
-    """Return where it goes on after whatever begins at i; negative where that is broken."""
+    """Return the index after the value at i; negative if it is invalid."""
     left = 1
     while left > 0:
         kind, n, i = head(b, i)
@@ -102,7 +102,7 @@ def leap(b: np.ndarray, i: int) -> int:
 
 @bare
 def named(b: np.ndarray, i: int, first: int, last: int) -> tuple[int, int]:
-    """Read a key: which name from first to last it is, or -1 for another; and where it goes on, negative if nowhere."""
+    """Read a key; return its index among the names first to last or -1, and the next index, negative if invalid."""
     kind, n, i = head(b, i)
     if kind != WORD or i + n > len(b):
         return -1, -1
@@ -118,7 +118,7 @@ def named(b: np.ndarray, i: int, first: int, last: int) -> tuple[int, int]:
 
 @bare
 def array(b: np.ndarray, i: int, got: np.ndarray, row: int) -> int:
-    """Read an array into a row of `got`, (2, 6); return where it goes on, negative where it is broken."""
+    """Read an array header into a row of `layout`, (2, 6); return the next index, negative if invalid."""
     got[row, DTYPE], got[row, DIMENSIONS], got[row, SIZE] = -1, 0, -1
     kind, pairs, i = head(b, i)
     if kind != MAP:
@@ -146,7 +146,7 @@ def array(b: np.ndarray, i: int, got: np.ndarray, row: int) -> int:
 
 @bare
 def rows_at(b: np.ndarray, i: int, got: np.ndarray) -> int:
-    """Read the rows of one kind: array `t` into got[0] and `x` into got[1]; return where it goes on."""
+    """Read the rows of one kind: array `t` into layout[0] and `x` into layout[1]; return the next index."""
     got[0, SIZE] = got[1, SIZE] = -1
     kind, pairs, after = head(b, i)
     if kind == PLAIN:
@@ -164,7 +164,7 @@ def rows_at(b: np.ndarray, i: int, got: np.ndarray) -> int:
 
 @bare
 def whole(got: np.ndarray, kind: int) -> bool:
-    """Return whether rows have the shape and bytes they say."""
+    """Return whether the shapes of the rows match their byte counts."""
     n, dtype = got[0, LONG], got[1, DTYPE]
     if got[0, SIZE] < 0 or got[1, SIZE] < 0 or got[0, DIMENSIONS] != 1 or got[1, DIMENSIONS] != 2 or dtype < 0:
         return False
@@ -175,7 +175,7 @@ def whole(got: np.ndarray, kind: int) -> bool:
 
 @bare
 def sample(b: np.ndarray, i: int, got: np.ndarray, found: np.ndarray, n: int) -> tuple[int, int]:
-    """Find the rows in one sample; return how many finds there are now, and where it goes on."""
+    """Find the rows in one sample; return the number of entries and the next index."""
     what, pairs, i = head(b, i)
     if what != MAP:
         return n, -1
@@ -193,12 +193,12 @@ def sample(b: np.ndarray, i: int, got: np.ndarray, found: np.ndarray, n: int) ->
 
 @bare
 def scan(b: np.ndarray, got: np.ndarray, found: np.ndarray) -> tuple[int, int, int]:
-    """Find all rows; return how many finds there are (negative: it is broken), the UAV id, and where its time lies.
+    """Find all rows; return the number of entries (negative: invalid), the UAV id, and the offset of the time.
 
     Args:
         b: bytes, and nine more at the end
-        got: (2, 6), written over
-        found: filled, one row a find: kind, rows, where their times and values lie, bytes of these, kind of number
+        layout: (2, 6), scratch
+        entries: output, one row an entry: kind, row count, offsets of times and values, bytes of the values, dtype
     """
     uav, t, n = -1, -1, 0
     what, pairs, i = head(b, 0)
@@ -225,7 +225,7 @@ def scan(b: np.ndarray, got: np.ndarray, found: np.ndarray) -> tuple[int, int, i
 
 @kernel
 def put_together(b: np.ndarray, at: np.ndarray, size: np.ndarray, out: np.ndarray) -> None:
-    """Copy stretches of bytes one behind the other."""
+    """Concatenate byte ranges."""
     k = 0
     for j in range(len(at)):
         out[k : k + size[j]] = b[at[j] : at[j] + size[j]]
@@ -233,10 +233,10 @@ def put_together(b: np.ndarray, at: np.ndarray, size: np.ndarray, out: np.ndarra
 
 
 def read(payload: bytes) -> Sample | None:
-    """Read a `History` as one sample of all its rows; what does not fit the others is left out.
+    """Decode a `History` into one sample with all its rows; rows with another dtype than the newest are skipped.
 
     Returns:
-        None where it is broken, or holds nothing.
+        None if it is invalid or empty.
     """
     b = np.frombuffer(payload + bytes(9), np.uint8)
     found = np.empty((len(b) // _LEAST + 1, 6), np.int64)
@@ -248,9 +248,9 @@ def read(payload: bytes) -> Sample | None:
 
 
 def _rows(b: np.ndarray, found: np.ndarray) -> Rows:
-    """Put those together that are of the newest one's kind of number."""
+    """Join the entries that have the newest entry's dtype."""
     kind, dtype = found[-1, 0], found[-1, 5]
-    rows, t_at, x_at, x_size = np.ascontiguousarray(found[found[:, 5] == dtype, 1:5].T)  # one find lies so by itself
+    rows, t_at, x_at, x_size = np.ascontiguousarray(found[found[:, 5] == dtype, 1:5].T)  # contiguous if single
     n = int(rows.sum())
     t, x = np.empty(8 * n, np.uint8), np.empty(int(x_size.sum()), np.uint8)
     put_together(b, t_at, 8 * rows, t)  # type: ignore[call-arg]

@@ -1,4 +1,4 @@
-"""The last minutes of one aircraft, from a gateway, for a twin that was never handed over to hear."""
+"""Query the last minutes of one aircraft from a gateway for a twin started without a snapshot."""
 
 from collections.abc import Mapping
 
@@ -6,18 +6,18 @@ from fleet.bus.bus_protocol import Bus
 from fleet.contract import History, Message, Mission, Params, Status
 from twin_worker.ownership.history_decoder import read
 
-PATIENCE_S = 0.5  # with a gateway that does not answer [s]
-_LONG_S = 2.0  # with one that sends megabytes [s]
-_TRIES = 2  # megabytes are dropped on a way that is full
+PATIENCE_S = 0.5  # for one message from a gateway [s]
+_LONG_S = 2.0  # for a history of several megabytes [s]
+_TRIES = 2  # large answers are dropped on a congested link
 SELDOM: tuple[type[Message], ...] = (Status, Params, Mission)
-"""What is said so seldom that the last of each is worth keeping."""
+"""Rare messages of which the last one stays valid."""
 
 
 def recall(bus: Bus, uav: int, known: Mapping[type, Message]) -> list[Message]:
-    """Ask what was said of an aircraft before, for a fresh twin to hear; what is `known` already is not asked for.
+    """Query the past messages of an aircraft for a new twin; types in `cached` are not queried.
 
     Raises:
-        ConnectionError: when the session is closed.
+        ConnectionError: when the session is closed; stop, the worker is shutting down.
     """
     found: list[Message] = []
     for kind in SELDOM:

@@ -1,14 +1,15 @@
-"""The claim protocol on the bus: tokens, announcements, handovers; `Claims` decides, a `Keeper` keeps the twins.
+"""Ownership protocol on the bus: liveliness tokens, claims, handovers. `OwnershipState` decides, a `TwinStore` acts.
 
-every 0.1 s, and at once when a token comes or goes or an aircraft is heard of that nobody holds
-unsure     ask everyone what they hold (`Claim`), then go on
-take       what nobody live holds: the last prediction is renewed at once, telemetry and model are recalled one by one
-ask        the live holder of what should be ours for copies (`Handover`), and take each as it comes; what does not come
-in time is taken without
-announce   what we write for, every 0.25 s and at once when that changed; what came as a copy only once we do write
-asked      for copies: send them, and go on
-heard      a higher claim on what we hold: drop it, without a word
-mend       who announces and is not known to live is looked for; what is claimed and came to nothing is begun anew
+Runs every 0.1 s, and at once when a token appears or disappears or an aircraft without an owner is seen.
+unsynchronised  query the claims of all workers (`Claim`), then continue
+acquire         aircraft without a live owner: propagate the last prediction at once, query telemetry and model later
+request         snapshots (`Handover`) from live owners of aircraft assigned to this worker; acquire each on arrival,
+                and without a snapshot after a timeout
+announce        the aircraft published by this worker, every 0.25 s and on change; an acquired snapshot only after its
+                first publication
+snapshot query  send snapshots, keep the aircraft
+superseded      a higher claim on an owned aircraft: release it
+repair          look up announcing workers without a token; restart acquisitions that failed
 """
 
 import logging
@@ -28,81 +29,81 @@ from fleet.contract import Claim, Handover, Wanted
 from twin_worker.ownership.protocol_state import Claims, Rank
 
 _log = logging.getLogger(__name__)
-_TURN_S = 0.1  # between turns without news [s]
-_SETTLE_S = 0.03  # tokens come in bursts [s]
+_TURN_S = 0.1  # between steps without an event [s]
+_SETTLE_S = 0.03  # waits for the rest of a burst of tokens [s]
 _ANNOUNCE_S = 0.25  # several times in `SILENT_S` [s]
-_ASK_S = 0.5  # for everyone to say what they hold; a frozen worker never does [s]
-_HAND_S = 3.0  # between copies from one that holds what should be ours; it writes meanwhile [s]
-_COPIES_S = 20.0  # for all that one worker is asked for at once [s]
-_COPY_S = 1.4  # for one of them; two that are lost do not have the rest taken without: less than half of `_HAND_S` [s]
-_LEAVE_S = 5.0  # for the others to take everything over at the end [s]
-_MEND_S = 1.0  # between looks for what was left half done [s]
-_MOST_AHEAD = 100  # workers whose clocks are complained of
+_ASK_S = 0.5  # for the claims of all workers; a frozen worker does not answer [s]
+_HAND_S = 3.0  # maximum gap between snapshots from an owner, which publishes meanwhile [s]
+_COPIES_S = 20.0  # for all snapshots requested from one worker at once [s]
+_COPY_S = 1.4  # for one snapshot; below half of the handover timeout, so that two lost ones do not end the handover [s]
+_LEAVE_S = 5.0  # for the other workers to acquire everything at shutdown [s]
+_MEND_S = 1.0  # between checks for incomplete acquisitions [s]
+_MOST_AHEAD = 100  # maximum number of workers with a clock warning
 
 
 class Keeper(Protocol):
-    """Who keeps the twins."""
+    """Stores the twins of the owned aircraft."""
 
     def expect(self, uavs: Iterable[int]) -> None:
-        """Begin to collect what is heard of these, before their twins are here."""
+        """Queue messages of these aircraft before their twins arrive."""
 
     def adopt(self, uav: int, epoch: int, twin: Handover | None) -> None:
-        """Hold one from now on, with its twin or without."""
+        """Acquire one aircraft, with a snapshot of its twin or without."""
 
     def recall(self, uavs: list[int]) -> None:
-        """Ask for the telemetry of before of some that came without their twins."""
+        """Query the past telemetry of aircraft acquired without a snapshot."""
 
     def renew(self, uav: int, epoch: int) -> None:
-        """Write under another epoch from now on."""
+        """Publish under another epoch from now on."""
 
     def drop(self, uavs: Iterable[int]) -> None:
-        """Hold these no longer."""
+        """Release these aircraft."""
 
     def copied(self, uav: int, epoch: int) -> Handover | None:
-        """Copy one's twin; None where there is none just now."""
+        """Return a snapshot of one twin; None if it is not available now."""
 
     @property
     def kept(self) -> dict[int, bool]:
-        """Tell of each that is held or expected whether its twin is here."""
+        """Return for each owned or expected aircraft whether its twin is ready."""
 
     @property
     def quiet(self) -> frozenset[int]:
-        """Name those that came as copies and are not written for yet."""
+        """Return the aircraft acquired by snapshot that this worker does not publish yet."""
 
     @property
     def bare(self) -> tuple[int, ...]:
-        """Name those without the telemetry of before."""
+        """Return the aircraft without past telemetry."""
 
 
 class Claiming:
-    """One worker's side of the protocol.
+    """One worker's side of the ownership protocol.
 
     Args:
-        bus: joined
-        ids: what it may hold
-        keeper: of its twins
+        bus: connected bus
+        ids: UAV ids this worker may own
+        store: of its twins
     """
 
     def __init__(self, bus: Bus, ids: range, keeper: Keeper) -> None:
         self.me = f"{bus.writer:016x}"
         self.claims = Claims(self.me, ids)
-        self.threaded = False  # true: `run` turns; false: whoever hears of news does
+        self.threaded = False  # true: `run` steps; false: callbacks step
         self._bus, self._keeper = bus, keeper
         self._lock = threading.RLock()
         self._news = threading.Event()
         self._said = float("-inf")
-        self._told: tuple[object, ...] = ()  # what was announced last
-        self._asked_for: dict[int, float] = {}  # since when there is no copy, by UAV id asked for [s, monotonic]
+        self._told: tuple[object, ...] = ()  # last announced claim
+        self._asked_for: dict[int, float] = {}  # start of the wait for a snapshot, by UAV id [s, monotonic]
         self._asking: dict[str, threading.Thread] = {}  # by worker
         self._recalling: list[threading.Thread] = []
-        self._stranger = False  # somebody unknown announces: the news of a life may come before that of its last end
+        self._stranger = False  # a worker without a known token announces; tokens can arrive out of order
         self._mended = float("-inf")
-        self._ahead: set[str] = set()  # workers whose epochs were refused
+        self._ahead: set[str] = set()  # workers whose epochs were rejected
 
     # --- from any thread ---------------------------------------------------------------------------------------------
 
     def join(self) -> None:
-        """Make known that this worker lives, and learn who else does and what they hold."""
+        """Declare this worker's liveliness token, and subscribe to tokens, claims and handover queries."""
         self._bus.attend(self._token)
         self._bus.subscribe(Claim, lambda claim, stamp: self._claim(claim))
         self._bus.answer(Claim, lambda *_: [(self.claim(asked=True), None)])
@@ -111,7 +112,7 @@ class Claiming:
         self.turn()
 
     def hear_of(self, uav: int) -> None:
-        """Learn that there is an aircraft; where nobody holds it, its owner does before long."""
+        """Register an aircraft; if it has no owner, the assigned worker acquires it."""
         claims = self.claims
         claims.hears = True
         if uav in claims.ids and uav not in claims.known:
@@ -121,17 +122,17 @@ class Claiming:
                 self.turn()
 
     def may_write(self) -> bool:
-        """Return whether results may be published."""
+        """Return whether this worker may publish results."""
         return not self.threaded or self.claims.may_write(time.monotonic())
 
     def overheard(self, uav: int, stamp: Stamp | None) -> None:
-        """Learn from a result who writes for an aircraft."""
+        """Record the publisher of an aircraft's result."""
         if stamp is not None and timely(stamp.epoch):
             with self._lock:
                 self.claims.note(uav, Rank(stamp.epoch, f"{stamp.writer:016x}"))
 
     def claim(self, *, asked: bool = False) -> Claim:
-        """Say what is held; to those who ask also what is known of others."""
+        """Return this worker's claim; `with_highest` adds the highest known claims of others."""
         with self._lock:
             seen = ((uav, *rank) for uav, rank in self.claims.seen.items()) if asked else ()
             quiet = self._keeper.quiet
@@ -170,10 +171,10 @@ class Claiming:
                     self.claims.note(uav, Rank(epoch, worker))
             self._keeper.drop(lost)
         if lost:
-            _log.info("%d aircraft are written for by %s, which has the higher claim", len(lost), claim.worker)
+            _log.info("%d aircraft released: worker %s has the higher claim", len(lost), claim.worker)
 
     def _asked(self, payload: bytes) -> Iterator[tuple[Handover, None]]:
-        """Send copies of what is held, one by one; who asked takes it, and is heard of when it does."""
+        """Yield snapshots of owned aircraft, one by one; the requester acquires them and announces it."""
         for uav in _wanted(payload).uavs if payload else ():
             with self._lock:
                 epoch = self.claims.held.get(uav)
@@ -183,7 +184,7 @@ class Claiming:
     # --- one thread --------------------------------------------------------------------------------------------------
 
     def run(self, stop: threading.Event) -> None:
-        """Turn until told to stop."""
+        """Step until `stop` is set."""
         while not stop.is_set():
             if self._news.wait(_TURN_S):
                 self.tick()
@@ -191,13 +192,13 @@ class Claiming:
             self._news.clear()
             try:
                 self.turn()
-            except ConnectionError:  # the session is closed: we are leaving
+            except ConnectionError:  # the session is closed: shutdown
                 return
-            except Exception:  # a defect met once must not end the claims
-                _log.exception("a turn of the claims failed; report it")
+            except Exception:  # an error must not stop the protocol
+                _log.exception("ownership step failed; report it")
 
     def turn(self) -> None:
-        """Do what is due."""
+        """Run whatever is due."""
         if not self.tick():
             return
         self._set_right()
@@ -206,14 +207,14 @@ class Claiming:
         with self._lock:
             plan = self.claims.plan(time.monotonic())
         self._take(plan.take)
-        if plan.sure:  # after a moment of doubt, as on a busy machine, it is waited no longer than before
+        if plan.sure:  # a short unsynchronised phase, as on a busy machine, does not restart the timeouts
             self._take(self._ask(plan.ask))
             self._mend()
         if self._news_to_tell() or time.monotonic() - self._said >= _ANNOUNCE_S:
             self._announce()
 
     def leave(self) -> None:
-        """Hand everything over to the others, for a few seconds at most."""
+        """Hand all aircraft over to the other workers, within a few seconds."""
         with self._lock:
             self.claims.leaving = True
         until, waited = time.monotonic() + _LEAVE_S, threading.Event()
@@ -222,20 +223,20 @@ class Claiming:
             waited.wait(_TURN_S)
 
     def _heirs(self) -> bool:
-        """Return whether anyone is there to hand what is still held to."""
+        """Return whether another worker can acquire an aircraft still owned here."""
         with self._lock:
             others = self.claims.heirs().values()
             return any(uav in ids for uav in self.claims.held for ids in others)
 
     def tick(self) -> bool:
-        """Look at clock and router; return whether the router is in sight."""
+        """Update the clock and the router state; return whether the router is connected."""
         in_sight = bool(self._bus.router)
         with self._lock:
             self.claims.tick(time.monotonic(), in_sight)
         return in_sight
 
     def _synchronise(self) -> None:
-        """Ask everyone what they hold and go on; what was overtaken meanwhile is claimed anew, or dropped."""
+        """Query all claims and resynchronise; aircraft claimed by others meanwhile are claimed again or released."""
         for claim, _ in self._bus.ask(Claim, timeout_s=_ASK_S):
             self._claim(claim)
         if not self.tick():
@@ -248,24 +249,24 @@ class Claiming:
             self._keeper.renew(uav, epoch)
 
     def _set_right(self) -> None:
-        """Claim anew what our own clock, once set back, no longer allows."""
+        """Claim aircraft again whose epochs are ahead of this clock after it was set back."""
         with self._lock:
             renewed = self.claims.timely(_wall_ms() + EPOCH_AHEAD_MS, _wall_ms())
         for uav, epoch in renewed.items():
             self._keeper.renew(uav, epoch)
 
     def _timely(self, worker: str, epoch: int) -> bool:
-        """Return whether a worker's epoch may be believed; say once where it is far ahead of our clock."""
+        """Return whether a worker's epoch is within the limit; warn once if it is far ahead of this clock."""
         if timely(epoch):
             return True
         if worker not in self._ahead and len(self._ahead) < _MOST_AHEAD:
             self._ahead.add(worker)
-            found = f"claims over {EPOCH_AHEAD_MS // 60_000} minutes ahead of this clock, which are refused"
-            _log.warning("worker %s: found %s; expected one time for all; set its clock, restart it", worker, found)
+            found = f"claims over {EPOCH_AHEAD_MS // 60_000} minutes ahead of this clock"
+            _log.warning("worker %s: found %s, expected synchronised clocks; set its clock", worker, found)
         return False
 
     def _ask(self, wanted: dict[str, list[int]]) -> list[int]:
-        """Ask each holder for copies, all at the same time; return what is asked for in vain."""
+        """Request snapshots from all owners at once; return the aircraft whose owner does not respond in time."""
         now, uavs = time.monotonic(), {uav for mine in wanted.values() for uav in mine}
         with self._lock:
             self._asked_for = {uav: self._asked_for.get(uav, now) for uav in uavs}
@@ -279,9 +280,9 @@ class Claiming:
             return [uav for uav in late if uav not in self.claims.held]
 
     def _copy(self, worker: str, uavs: list[int]) -> None:
-        """Ask one holder, and take each as it comes.
+        """Request snapshots from one owner and acquire each on arrival.
 
-        One at a time: copies that nobody reads yet must fit into what lies between two processes, or be dropped there.
+        One at a time: unread snapshots must fit into the buffers between two processes, else they are dropped.
         """
         until = time.monotonic() + _COPIES_S
         for uav in uavs:
@@ -292,7 +293,7 @@ class Claiming:
                     self._copied(worker, uavs, twin)
 
     def _copied(self, worker: str, uavs: list[int], twin: Handover) -> None:
-        now = time.monotonic()  # it hands over: the rest will come
+        now = time.monotonic()  # the owner responds: keep waiting for the rest
         with self._lock:
             self._asked_for = self._asked_for | dict.fromkeys(uavs, now)
             wanted = twin.uav in uavs and twin.uav not in self.claims.held and timely(twin.epoch)
@@ -316,7 +317,7 @@ class Claiming:
             self._keeper.recall(uavs)
 
     def _mend(self) -> None:
-        """Put right what crossing messages, a lost one or a defect left half done; nothing of it is usual."""
+        """Repair rare inconsistencies after crossed or lost messages or an internal error."""
         now = time.monotonic()
         if now - self._mended < _MEND_S:
             return
@@ -330,13 +331,13 @@ class Claiming:
             held, kept = dict(self.claims.held), self._keeper.kept
             self._keeper.drop(kept.keys() - held.keys() - self._asked_for.keys())
         if lacking := [uav for uav in held if not kept.get(uav)] if not busy else []:
-            _log.warning("%d aircraft are held without their twins; they begin from what was said before", len(lacking))
+            _log.warning("%d owned aircraft have no twin; restored from published data", len(lacking))
             for uav in lacking:
                 self._keeper.adopt(uav, held[uav], None)
             self._recall(lacking)
 
     def _begin(self, act: Callable[..., None], *given: Any) -> threading.Thread:
-        """Do it beside the turns, which go on."""
+        """Run a task in a thread."""
         thread = threading.Thread(target=self._watched, args=(act, *given), daemon=True)
         thread.start()
         return thread
@@ -344,14 +345,14 @@ class Claiming:
     def _watched(self, act: Callable[..., None], *given: Any) -> None:
         try:
             act(*given)
-        except ConnectionError:  # the session is closed: we are leaving
+        except ConnectionError:  # the session is closed: shutdown
             return
-        except Exception:  # a defect met once must not end the claims
-            _log.exception("taking over met a defect; report it")
+        except Exception:  # an error must not stop the protocol
+            _log.exception("takeover failed with an internal error; report it")
         self._news.set()
 
     def _news_to_tell(self) -> bool:
-        """Return whether more or other aircraft are written for than was announced."""
+        """Return whether the claim differs from the last announced one."""
         claim = self.claim()
         return (claim.held, claim.bare) != self._told
 

@@ -1,4 +1,4 @@
-"""Who should hold an aircraft: the worker of the highest random weight among those whose range has its id. Pure."""
+"""Assign aircraft to workers by rendezvous hashing among the workers whose range contains the id. Pure functions."""
 
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
@@ -11,17 +11,17 @@ _S30, _S27, _S31 = np.uint64(30), np.uint64(27), np.uint64(31)
 
 
 def owners(uavs: Iterable[int], workers: Mapping[str, range]) -> dict[int, str]:
-    """Return the owner of each aircraft; one outside every range has none.
+    """Return the assigned worker of each aircraft; an id outside every range has none.
 
-    When a worker goes only its own aircraft move, when one comes it only takes: no other pair is weighed anew.
+    If a worker leaves, only its own aircraft move; if one joins, it only acquires: all other assignments stay.
 
     Args:
         uavs: ids
-        workers: the range of ids of every live worker, by its name
+        workers: id range of every live worker, by name
     Source: Thaler and Ravishankar 1998, highest random weight.
     """
     ids = np.fromiter(uavs, np.int64)
-    names = sorted(workers)  # of equal weights the first name wins, everywhere
+    names = sorted(workers)  # deterministic tie-break by name
     if not len(ids) or not names:
         return {}
     low = np.array([[workers[name].start] for name in names])
@@ -34,7 +34,7 @@ def owners(uavs: Iterable[int], workers: Mapping[str, range]) -> dict[int, str]:
 
 
 def owner(uav: int, workers: Mapping[str, range]) -> str | None:
-    """Return the owner of one aircraft; None outside every range."""
+    """Return the assigned worker of one aircraft; None outside every range."""
     return owners([uav], workers).get(uav)
 
 
@@ -44,7 +44,7 @@ def _number(name: str) -> int:
 
 
 def _mixed(x: np.ndarray) -> np.ndarray:
-    """Mix 64 bits so that every one depends on all.
+    """Mix 64 bits so that each output bit depends on all input bits.
 
     Source: Steele, Lea and Flood 2014, SplitMix64.
     """

@@ -1,4 +1,4 @@
-"""The twins one worker keeps: where messages wait for them, how they come, and how they go."""
+"""Store the twins of one worker: queue messages, acquire and release twins."""
 
 import logging
 import threading
@@ -22,71 +22,71 @@ from twin_worker.ownership.history_query import SELDOM, recall
 from twin_worker.twin.state.state import Twin, hear
 
 _log = logging.getLogger(__name__)
-INBOX = 4096  # messages waiting per UAV; the oldest go first and are counted
-_QUIET_S = 1.0  # after which one that came is written for, or has nothing to be written of it [s]
-_BUSY_S = 0.3  # for a twin that is just being worked on; it is asked for again [s]
+INBOX = 4096  # queued messages per UAV; the oldest are dropped and counted
+_QUIET_S = 1.0  # after this time an acquired snapshot counts as published, with or without a prediction [s]
+_BUSY_S = 0.3  # wait for a busy twin; the requester tries again [s]
 
 
 @dataclass(eq=False)
 class Held:
-    """One UAV this worker holds: its twin, its inbox and its claim."""
+    """One UAV owned by this worker: its twin, inbox and epoch."""
 
     twin: Twin
     epoch: int
     inbox: deque[Message] = field(default_factory=lambda: deque(maxlen=INBOX))
     arrived: float = float("nan")  # wall time of the newest sample [s, monotonic]
-    placed: Rows | None = None  # positions heard last
-    stood: float = float("-inf")  # data time of what was said without the twin, here or elsewhere [s since 1970]
-    published: float = float("-inf")  # when a prediction was, last [s, monotonic]
+    placed: Rows | None = None  # newest received positions
+    stood: float = float("-inf")  # data time of the newest prediction without the twin [s since 1970]
+    published: float = float("-inf")  # wall time of the newest published prediction [s, monotonic]
     shed: int = 0
-    failed: str = ""  # what went wrong last, a defect of ours
-    lock: threading.Lock = field(default_factory=threading.Lock)  # held while the twin changes, or is copied
-    filling: threading.Lock = field(default_factory=threading.Lock)  # held while the inbox is appended to, or replaced
-    ready: bool = True  # its twin is here
-    bare: bool = False  # without the telemetry of before
-    since: float = float("-inf")  # when its twin came [s, monotonic]
-    written: bool = False  # a prediction was published, or nobody else publishes any
-    told: tuple[Prediction, Wire] | None = None  # one that was asked for, and the same with law and parameters, packed
+    failed: str = ""  # newest internal error
+    lock: threading.Lock = field(default_factory=threading.Lock)  # protects changes and copies of the twin
+    filling: threading.Lock = field(default_factory=threading.Lock)  # protects the inbox
+    ready: bool = True  # the twin is available
+    bare: bool = False  # no past telemetry
+    since: float = float("-inf")  # when the twin became ready [s, monotonic]
+    written: bool = False  # a prediction was published, or no other worker publishes
+    told: tuple[Prediction, Wire] | None = None  # newest prediction, and the same encoded with law and parameters
 
 
 class Extras(Protocol):
-    """Who keeps what belongs to an aircraft besides its twin."""
+    """Stores data of an aircraft besides its twin."""
 
     def take(self, uav: int, load: Load) -> None:
-        """Keep what came with a twin."""
+        """Store the data received with a twin."""
 
     def show(self, uav: int) -> tuple[Ledger, Mismatch | None]:
-        """Return it: open conflicts, and the mismatch found last."""
+        """Return the open traffic alerts and the newest mismatch."""
 
     def forget(self, uav: int) -> None:
-        """Return it up."""
+        """Discard the data of an aircraft."""
 
 
 class Twins:
-    """What is kept; a `Keeper`.
+    """In-process `TwinStore`.
 
     Args:
-        bus: joined
-        ids: that may come
-        make: makes the twin of an id
-        extras: takes and gives what belongs to an aircraft besides its twin
+        bus: connected bus
+        ids: UAV ids this worker may own
+        create: creates the twin of an id
+        companion: stores data of an aircraft besides its twin
     """
 
     def __init__(self, bus: Bus, ids: range, make: Callable[[int], Twin], extras: Extras) -> None:
         self.held: dict[int, Held] = {}
         self.lock = threading.Lock()
         self.ids = ids
-        self.paced: Callable[[Callable[[], None]], None] = _at_once  # does what others need not wait for
+        self.paced: Callable[[Callable[[], None]], None] = _at_once  # runs low-priority tasks
         self._bus, self._make, self._extras = bus, make, extras
-        self._models: dict[int, Model] = {}  # last published by others, of ids of ours
+        self._models: dict[int, Model] = {}  # newest published by other workers, of ids in range
         self._predictions: dict[int, Prediction] = {}
-        self._said: dict[int, dict[type, Message]] = {}  # by gateways, of aircraft that others hold
+        self._said: dict[int, dict[type, Message]] = {}  # from gateways, of aircraft owned by others
         self._fence = Fence()
 
-    # --- what is heard -----------------------------------------------------------------------------------------------
+    # --- reception ---------------------------------------------------------------------------------------------------
 
     def hear(self, message: Message) -> bool:
-        """Let a message wait for its twin; tell whether there is one."""
+        """Queue a message for its twin; return whether there is one."""
         held = self.held.get(message.uav)
         if held is None:
             if isinstance(message, SELDOM) and message.uav in self.ids:
@@ -94,13 +94,13 @@ class Twins:
             return False
         if isinstance(message, Sample):
             held.arrived, held.placed = time.monotonic(), message.position or held.placed
-        with held.filling:  # never `lock`, which is held for as long as an identification takes
+        with held.filling:  # never `lock`, which an identification holds for its whole duration
             held.shed += len(held.inbox) == INBOX
             held.inbox.append(message)
         return True
 
     def overhear(self, said: Model | Prediction, stamp: Stamp | None) -> bool:
-        """Keep what another worker published of an aircraft of its own; tell whether that is believed."""
+        """Store another worker's result for its own aircraft; return whether its stamp is valid."""
         if said.uav in self.held or not self._fence.believes(said.uav, stamp):
             return False
         if isinstance(said, Model):
@@ -110,19 +110,19 @@ class Twins:
         return True
 
     def ready(self) -> list[Held]:
-        """Return those whose twins are here, by UAV id."""
+        """Return the aircraft with a ready twin, by UAV id."""
         with self.lock:
             return [held for _, held in sorted(self.held.items()) if held.ready]
 
-    # --- how they come -----------------------------------------------------------------------------------------------
+    # --- acquisition -------------------------------------------------------------------------------------------------
 
     def expect(self, uavs: Iterable[int]) -> None:
-        """Begin to collect what is heard of these, before their twins are here."""
+        """Queue messages of these aircraft before their twins arrive."""
         for uav in uavs:
             self._place(uav)
 
     def adopt(self, uav: int, epoch: int, twin: Handover | None) -> None:
-        """Hold one from now on, with its twin or without."""
+        """Acquire one aircraft, with a snapshot of its twin or without."""
         held = self._place(uav)
         held.epoch, held.bare = epoch, twin is None and not held.ready
         if twin is None:
@@ -130,7 +130,7 @@ class Twins:
             return
         try:
             if twin.code != fleet.SOURCES:
-                raise ValueError(f"uav-{uav}: found a twin of other sources, expected ours; start all workers alike")
+                raise ValueError(f"uav-{uav}: found a snapshot of another version, expected ours; update all workers")
             load = unpacked(twin.load, uav)
         except ValueError as error:
             _log.warning("%s", error)
@@ -140,17 +140,17 @@ class Twins:
         fresh = self._make(uav)
         load.twin.pace, load.twin.quota = fresh.pace, fresh.quota
         if (said := self._predictions.pop(uav, None)) is not None:
-            held.stood = max(held.stood, said.t)  # a copy that was long on its way has nothing to add to that
+            held.stood = max(held.stood, said.t)  # for a delayed snapshot
         for kept in (self._models, self._said):
             kept.pop(uav, None)  # type: ignore[attr-defined]
         self._begin(held, load.twin, load.inbox)
 
     def recall(self, uavs: list[int]) -> None:
-        """Begin some without their twins: with the gateway's last minutes, and the model published last.
+        """Start twins without snapshots: from the gateway's last minutes, and the last published model.
 
-        All of them go on at once. The past comes one by one, first to those whose future is known for the shortest
-        time, and what follows from it is spread over the usual periods. Where CPU time is short those that are
-        renewed meanwhile wait for theirs.
+        All continue their last prediction at once. Past telemetry is queried one by one, shortest horizon first.
+        Subsequent work is spread over the usual periods. If CPU time is short, aircraft with a propagated prediction
+        wait.
         """
         begun = [(uav, twin) for uav in uavs if (twin := self._go_on(uav)) is not None]
         begun.sort(key=lambda one: one[1].prediction.horizon_s if one[1].prediction else 0.0)
@@ -158,7 +158,7 @@ class Twins:
             (self.paced if twin.prediction else _at_once)(partial(self._recall, uav, twin, k / len(begun)))
 
     def _go_on(self, uav: int) -> Twin | None:
-        """Make a twin that writes at once where another worker published a prediction; None where there is a twin."""
+        """Create a twin that continues another worker's prediction; return None if a twin exists."""
         held = self.held.get(uav)
         if held is None or held.ready:
             return None
@@ -168,23 +168,23 @@ class Twins:
         return twin
 
     def _recall(self, uav: int, twin: Twin, share: float) -> None:
-        """Let a twin hear what was said before, and believe what was published."""
+        """Ingest the queried past messages into a twin, and restore the published model."""
         held = self.held.get(uav)
         if held is None:
             return
         try:
             past = recall(self._bus, uav, self._said.pop(uav, {}))
-        except ConnectionError:  # we are leaving
+        except ConnectionError:  # shutdown
             return
         model = self._models.pop(uav, None)
         with held.lock:
             base = twin.base
             for message in past:
                 hear(twin, message)
-            twin.base = base  # mission and parameters are news to this twin alone: the path it renews was flown by them
+            twin.base = base  # mission and parameters are new only to this twin: the continued path used them already
             known = model is not None and revive(twin, model)
             wait(twin, share, fly=held.ready and isfinite(twin.pace.renew), learn=known)
-        if self.held.get(uav) is not held:  # it was lost meanwhile
+        if self.held.get(uav) is not held:  # released meanwhile
             return
         if held.ready:
             held.bare = False
@@ -192,7 +192,7 @@ class Twins:
             self._begin(held, twin, [])
 
     def renew(self, uav: int, epoch: int) -> None:
-        """Write under another epoch from now on."""
+        """Publish under another epoch from now on."""
         if (held := self.held.get(uav)) is not None:
             held.epoch = epoch
 
@@ -202,7 +202,7 @@ class Twins:
 
     @staticmethod
     def _begin(held: Held, twin: Twin, before: list[Message], *, bare: bool = False) -> None:
-        """Go on with a twin, and with what came since: telemetry it has already taken in is not taken in again."""
+        """Start a twin with the messages queued meanwhile; skip telemetry it has already ingested."""
         with held.lock:
             known = twin.data_t if twin.data_t > 0 else twin.history.newest
             known = max([known, *(b.t for b in before)])
@@ -215,10 +215,10 @@ class Twins:
             if held.arrived != held.arrived and twin.history.newest > 0:
                 held.arrived = time.monotonic()
 
-    # --- how they go -------------------------------------------------------------------------------------------------
+    # --- release -----------------------------------------------------------------------------------------------------
 
     def drop(self, uavs: Iterable[int]) -> None:
-        """Hold these no longer."""
+        """Release these aircraft."""
         with self.lock:
             gone = {uav: self.held.pop(uav) for uav in uavs if uav in self.held}
         for uav, held in gone.items():
@@ -230,7 +230,7 @@ class Twins:
             self._extras.forget(uav)
 
     def copied(self, uav: int, epoch: int) -> Handover | None:
-        """Copy one's twin, between two of its turns; None where there is none yet, or it is worked on for longer."""
+        """Return a snapshot of one twin between two steps; None if it is not ready or busy for longer."""
         held = self.held.get(uav)
         if held is None or not held.lock.acquire(timeout=_BUSY_S):
             return None
@@ -240,7 +240,7 @@ class Twins:
             with held.filling:
                 waiting = list(held.inbox)
             load = packed(Load(held.twin, waiting, *self._extras.show(uav)))
-        except TypeError:  # a defect: its new owner begins cold
+        except TypeError:  # internal error: the new owner starts without a snapshot
             _log.exception("uav-%d cannot be handed over; report it", uav)
             load = b""
         finally:
@@ -249,13 +249,13 @@ class Twins:
 
     @property
     def kept(self) -> dict[int, bool]:
-        """Tell of each that is held or expected whether its twin is here."""
+        """Return for each owned or expected aircraft whether its twin is ready."""
         with self.lock:
             return {uav: held.ready for uav, held in self.held.items()}
 
     @property
     def quiet(self) -> frozenset[int]:
-        """Name those whose holder of before is still the one that writes."""
+        """Return the acquired aircraft whose previous owner still publishes."""
         since = time.monotonic() - _QUIET_S
         with self.lock:
             return frozenset(
@@ -264,7 +264,7 @@ class Twins:
 
     @property
     def bare(self) -> tuple[int, ...]:
-        """Name those without the telemetry of before."""
+        """Return the aircraft without past telemetry."""
         with self.lock:
             return tuple(uav for uav, held in self.held.items() if held.bare)
 

@@ -1,7 +1,7 @@
-"""Objects of known classes to bytes and back, without pickle: bytes from a wire become these classes or a `ValueError`.
+"""Serialise objects of registered classes without pickle: untrusted bytes give these classes or a `ValueError`.
 
-Plain values stay as they are; everything else is a list that begins with its kind, as in `["t", 1, 2]` for a tuple.
-An object that is met again is told as a reference, so that what was one stays one.
+Scalars are encoded as they are; everything else is a list that starts with its type tag: `["t", 1, 2]` is a tuple.
+A repeated object is encoded as a reference, so that identity is preserved.
 """
 
 from collections import deque
@@ -15,40 +15,40 @@ import msgspec
 import numpy as np
 
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "<u8", "<u4", "|i1", "|u1", "|b1")
-_DEEPEST = 24  # lists in lists
+_DEEPEST = 24  # nested lists
 _PLAIN = (type(None), bool, int, float, str, bytes)
 
 
 class Special(NamedTuple):
-    """A class of somebody else's: how to take it apart and how to put it together."""
+    """Conversion of a third-party class to serialisable parts and back."""
 
     apart: Callable[[Any], Any]
     together: Callable[[Any], Any]
 
 
 Known = Mapping[str, type | tuple[type, Special]]
-"""Classes by the name they travel under."""
+"""Classes by their serialised name."""
 
 
 def pack(thing: Any, known: Known) -> bytes:
-    """Return the bytes of an object.
+    """Serialise an object.
 
     Raises:
-        TypeError: when there is something of an unknown class in it; name it in `known`.
+        TypeError: when it contains an object of an unregistered class; add the class to `registry`.
     """
     return msgspec.msgpack.encode(_Writer(known).write(thing))
 
 
 def unpack(data: bytes, known: Known) -> Any:
-    """Return the object back.
+    """Deserialise an object.
 
     Raises:
-        ValueError: when the bytes are no object of these classes; the sender runs another version, or is hostile.
+        ValueError: when the bytes are no object of these classes; the sender runs another version or is hostile.
     """
     try:
         return _Reader(known).read(msgspec.msgpack.decode(data), 0)
     except (TypeError, KeyError, IndexError, AttributeError, OverflowError, RecursionError, msgspec.DecodeError) as why:
-        raise ValueError(f"twin: found {len(data)} bytes that are none ({why}); start both sides anew") from None
+        raise ValueError(f"twin: found {len(data)} invalid bytes ({why}), expected a twin; update workers") from None
 
 
 class _Writer:
@@ -56,7 +56,7 @@ class _Writer:
         self.names = {(one if isinstance(one, type) else one[0]): name for name, one in known.items()}
         self.special = {one[0]: one[1] for one in known.values() if not isinstance(one, type)}
         self.met: dict[int, int] = {}
-        self.kept: list[Any] = []  # as long as they are kept no other object has their id
+        self.kept: list[Any] = []  # keeps the objects alive, so that their ids stay unique
 
     def write(self, thing: Any) -> Any:
         kind = type(thing)
@@ -74,7 +74,7 @@ class _Writer:
             return ["q", thing.maxlen, *map(self.write, thing)]
         name = self.names.get(kind)
         if name is None:
-            raise TypeError(f"{kind.__module__}.{kind.__qualname__}: is not carried; name it among the known classes")
+            raise TypeError(f"{kind.__module__}.{kind.__qualname__}: is not serialisable; add it to the registry")
         if isinstance(thing, Enum):
             return ["e", name, thing.value]
         if isinstance(thing, tuple):
@@ -132,7 +132,7 @@ class _Reader:
         if kind == "x":
             special = self.known[rest[0]]
             if isinstance(special, type):
-                raise TypeError(f"{rest[0]} travels as it is")
+                raise TypeError(f"{rest[0]} has no codec")
             self.met[place] = special[1].together(self.read(rest[1], depth))
         elif kind == "s":
             self.met[place] = msgspec.msgpack.decode(rest[1], type=self._class(rest[0], msgspec.Struct))
@@ -141,7 +141,7 @@ class _Reader:
             made = self.met[place] = cls.__new__(cls)
             parts = {key: self.read(part, depth) for key, part in zip(rest[1::2], rest[2::2], strict=True)}
             if parts.keys() != set(_names(cls if is_dataclass(cls) else cls())):
-                raise TypeError(f"a {rest[0]} of other attributes")
+                raise TypeError(f"a {rest[0]} with other attributes")
             made.__dict__.update(parts)
         return self.met[place]
 
@@ -160,7 +160,7 @@ def _array(thing: np.ndarray, write: Callable[[Any], Any]) -> list[Any]:
     if thing.dtype == object:
         return ["w", list(thing.shape), *map(write, thing.ravel().tolist())]
     if thing.dtype.str not in _DTYPES:
-        raise TypeError(f"an array of {thing.dtype}: is not carried; expected one of {_DTYPES}")
+        raise TypeError(f"an array of {thing.dtype}: is not serialisable; expected one of {_DTYPES}")
     return ["a", thing.dtype.str, list(thing.shape), np.ascontiguousarray(thing).tobytes()]
 
 

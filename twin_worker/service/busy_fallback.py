@@ -1,4 +1,4 @@
-"""What is published of an aircraft whose twin is late or locked: its last path, from the position received last."""
+"""Publish a fallback prediction for a late or locked twin: its last path, shifted to the newest position."""
 
 import time
 from collections.abc import Callable
@@ -10,16 +10,16 @@ from twin_worker.ownership.twin_store import Held
 from twin_worker.twin.state.schedule import SOON
 from twin_worker.twin.steps.extrapolate import LATEST_S, OVERDUE_S, renewed
 
-LOOK_S = 0.4  # between looks for aircraft without a prediction [s]
-OLD_S = 1.0  # since an aircraft's last prediction was published, from which on another is due: least [s]
-_LATE = 1.2  # the same in the wanted periods of predictions [-]
-_LACKING = 2.0  # that in these from which on no renewal will come, either [-]
-_BACK_S = 1.0  # telemetry that lies so far before what was published: the clock was set back [s]
-_FARTHEST = 2e9  # positions beyond are noise [1e-7 deg, mm]
+LOOK_S = 0.4  # between checks for aircraft without a prediction [s]
+OLD_S = 1.0  # minimum age of the last published prediction before a fallback is due [s]
+_LATE = 1.2  # the same in scheduled prediction periods [-]
+_LACKING = 2.0  # multiple of that age at which the aircraft counts as without a prediction [-]
+_BACK_S = 1.0  # telemetry this far before the last prediction means that the clock was set back [s]
+_FARTHEST = 2e9  # larger coordinates are invalid [1e-7 deg, mm]
 
 
 def stand_in(held: Held) -> Prediction | None:
-    """Renew a prediction for a twin that is locked, which may be for seconds on a busy machine; it stays as it is."""
+    """Propagate the last prediction of a locked twin, without a change to the twin."""
     twin, rows = held.twin, held.placed
     if rows is None or not held.ready:
         return None
@@ -39,7 +39,7 @@ def stand_in(held: Held) -> Prediction | None:
 
 
 def stand_in_for(holding: list[Held], publish: Callable[[Message, Held], None]) -> None:
-    """Renew the predictions of all whose twins were not reached in time: for want of CPU time, or locked."""
+    """Propagate the predictions of all twins that are overdue, due to lack of CPU time or a lock."""
     for held in holding:
         late = time.monotonic() - held.published > _due_s(held)
         if late and (made := stand_in(held)) is not None:
@@ -47,7 +47,7 @@ def stand_in_for(holding: list[Held], publish: Callable[[Message, Held], None]) 
 
 
 def lacks_prediction(held: Held, now: float) -> bool:
-    """Return whether an aircraft has been without a prediction, even a renewed one, up to `now`, monotonic [s]."""
+    """Return whether an aircraft has no recent prediction, not even a propagated one, at `now`, monotonic [s]."""
     return now - held.published > _LACKING * _due_s(held)
 
 
@@ -57,14 +57,14 @@ def _due_s(held: Held) -> float:
 
 
 def said_already(result: Message, held: Held) -> bool:
-    """Return whether a prediction, come late, is older than what was said meanwhile."""
+    """Return whether a late prediction is older than the fallback published meanwhile."""
     if not isinstance(result, Prediction) or not held.stood - OVERDUE_S < result.t <= held.stood:
         return False
     return result.t > held.stood - LATEST_S or held.placed is None or _newest(held) > held.stood - _BACK_S
 
 
 def _newest(held: Held) -> float:
-    """Return the time of the newest position received [s since 1970]."""
+    """Return the time of the newest received position [s since 1970]."""
     try:
         t = held.placed.t.numpy() if held.placed is not None else np.empty(0)
     except ValueError:

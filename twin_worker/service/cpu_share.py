@@ -1,34 +1,34 @@
-"""The share of this process's CPU time that work on threads beside the sweep may take."""
+"""Limit the share of this process's CPU time used by background threads."""
 
 import threading
 import time
 from collections.abc import Callable
 
-LEAST = 0.2  # it never is less [-]
-_GROWS = 1.2  # how it recovers with every piece of work [-]
-_LOOK_S = 0.05  # between looks at how much the others had [s]
+LEAST = 0.2  # lower limit [-]
+_GROWS = 1.2  # recovery factor per task [-]
+_LOOK_S = 0.05  # between checks of the CPU time of the other threads [s]
 
 
 class Beside:
-    """Threads that rest after a piece of work until the others had their share.
+    """Make background threads rest after each task until the other threads received their share.
 
-    It is measured as CPU time: a process that is given little of it works as little on everything, and a piece of work
-    that took long because the processor was busy elsewhere is not paid for twice.
+    The share is measured in CPU time: a process with little CPU time slows all of its work equally, and a task delayed
+    by other processes does not lengthen the rest.
     """
 
     def __init__(self) -> None:
         self.share = 1.0
 
     def yield_to_telemetry(self, late: bool) -> None:
-        """Take less where telemetry is late; every piece of work after that may take a little more again."""
+        """Halve the share if telemetry is late; each later task raises it again."""
         self.share = max(0.5 * self.share, LEAST) if late else self.share
 
     def owed(self, worked: float) -> float:
-        """Return how much the others are to have after so much work [s]."""
+        """Return the rest after `used_s` of work [s]."""
         return worked * (1.0 / self.share - 1.0)
 
     def do(self, work: Callable[[], None], stop: threading.Event | None = None) -> None:
-        """Work, then rest until the other threads had their CPU time, or had time enough to take it."""
+        """Run a task, then rest until the other threads used their CPU time or had the wall time for it."""
         self.share = min(_GROWS * self.share, 1.0)
         cpu, wall = time.thread_time(), time.monotonic()
         work()

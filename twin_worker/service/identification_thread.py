@@ -1,4 +1,4 @@
-"""A thread that identifies one aircraft after another, so that the telemetry of the others never waits for it."""
+"""Identify one aircraft after another in a thread, so that telemetry of the others is not delayed."""
 
 import logging
 import threading
@@ -19,13 +19,13 @@ Publish = Callable[[Message, Held], None]
 
 
 class Learner:
-    """Identifies whoever has waited longest.
+    """Identifies the aircraft whose identification is oldest.
 
     Args:
-        holding: gives those whose twins are here
-        publish: sends a result
-        rates: where it is noted
-        beside: the share of CPU time it may take
+        owned_twins: returns the ready twins
+        publish: publishes a result
+        rates: counts the identifications
+        cpu_share: limits the CPU time
     """
 
     def __init__(
@@ -39,9 +39,9 @@ class Learner:
         self._beside = beside or Beside()
 
     def run(self, stop: threading.Event) -> None:
-        """Identify until told to stop, at the priority of those who predict.
+        """Identify until `stop` is set, at the same priority as the prediction thread.
 
-        A lower one would turn against them: where all cores are busy it would sleep with what they wait for in hand.
+        At a lower priority, a busy machine could suspend it while it holds a lock that the prediction thread needs.
         """
         while not stop.is_set():
             held = self._next()
@@ -53,8 +53,8 @@ class Learner:
     def _try(self, held: Held) -> None:
         try:
             self._identify(held)
-        except Exception as error:  # a defect met by one aircraft must not stop the others
-            held.failed = f"{held.twin.name}: found a defect ({error}), its model is missing; report it"
+        except Exception as error:  # an error in one aircraft must not stop the others
+            held.failed = f"{held.twin.name}: found an internal error ({error}), expected a model; report it"
             _log.exception(held.failed)
 
     def _next(self) -> Held | None:

@@ -1,4 +1,4 @@
-"""A worker's numbers as metrics: what it holds, how old that is, what heavy work was done, what was shed."""
+"""Export a worker's Prometheus metrics: owned aircraft, data age, completed work, dropped messages."""
 
 from collections.abc import Callable, Iterator
 from typing import Protocol
@@ -13,26 +13,26 @@ _TWIN = Naming("parauav_twin", ("uav",), _NOW)
 
 
 class Bussed(Protocol):
-    """A worker's side of the bus."""
+    """Bus attributes used for metrics."""
 
     bad: int
 
     @property
     def router(self) -> str:
-        """Name the router; empty: none is there."""
+        """Return the router's address; empty if not connected."""
 
 
 def counters(state: Callable[[], FleetState], bus: Bussed) -> Families:
-    """Return what Prometheus is told."""
+    """Return the metric families of a worker."""
     return lambda: _counters(state(), bus)
 
 
 def _counters(state: FleetState, bus: Bussed) -> Iterator[Metric]:
-    yield GaugeMetricFamily("parauav_worker_uavs", "aircraft held", len(state.rows))
-    yield GaugeMetricFamily("parauav_worker_router", "a router is there", float(bool(bus.router)))
-    yield CounterMetricFamily("parauav_worker_undecodable", "messages heard that do not fit the contract", bus.bad)
-    yield GaugeMetricFamily("parauav_worker_shed", "messages of aircraft held that found no room", state.shed)
-    done = CounterMetricFamily("parauav_worker_done", "heavy work done", labels=["work"])
+    yield GaugeMetricFamily("parauav_worker_uavs", "owned aircraft", len(state.rows))
+    yield GaugeMetricFamily("parauav_worker_router", "1 if a router is connected", float(bool(bus.router)))
+    yield CounterMetricFamily("parauav_worker_undecodable", "messages that cannot be decoded", bus.bad)
+    yield GaugeMetricFamily("parauav_worker_shed", "messages dropped, inbox full", state.shed)
+    done = CounterMetricFamily("parauav_worker_done", "completed heavy work", labels=["work"])
     for work, count in state.done.items():
         done.add_metric([work], count)
     yield done
@@ -45,9 +45,9 @@ def _judged(rows: tuple[FleetRow, ...]) -> Iterator[Metric]:
     for state in State:
         states.add_metric([state.value], sum(row.state is state for row in rows))
     yield states
-    fits = GaugeMetricFamily("parauav_twin_fit", "on unseen data, by state of the model [%]", labels=["uav", "of"])
-    alerts = GaugeMetricFamily("parauav_twin_alerts", "alerts in force", labels=["uav"])
-    mismatch = GaugeMetricFamily("parauav_twin_mismatch", "flight and twin part ways", labels=["uav"])
+    fits = GaugeMetricFamily("parauav_twin_fit", "on held-out data, by state of the model [%]", labels=["uav", "of"])
+    alerts = GaugeMetricFamily("parauav_twin_alerts", "active alerts", labels=["uav"])
+    mismatch = GaugeMetricFamily("parauav_twin_mismatch", "1 if a mismatch is detected", labels=["uav"])
     for row in rows:
         for name, fit in row.fit.items():
             fits.add_metric([str(row.uav), name], fit)

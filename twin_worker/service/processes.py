@@ -1,4 +1,4 @@
-"""Several workers of one range on one machine: they share it by their claims, as workers on several machines do."""
+"""Run several workers for one id range on one machine; they share it by the ownership protocol."""
 
 import threading
 
@@ -6,11 +6,11 @@ from fleet.process.children import Children
 from fleet.process.logs import tell
 
 _LOOK_S = 0.5
-_AGAIN_S = 5.0  # before one that died is started again, so that what kills it at once does not run hot [s]
+_AGAIN_S = 5.0  # before a restart, so that an immediate failure does not loop at full load [s]
 
 
 def run_many(options: list[list[str]], stop: threading.Event) -> int:
-    """Run a worker with each of these options until told to stop; who dies is started again, a refusal ends all."""
+    """Run one worker per list of options until `stop` is set; restart failed ones, end all on a usage error."""
     with Children() as children:
         started = {f"worker {k}": each for k, each in enumerate(options)}
         for name, each in started.items():

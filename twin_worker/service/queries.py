@@ -1,4 +1,4 @@
-"""What one worker answers about its aircraft: the newest predictions, on any grid or all at once, and what-ifs."""
+"""Answer queries about a worker's aircraft: newest predictions, on any grid or all at once, and what-ifs."""
 
 import copy
 import logging
@@ -21,21 +21,21 @@ Stamped = Iterator[tuple[Any, Stamp]]
 
 
 class Answers:
-    """Answers under the claim of each aircraft.
+    """Query handlers; each answer carries the aircraft's fencing token.
 
     Args:
-        writer: of the bus
-        holding: gives those whose twins are here, by UAV id
+        writer: id of the bus session
+        owned_twins: returns the ready twins, by UAV id
     """
 
     def __init__(self, writer: int, holding: Callable[[], list[Held]]) -> None:
         self._writer, self._holding = writer, holding
 
     def predictions(self, uav: int | None, asked: dict[str, str], payload: bytes) -> Stamped:
-        """Return the newest prediction of one aircraft or all, on the grid that is asked for, or what one supposes.
+        """Return the newest prediction of one aircraft or all, on the requested grid, or the result of a what-if.
 
         Raises:
-            ValueError: when grid or question are absurd, or cannot be answered; the sentence says why.
+            ValueError: when the grid or the query is invalid or cannot be answered; the message states the reason.
         """
         grid = wanted(asked)
         if payload:
@@ -47,24 +47,24 @@ class Answers:
         return self.stamped((held, made and resample(made.message(), grid)) for held, made in found)
 
     def at_once(self) -> Predictions:
-        """Return the newest prediction of every aircraft held."""
+        """Return the newest prediction of every owned aircraft."""
         found = [(Raw(made.payload), held.epoch) for held in self._holding() if (made := told(held)) is not None]
         predictions, epochs = (tuple(each) for each in zip(*found, strict=True)) if found else ((), ())
         return Predictions(t=time.time(), predictions=predictions, epochs=epochs)
 
     def of(self, uav: int | None) -> list[Held]:
-        """Return the aircraft asked for, all for None, if it is held."""
+        """Return the requested aircraft if owned; all for None."""
         return [held for held in self._holding() if uav in (None, held.twin.uav)]
 
     def stamped(self, pairs: Iterable[tuple[Held, Any]]) -> Stamped:
-        """Put the claim beside what there is to tell."""
+        """Pair each message with its stamp; skip None."""
         return ((message, Stamp(held.epoch, self._writer)) for held, message in pairs if message is not None)
 
     def _supposed(self, uav: int | None, asked: WhatIf) -> list[tuple[Held, Prediction]]:
-        """Let a copy of one twin fly what a query supposes.
+        """Run a what-if on a copy of one twin.
 
         Raises:
-            ValueError: when it names no single aircraft, or this one cannot be flown so.
+            ValueError: when it does not select a single aircraft, or its twin cannot run it; ask one UAV.
         """
         if uav is None:
             raise ValueError("what if: found a query for every aircraft, expected one; ask e.g. parauav/7/prediction")
@@ -72,10 +72,10 @@ class Answers:
 
 
 def suppose(held: Held, asked: WhatIf) -> Prediction:
-    """Copy the twin between two messages and let the copy answer, on the asker's thread.
+    """Run a what-if on a copy of the twin, on the caller's thread.
 
     Raises:
-        ValueError: when it cannot answer; the sentence says why.
+        ValueError: when it cannot be answered; the message states the reason.
     """
     with held.lock:
         twin = copy.deepcopy(held.twin)
@@ -83,13 +83,13 @@ def suppose(held: Held, asked: WhatIf) -> Prediction:
         return answer(twin, asked)
     except ValueError:
         raise
-    except Exception as error:  # a defect met by a question must not stop the answers
+    except Exception as error:  # an error in one query must not stop the others
         _log.exception("%s: a what-if failed", twin.name)
-        raise ValueError(f"what if: {twin.name} met a defect ({error}), expected a prediction; report it") from None
+        raise ValueError(f"{twin.name}: found an internal error ({error}), expected a prediction; report it") from None
 
 
 def told(held: Held) -> Wire | None:
-    """Return the newest prediction with the law and parameters it was flown by, packed once; None before any."""
+    """Return the newest prediction, encoded with its law and parameters; None before the first."""
     made, control = held.twin.prediction, held.twin.control
     if made is None:
         return None

@@ -1,4 +1,4 @@
-"""Compile the twin's physics before the first aircraft needs it, on a made-up straight flight."""
+"""Compile the twin's physics before the first aircraft needs it, on a synthetic straight flight."""
 
 import numpy as np
 
@@ -40,7 +40,7 @@ _ITEMS = tuple(
 
 
 def warm_up() -> None:
-    """Run every compiled function of the worker once; from the disk cache this takes about a second."""
+    """Run every compiled function of the worker once; about one second from the disk cache."""
     window = _flight()
     axes = [identify_axis(axis, window, 2.0)[1] for axis in AXES]
     par, _ = arduplane.parameters({})
@@ -71,7 +71,7 @@ def warm_up() -> None:
 
 
 def _in_the_large(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: Window) -> None:
-    """Fly the hybrid, alone and in a bundle of two."""
+    """Run the point-mass model, alone and as a batch of two."""
     body, air, start = np.ones(point_mass.N_BODY), np.ones(point_mass.N_AIR), np.zeros(point_mass.N_START)
     body[point_mass.V_0] = start[point_mass.V] = _SPEED
     start[:3], chance = window.p[-1], np.zeros((2, 5, 4))
@@ -82,7 +82,7 @@ def _in_the_large(control: tuple[np.ndarray, np.ndarray, np.ndarray], window: Wi
 
 
 def _meet() -> None:
-    """Let two aircraft fly at each other."""
+    """Run the conflict detection for two aircraft on a collision course."""
     traffic, ahead = Traffic(), np.arange(0.0, 20.0)
     for uav, way in ((0, 1.0), (1, -1.0)):
         path = np.column_stack([way * _SPEED * (ahead - 10.0), 0.0 * ahead, -100.0 + 0.0 * ahead])
@@ -101,7 +101,7 @@ def _meet() -> None:
 
 
 def _go_on() -> None:
-    """Renew a prediction, feed the wind filter, and see whether it flies."""
+    """Propagate a prediction, update the wind filter, and detect flight."""
     ahead, path = (Array.of(values).numpy() for values in (np.arange(5.0), np.zeros((5, 3))))
     shifted(ahead, path, 1.0, np.zeros(3), np.empty((4, 3), np.float32))  # type: ignore[call-arg]
     widened(ahead, path, 1.0, np.empty((4, 3), np.float32))  # type: ignore[call-arg]
@@ -110,13 +110,13 @@ def _go_on() -> None:
 
 
 def _recall() -> None:
-    """Read what a gateway tells of the past."""
+    """Decode a history message."""
     rows = Rows(t=Array.of([1e9], "<f8"), x=Array.of(np.zeros((1, 3))))
     read(encode(History(uav=0, t=1e9, samples=(Sample(uav=0, t=1e9, velocity=rows),))))
 
 
 def _remember(window: Window) -> None:
-    """Lay telemetry on the grid, hold what was reported, and answer a prediction."""
+    """Resample telemetry, hold an input, and score a prediction."""
     place = to_geodetic(_HOME, window.p).astype(float)
     history = Telemetry()
     for name, rows in (("attitude", window.x[:, 3:]), ("velocity", window.v), ("position", place)):
@@ -130,7 +130,7 @@ def _remember(window: Window) -> None:
 
 
 def _learn() -> None:
-    """Identify, verify, and tell what a model is worth: whoever first does holds the lock of an aircraft meanwhile."""
+    """Identify, verify and compute the shrinkage sample, as the first identification holds an aircraft's lock."""
     window = _flight(60.0)
     plant, known = identify(window, np.zeros(2), load(GENERIC)), len(window) // 2
     verify(plant, window, known, 0.0, None)
@@ -141,7 +141,7 @@ def _learn() -> None:
 
 
 def _flight(seconds: float = 20.0, dt: float = 0.04) -> Window:
-    """Make up a flight due north with a little of everything in every channel."""
+    """Return a synthetic flight due north with noise in every channel."""
     n = int(seconds / dt)
     rng = np.random.default_rng(0)
     t = dt * np.arange(n)

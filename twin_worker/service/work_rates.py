@@ -1,16 +1,16 @@
-"""How often heavy work is really done, and what to say where that is too seldom."""
+"""Measure the actual rates of heavy work, and describe those that are too low."""
 
 from collections import Counter, deque
 
 from twin_worker.twin.state.schedule import Pace, Work
 
-OVER_S = 30.0  # rates are of so long [s]
-_LATE = 1.3  # share of the wanted period from which it is worth saying [-]
+OVER_S = 30.0  # averaging time of the rates [s]
+_LATE = 1.3  # ratio of actual to scheduled period that is reported [-]
 _MOST = 20_000
 
 
 class Rates:
-    """What one worker did lately, and in all."""
+    """Work of one worker: recent rates and totals."""
 
     def __init__(self) -> None:
         self._done: dict[Work, deque[float]] = {work: deque(maxlen=_MOST) for work in Work}
@@ -18,13 +18,13 @@ class Rates:
         self.total: Counter[Work] = Counter()
 
     def note(self, work: Work, now: float, times: int = 1) -> None:
-        """Note work done at `now`, monotonic [s]."""
+        """Record work done at `now`, monotonic [s]."""
         self._since = now if self._since is None else self._since
         self._done[work].extend([now] * times)
         self.total[work] += times
 
     def period(self, work: Work, aircraft: int, now: float) -> float:
-        """Return how often each of so many aircraft got it [s]; 0: not known yet, inf: never."""
+        """Return the mean period of the work per aircraft [s]; 0: not known yet, inf: never."""
         if self._since is None or now - self._since < OVER_S:
             return 0.0
         done = self._done[work]
@@ -33,7 +33,7 @@ class Rates:
         return aircraft * OVER_S / len(done) if done else float("inf")
 
     def said(self, pace: Pace, aircraft: int, now: float) -> list[str]:
-        """Say what is shed; nothing where all is done as often as wanted."""
+        """Describe the work that is less frequent than scheduled; empty if there is none."""
         wanted = {Work.PREDICT: pace.predict, Work.IDENTIFY: pace.identify}
         found = {work: self.period(work, aircraft, now) for work in wanted}
         late = [

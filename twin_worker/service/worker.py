@@ -1,4 +1,4 @@
-"""The live driver: messages from the bus to the twins this worker holds, results back, one line per UAV."""
+"""Live driver: pass bus messages to the twins of this worker, publish the results and one row per UAV."""
 
 import logging
 import threading
@@ -39,17 +39,17 @@ from twin_worker.twin.state.state import AUTO
 from twin_worker.twin.step import Twin, advance, catch_up, fleet_row
 
 _log = logging.getLogger(__name__)
-_SILENT_S = 1.0  # wall time without news after which data time runs on by the wall clock [s]
-_STALL_S = 1.0  # of silence counted between two sweeps at most: a worker that stood still knows of no silence [s]
+_SILENT_S = 1.0  # wall time without a sample after which data time follows the wall clock [s]
+_STALL_S = 1.0  # maximum silence counted between two sweeps, because a stalled worker receives nothing [s]
 _STATE_S = 1.0  # between fleet tables [s]
-_OTHERS_S = 0.4  # between looks at what others predict [s]
-_OTHERS = 0.1  # of the CPU time of this process that such a look may take [-]
-_SWEEP_S = 0.015  # of telemetry is taken in at once [s]
-_LATE_S = 0.12, 0.2  # between sweeps, from which telemetry counts as late: least and most [s]
-_LATE, _HEAVY = 1.2, 0.25  # that in periods of renewal; what heavy work may take of it, CPU [-]
-_END_S = 1.0  # for a thread to end what it has begun; one that is late is left behind [s]
-_OFF_S = 60.0  # after a defect of the diagnosis that is no aircraft's [s]
-_NEW_S = 2.0  # an aircraft that came so lately is predicted before any other work begins [s]
+_OTHERS_S = 0.4  # between reads of other workers' predictions [s]
+_OTHERS = 0.1  # maximum share of the CPU time of this process for these reads [-]
+_SWEEP_S = 0.015  # telemetry is collected for this time before a sweep [s]
+_LATE_S = 0.12, 0.2  # limits of the sweep period above which telemetry counts as late [s]
+_LATE, _HEAVY = 1.2, 0.25  # that period in propagation periods; share of it for heavy work, CPU [-]
+_END_S = 1.0  # wait for the end of each thread; a blocked one is abandoned [s]
+_OFF_S = 60.0  # pause after an internal error of the diagnosis as a whole [s]
+_NEW_S = 2.0  # an aircraft acquired within this time has priority for its first prediction [s]
 
 
 class Worker:
@@ -70,25 +70,25 @@ class Worker:
         self.bus, self.uavs, self.diagnosis = bus, uavs, diagnosis
         self.omega, self.method, self.airframe = omega, method, airframe or load(GENERIC)
         self.pace = pace or Pace()
-        self._late = min(max(_LATE * self.pace.renew, _LATE_S[0]), _LATE_S[1])  # who renews often wants short sweeps
+        self._late = min(max(_LATE * self.pace.renew, _LATE_S[0]), _LATE_S[1])  # short for frequent propagation
         self.quota = Quota(most=_HEAVY * self._late)
         self.sentence = self._undiagnosed = ""
-        self._diagnose_from = float("-inf")  # no diagnosis is begun before [s, monotonic]
+        self._diagnose_from = float("-inf")  # earliest next diagnosis [s, monotonic]
         self.rates = Rates()
         self.beside = Beside()
         self.learner = Learner(self._whole, self._publish, self.rates, self.beside)
-        self._swept = float("-inf")  # when the last sweep began [s, monotonic]
-        self._first = 0  # whose turn is the first of the next sweep
+        self._swept = float("-inf")  # start of the last sweep [s, monotonic]
+        self._first = 0  # index of the first aircraft of the next sweep
         self.traffic = Traffic(separation or Separation())
         self._twins = Twins(bus, uavs, self._make, self)
         self._twins.paced = self.beside.do
         self._held = self._twins.held
         self.claiming = Claiming(bus, uavs, self._twins)
         self._news = threading.Event()
-        self._renewing = threading.Lock()  # held while late predictions are renewed: the sweep waits for that
+        self._renewing = threading.Lock()  # in use while fallback predictions are published; the sweep waits for it
 
     def listen(self) -> None:
-        """Subscribe, answer queries, and ask for what was said before this worker came."""
+        """Subscribe, declare the query handlers, and query the aircraft that exist already."""
         told = Answers(self.bus.writer, self.holding)
         self.claiming.join()
         self.bus.subscribe(Sample, lambda message, _: self._hear(message), self._wants)
@@ -109,12 +109,12 @@ class Worker:
         return Twin(uav, omega=self.omega, method=self.method, airframe=self.airframe, pace=self.pace, quota=self.quota)
 
     def _wants(self, uav: int) -> bool:
-        """Return whether an aircraft is held, or about to be; one never heard of may be claimed."""
+        """Return whether an aircraft is owned or expected; a new one is registered first."""
         self.claiming.hear_of(uav)
         return uav in self._held
 
     def _may_want(self, uav: int) -> bool:
-        """Return whether an aircraft may ever be held."""
+        """Return whether an aircraft is in the id range; a new one is registered first."""
         self.claiming.hear_of(uav)
         return uav in self.uavs
 
@@ -123,13 +123,13 @@ class Worker:
             self._news.set()
 
     def _overhear(self, said: Prediction | Model, stamp: Stamp | None) -> None:
-        """Keep what others say of their aircraft; of two writers the higher claim is believed."""
+        """Store results of other workers; of two publishers the higher claim is valid."""
         self.claiming.overheard(said.uav, stamp)
         if self._twins.overhear(said, stamp) and isinstance(said, Prediction):
             self.traffic.hear(said)
 
     def _overhear_all(self, letters: list[Letter]) -> None:
-        """Read what others predict: the newest of each aircraft, a few times a second."""
+        """Decode the newest predictions of other workers, a few times a second."""
         for uav, payload, named, stamp in letters:
             if uav in self._held:
                 self.claiming.overheard(uav, stamp)
@@ -142,44 +142,44 @@ class Worker:
                 self._overhear(said, stamp)
 
     def take(self, uav: int, load: Load) -> None:
-        """Keep what came with a twin from another worker."""
+        """Store the data received with a twin from another worker."""
         self.traffic.take(uav, load.conflicts)
         if self.diagnosis is not None and load.mismatch is not None:
             self.diagnosis.watch(uav).told = load.mismatch
 
     def show(self, uav: int) -> tuple[Ledger, Mismatch | None]:
-        """Return what goes with a twin to another worker."""
+        """Return the data to send with a twin to another worker."""
         watch = self.diagnosis.watches.get(uav) if self.diagnosis is not None else None
         return self.traffic.show(uav), watch.told if watch is not None else None
 
     def forget(self, uav: int) -> None:
-        """Give up what belongs to a twin that is held here no longer."""
+        """Discard the data of a twin that this worker no longer owns."""
         self.traffic.forget(uav)
         if self.diagnosis is not None:
             self.diagnosis.watches.pop(uav, None)
 
     def active(self, held: Held) -> list[Alert]:
-        """Return the alerts of one aircraft that are in force."""
+        """Return the active alerts of one aircraft."""
         return held.twin.ledger.active + self.traffic.active(held.twin.uav)
 
     def holding(self) -> list[Held]:
-        """Return what this worker holds, by UAV id."""
+        """Return the ready twins, by UAV id."""
         return self._twins.ready()
 
     def _whole(self) -> list[Held]:
-        """Return those held that have heard what was said before."""
+        """Return the ready twins with past telemetry."""
         return [held for held in self.holding() if not held.bare]
 
     def turn(self) -> int:
-        """Advance every twin once; return how many messages were taken in."""
+        """Step every twin once; return the number of ingested messages."""
         taken, begun = 0, time.monotonic()
         for held in self._in_turn():
             with self._renewing:
                 waiting = len(held.inbox)
             taken += waiting
             if not waiting and not begun - held.arrived > _SILENT_S and not held.lock.locked():
-                continue  # as it is with most in most sweeps
-            if held.lock.locked():  # it is identified just now, or copied
+                continue  # the usual case
+            if held.lock.locked():  # in identification or copied
                 if (made := stand_in(held)) is not None:
                     self._publish(made, held)
                 continue
@@ -188,16 +188,16 @@ class Worker:
                     if not said_already(result, held):
                         self._publish(result, held)
                 self.quota.settle()
-            except Exception as error:  # a defect met by one aircraft must not stop the others
-                held.failed = f"{held.twin.name}: found a defect ({error}), its results are missing; report it"
+            except Exception as error:  # an error in one aircraft must not stop the others
+                held.failed = f"{held.twin.name}: found an internal error ({error}), expected results; report it"
                 _log.exception(held.failed)
         self._diagnose()
         return taken
 
     def _in_turn(self) -> list[Held]:
-        """Return all, those without a prediction first, then those whose last is old, then each sweep another.
+        """Return all twins: those without a prediction first, then those with an outdated one, then in rotating order.
 
-        Heavy work may go to the first alone, and who could not be renewed has nothing but a flight ahead to wait for.
+        The budget may allow heavy work for the first twins only, and a twin that cannot be propagated needs a rollout.
         """
         found = self.holding()
         self._first = (self._first + 1) % max(len(found), 1)
@@ -210,11 +210,11 @@ class Worker:
         return found
 
     def _watch_time(self) -> None:
-        """Let heavy work wait where telemetry does: a sweep that was late leaves it a share of the CPU time."""
+        """Reduce the heavy work after a late sweep."""
         now = time.monotonic()
         passed, self._swept = now - self._swept, now
         late = passed > self._late
-        if _STALL_S < passed < float("inf"):  # what arrived meanwhile is not taken in yet: that is no silence
+        if _STALL_S < passed < float("inf"):  # messages received meanwhile are not ingested yet: no silence
             for held in self._held.copy().values():
                 held.arrived = min(held.arrived + passed - _STALL_S, now)
         self.beside.yield_to_telemetry(late)
@@ -225,14 +225,14 @@ class Worker:
                 self.rates.note(work, now, done)
 
     def _publish(self, result: Message, held: Held) -> None:
-        """Publish under the claim in force; what is held no longer, or not surely, is kept back."""
+        """Publish a result with its stamp; discard it without confirmed ownership."""
         if held.ready and self.claiming.may_write():
             self.bus.publish(result, Stamp(held.epoch, self.bus.writer))
             if isinstance(result, Prediction):
                 held.written, held.published = True, time.monotonic()
 
     def _diagnose(self) -> None:
-        """Let the diagnosis go on in the background, and publish what it found."""
+        """Run the background diagnosis once, and publish its results."""
         if self.diagnosis is None or time.monotonic() < self._diagnose_from:
             return
         held = {one.twin.uav: one for one in self.holding()}
@@ -240,8 +240,10 @@ class Worker:
             for found in self.diagnosis.turn([(one.twin, one.lock) for one in held.values()]):
                 self._publish(found, held[found.uav])
             self._undiagnosed = ""
-        except Exception as error:  # a defect of the diagnosis must not stop the predictions
-            self._undiagnosed = f"the diagnosis met a defect ({error}); it is tried again in {_OFF_S:.0f} s, report it"
+        except Exception as error:  # an error in the diagnosis must not stop the predictions
+            self._undiagnosed = (
+                f"diagnosis failed with an internal error ({error}); retried in {_OFF_S:.0f} s, report it"
+            )
             self._diagnose_from = time.monotonic() + _OFF_S
             _log.exception(self._undiagnosed)
 
@@ -257,7 +259,7 @@ class Worker:
             for h in self.holding()
         ]
         shed = sum(held.shed for held in self.holding())
-        said = [f"{shed} messages shed: too many UAVs for this worker"] if shed else []
+        said = [f"{shed} messages dropped: too many UAVs for this worker"] if shed else []
         said += self.rates.said(self.pace, len(self.holding()), time.monotonic())
         said += [held.failed for held in self.holding() if held.failed]
         if self.diagnosis is not None:
@@ -268,7 +270,7 @@ class Worker:
         return FleetState(t=time.time(), rows=tuple(rows), sentence=sentence, done=done, shed=shed)
 
     def run(self, stop: threading.Event) -> None:
-        """Join, turn until told to stop, publishing the fleet table once a second; then hand everything over."""
+        """Connect, sweep until `stop` is set, publish the fleet table once a second; then hand everything over."""
         self.claiming.threaded, self.quota.aside = True, frozenset({Work.IDENTIFY})
         self.listen()
         each = (self.claiming.run, self.learner.run, self._stand_in)
@@ -278,20 +280,20 @@ class Worker:
         self._turn_while(lambda: not stop.is_set())
         heirs = threading.Thread(target=self.claiming.leave, daemon=True)
         heirs.start()
-        self._turn_while(heirs.is_alive)  # each is written for until its own turn to go comes
+        self._turn_while(heirs.is_alive)  # each aircraft is published until its handover
         for hand in (*hands, heirs):
             hand.join(_END_S)
 
     def _stand_in(self, stop: threading.Event) -> None:
-        """Look after aircraft whose twins are late, on a thread of its own: it waits for no other work."""
+        """Publish fallback predictions for late twins, on a thread that waits for no other work."""
         while not stop.wait(LOOK_S):
             try:
                 with self._renewing:
                     stand_in_for(self.holding(), self._publish)
-            except ConnectionError:  # the session is closed: we are leaving
+            except ConnectionError:  # the session is closed: shutdown
                 return
-            except Exception:  # a defect met once must not end the renewals
-                _log.exception("renewing late predictions met a defect; report it")
+            except Exception:  # an error must not stop the fallbacks
+                _log.exception("fallback predictions failed with an internal error; report it")
 
     def _turn_while(self, condition: Callable[[], bool]) -> None:
         due, listen, enough, pause = 0.0, 0.0, 0.0, threading.Event()
@@ -312,16 +314,16 @@ class Worker:
 
 
 def data_time(held: Held) -> float:
-    """Return the UAV's data time now: its newest sample, and the wall time since where it has fallen silent [s]."""
+    """Return the UAV's current data time [s]: its newest sample, plus the wall time since it fell silent."""
     silent = time.monotonic() - held.arrived
     newest = held.twin.history.newest
     return newest + silent if silent > _SILENT_S else newest
 
 
 def _advance_all(held: Held, waiting: int, traffic: Traffic) -> Iterator[Message]:
-    """Turn the loop after every message, as offline; the wall clock turns it on where data have fallen silent.
+    """Step the twin after every message, as offline; without data the wall clock steps it.
 
-    Where the quota has a limit, what has waited is taken in at once: a late worker would otherwise never catch up.
+    With a limited budget, queued messages are ingested together, because a late worker could not catch up otherwise.
     """
     twin = held.twin
     if twin.quota is not None and twin.quota.limited and waiting > 1:
@@ -334,14 +336,14 @@ def _advance_all(held: Held, waiting: int, traffic: Traffic) -> Iterator[Message
         waiting = 1
     for left in reversed(range(waiting)):
         with held.lock:
-            if not held.ready:  # handed over meanwhile, with what still waits
+            if not held.ready:  # released meanwhile, with the rest of its inbox
                 return
             if twin.quota is not None:
                 twin.quota.behind = left > 0
             results = advance(twin, (held.inbox.popleft(),))
         yield from traffic.after(twin.uav, twin.turned_t, results)
     now = data_time(held)
-    if not waiting and now > twin.history.newest:  # a worker that is late hears no silence
+    if not waiting and now > twin.history.newest:  # a late worker does not detect silence
         with held.lock:
             results = advance(twin, (), now) if held.ready else []
         yield from traffic.after(twin.uav, twin.turned_t, results)

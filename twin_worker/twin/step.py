@@ -1,4 +1,4 @@
-"""THE loop of one aircraft, `advance(twin, messages, now)`. Data time only: no bus, no thread, no wall clock."""
+"""Step one aircraft's twin: `advance(twin, messages, now)`. Uses data time only: no bus, thread or wall clock."""
 
 from collections.abc import Iterable, Iterator
 from math import isfinite
@@ -22,27 +22,27 @@ from twin_worker.twin.steps.identify_step import learn
 from twin_worker.twin.steps.predict_step import LOOK_BACK_S, foresee
 from twin_worker.twin.steps.rollouts import fly_put_off
 
-LOST_S = 3.0  # without a sample: link lost [s]
-_TICK_S = 1.0  # between turns while data are silent, between scorings, and of tries to foresee [s]
-_BEFORE_S = 3.0  # positions from before those that were scored last, so that none falls between [s]
-_SILENT_TURNS = 150  # most of them [-]
-_LATE_S = 10.0  # velocities older than this come too late for the wind [s]
-_AHEAD_S = 1.0  # data time that is ahead of telemetry by more goes back when telemetry arrives [s]
-_LATEST = 4e9  # times beyond are noise [s since 1970]
+LOST_S = 3.0  # link lost after this time without a sample [s]
+_TICK_S = 1.0  # between steps without data, between scorings, and before a failed prediction is retried [s]
+_BEFORE_S = 3.0  # overlap with positions already scored, so that none is skipped [s]
+_SILENT_TURNS = 150  # maximum number of steps without data [-]
+_LATE_S = 10.0  # older velocities are not used for the wind [s]
+_AHEAD_S = 1.0  # data time further ahead of telemetry is set back to the next sample [s]
+_LATEST = 4e9  # later times are invalid [s since 1970]
 
 
 def advance(twin: Twin, messages: Iterable[Message], now: float = -np.inf) -> list[Message]:
-    """Take what was heard, and identify, verify, predict and score whatever fell due meanwhile.
+    """Ingest messages, and identify, verify, predict and score whatever is due.
 
-    Data time is the newest time in any message, on the time axis of telemetry, and deadlines are met after every
-    single one: the answer does not depend on how a driver groups them. Where the data themselves are silent the loop
-    turns once a second. Silence is judged by arrival: telemetry that arrives is not silent, whatever its times are
+    Data time is the newest time in any message, on the time axis of telemetry. Due work runs after every message,
+    so the result does not depend on how a driver groups them. Without data, the twin steps once a second. Silence is
+    measured by arrival: arriving telemetry is not silent, whatever its time stamps
     (see `twin_worker.telemetry.arrival_delay`).
 
     Args:
         twin: the aircraft's twin, changed in place
-        messages: Sample, Status, Mission, Params in the order they were heard
-        now: data time by the wall clock, where data have fallen silent [s since 1970]
+        messages: Sample, Status, Mission, Params in order of reception
+        now: data time from the wall clock when no data arrive [s since 1970]
     Returns:
         Model, Prediction and Alert messages to publish
     """
@@ -60,11 +60,11 @@ def advance(twin: Twin, messages: Iterable[Message], now: float = -np.inf) -> li
 
 
 def catch_up(twin: Twin, messages: Iterable[Message]) -> list[Message]:
-    """Take what has waited, and turn the loop once a second of data time instead of after every message.
+    """Ingest queued messages, and step once per second of data time instead of after every message.
 
     Args:
         twin: the aircraft's twin, changed in place
-        messages: as of `advance`, which takes the newest one
+        messages: as for `advance`, which ingests the newest one
     Returns:
         Model, Prediction and Alert messages to publish
     """
@@ -80,9 +80,9 @@ def catch_up(twin: Twin, messages: Iterable[Message]) -> list[Message]:
 
 
 def silence(twin: Twin, message: Message) -> Iterator[float]:
-    """Return the instants at which the loop turns before `message`, where the data were silent [s since 1970].
+    """Yield the times of the steps in the gap before `message` [s since 1970].
 
-    Once a second; a longer silence than any prediction is worth is leapt over.
+    One step per second; a gap longer than any useful prediction is skipped.
     """
     at, until = max(twin.data_t, twin.turned_t), _heard(message)
     if isinstance(message, Sample):
@@ -102,25 +102,25 @@ def _heard(message: Message) -> float:
 
 
 def _take_sample(twin: Twin, sample: Sample) -> bool:
-    """Take telemetry; False where it was dated anew and the status that tells by how much is still to come."""
+    """Ingest telemetry; return False if it was re-anchored and the status with the step has not arrived yet."""
     leaps = _leaps(twin, sample)
     hear(twin, sample)
     newest = twin.history.newest
     if isfinite(newest):
         twin.delay.take_sample(newest, leaps)
-    ran_ahead = twin.data_t - newest > _AHEAD_S  # by status messages, while it was silent or before it fell behind
+    ran_ahead = twin.data_t - newest > _AHEAD_S  # due to status messages while telemetry was silent or delayed
     twin.data_t = newest if ran_ahead and isfinite(newest) else max(twin.data_t, _heard(sample))
     return not leaps
 
 
 def _leaps(twin: Twin, sample: Sample) -> bool:
-    """Tell whether the time of telemetry leaps by no more than its delay: it was dated anew, and nothing is missing."""
+    """Return whether telemetry time jumps by at most its delay: it was re-anchored, and no data are missing."""
     leap = _heard(sample) - twin.history.newest
     return _TICK_S < leap < twin.delay.now + _TICK_S and isfinite(twin.data_t)
 
 
 def _take_other(twin: Twin, message: Message) -> None:
-    """Take a message that carries the gateway's clock, dated as telemetry is."""
+    """Ingest a message on the gateway's clock, with its time converted to telemetry time."""
     at, newest = _heard(message), twin.history.newest
     if isfinite(at):
         delay = _delay(twin, message)
@@ -129,12 +129,12 @@ def _take_other(twin: Twin, message: Message) -> None:
         at -= delay
         message = replace(message, t=at) if delay else message
     hear(twin, message)
-    if isfinite(twin.data_t):  # after a jump of the clock telemetry leads
+    if isfinite(twin.data_t):  # after a clock jump, telemetry sets the data time
         twin.data_t = max(twin.data_t, at)
 
 
 def _delay(twin: Twin, message: Message) -> float:
-    """Return how far telemetry is behind the clock of a message that is no telemetry [s]."""
+    """Return the delay of telemetry behind the clock of a message that is not telemetry [s]."""
     newest = twin.history.newest
     if not isinstance(message, Status) or not isfinite(newest) or not isfinite(_heard(message)):
         return twin.delay.now
@@ -142,7 +142,7 @@ def _delay(twin: Twin, message: Message) -> float:
 
 
 def _turn(twin: Twin, now: float) -> list[Message]:
-    """Do whatever is due at data time `now`; it may lie before the last turn, where that ran ahead of late data."""
+    """Run whatever is due at data time `now`, which can be earlier than the last step if telemetry is late."""
     if twin.origin is None or not (isfinite(twin.history.newest) and isfinite(now)):
         return []
     twin.turned_t = now
@@ -160,9 +160,9 @@ def _turn(twin: Twin, now: float) -> list[Message]:
         twin.predict_t = twin.renew_t = now
         made = foresee(twin, now)
         new = twin.prediction if made else None
-        if new is None:  # telemetry has a gap just now, or too little of it has come
+        if new is None:  # telemetry has a gap, or is too short
             _again(twin, now)
-        twin.base = new or twin.base  # which is not renewed for ever
+        twin.base = new or twin.base  # which is not extrapolated without limit
         results += [*made, *watch(twin, now, new)]
     elif _due(now, twin.renew_t, SOON * _renew_s(twin, now)) and twin.may(Work.RENEW):
         twin.renew_t = now
@@ -175,24 +175,24 @@ def _turn(twin: Twin, now: float) -> list[Message]:
 
 
 def _renew_s(twin: Twin, now: float) -> float:
-    """Return the period of renewals [s]; a flight ahead that has to wait for CPU time is replaced by them."""
+    """Return the period of extrapolated predictions [s]; they replace a rollout that waits for CPU time."""
     pace = twin.pace
     return min(pace.renew, max(pace.predict, _TICK_S)) if overdue(twin, now) else pace.renew
 
 
 def _again(twin: Twin, now: float) -> None:
-    """Let the next flight ahead be tried before long."""
+    """Schedule the next rollout soon."""
     twin.predict_t = min(twin.predict_t, now - max(twin.pace.predict - _TICK_S, 0.0))
 
 
 def identify_due(twin: Twin) -> bool:
-    """Return whether an identification is due at the data time of the last turn."""
+    """Return whether an identification is due at the data time of the last step."""
     ready = twin.origin is not None and isfinite(twin.history.newest) and isfinite(twin.turned_t)
     return ready and not twin.lost and _due(twin.turned_t, twin.identify_t, twin.pace.identify)
 
 
 def identify(twin: Twin) -> list[Message]:
-    """Identify and verify once, as of the last turn."""
+    """Identify and verify once, at the time of the last step."""
     twin.identify_t = twin.turned_t
     return learn(twin)
 
@@ -214,14 +214,14 @@ def _watch_link(twin: Twin, now: float) -> list[Message]:
 
 
 def _blow(twin: Twin) -> None:
-    """Feed the wind filter once a second."""
+    """Update the wind filter once a second."""
     if twin.history.newest - twin.wind_t >= 1.0:
         since = max(twin.wind_t, twin.history.newest - _LATE_S)
         twin.wind_t = blow(twin.wind, twin.history, twin.wind_t, since)
 
 
 def _remember(twin: Twin) -> None:
-    """Mark what is known now, so that a fault found later can be gone back before."""
+    """Add a checkpoint when due, so that the models can restart before the onset of a fault."""
     t = twin.wind_t
     if np.isfinite(t) and not (twin.marks and twin.marks[-1].t <= t < twin.marks[-1].t + EVERY_S):
         twin.marks.append(mark(t, twin.wind, (twin.last, twin.plant), twin.hybrid))
@@ -240,12 +240,12 @@ def _score(twin: Twin) -> None:
 
 
 def fleet_row(twin: Twin, now: float, alerts: Iterable[Alert] = (), **claim: object) -> FleetRow:
-    """Return the aircraft's line of the fleet table.
+    """Return the aircraft's row of the fleet table.
 
     Args:
         twin: the aircraft's twin
         now: data time [s since 1970]
-        alerts: those in force
+        alerts: active alerts
         claim: worker and epoch
     """
     made = twin.prediction

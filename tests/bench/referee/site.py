@@ -71,7 +71,7 @@ class Worker:
     @property
     def name(self) -> str:
         """Give the name it claims by; empty before it says so."""
-        found = re.search(r"twin_worker ([0-9a-f]{16}): may hold", self._said.read_text(errors="replace"))
+        found = re.search(r"twin_worker ([0-9a-f]{16}): serves", self._said.read_text(errors="replace"))
         return found[1] if found else ""
 
     def signal(self, number: int) -> None:

@@ -1,9 +1,9 @@
-"""The CPU time that heavy work may take in each sweep over all twins; telemetry of every aircraft goes first.
+"""CPU time budget for heavy work in each sweep over all twins; telemetry of every aircraft has priority.
 
-A token bucket. While sweeps are in time it is filled with a fixed amount in each. A late sweep fills it with a share of
-the CPU time that this thread was really given since the sweep before: where the processor is shared with others, or
-limited, heavy work falls in proportion to the CPU time and no faster, however late every sweep is by the wall clock.
-While flights ahead wait in late sweeps, nothing else is begun.
+A token bucket. While sweeps are on time, each sweep adds a fixed amount. A late sweep adds a fraction of the CPU time
+that this thread received since the previous sweep. On a shared or limited processor, heavy work therefore falls in
+proportion to the CPU time, independent of the wall-clock delay. While rollouts wait in late sweeps, no other work
+starts.
 """
 
 import time
@@ -12,24 +12,24 @@ from dataclasses import dataclass, field
 
 from twin_worker.twin.state.schedule import Work
 
-SWEEP_S = 0.05  # of heavy work in one sweep, CPU [s]
-LEAST_S = 1e-3  # the same in a late sweep: so that it does not end [s]
-EARNED = 0.5  # of the CPU time of this thread, which heavy work may take while sweeps are late [-]
-_GROWS = 1.2  # how it recovers with every sweep that was not late [-]
-_SHARE = {Work.PREDICT: 1.0, Work.IDENTIFY: 0.7, Work.ENSEMBLE: 0.5}  # of a sweep, up to which each kind may begin [-]
+SWEEP_S = 0.05  # heavy work per sweep, CPU [s]
+LEAST_S = 1e-3  # minimum in a late sweep, so that heavy work continues [s]
+EARNED = 0.5  # share of this thread's CPU time for heavy work while sweeps are late [-]
+_GROWS = 1.2  # recovery factor per sweep on time [-]
+_SHARE = {Work.PREDICT: 1.0, Work.IDENTIFY: 0.7, Work.ENSEMBLE: 0.5}  # of the limit [-]
 
 
 @dataclass
 class Quota:
-    """What may be begun in one sweep; without a limit everything.
+    """Heavy work that may start in one sweep; unlimited by default.
 
     Attributes:
-        limit: of heavy work in one sweep, CPU [s]; what one piece of work takes beyond is missing in the next
-        most: the same where there is one, while telemetry is in time
-        hurry: an aircraft waits for its first prediction, so that nothing else is begun
-        behind: telemetry of this aircraft waits: what would be foreseen now is old already
-        aside: kinds that are done by another hand
-        done, refused: how often each other kind was
+        limit: heavy work per sweep, CPU [s]; an overrun is deducted from the next sweep
+        max_limit: limit while telemetry is on time, CPU [s]
+        first_prediction_pending: an aircraft has no prediction yet; no other work starts
+        backlog: telemetry of this aircraft is queued; a prediction made now would be outdated
+        offloaded: kinds of work that another thread does
+        done, refused: number of starts and refusals of each kind
     """
 
     limit: float = float("inf")
@@ -40,15 +40,15 @@ class Quota:
     done: Counter[Work] = field(default_factory=Counter)
     refused: Counter[Work] = field(default_factory=Counter)
     _spent: float = 0.0
-    _since: float | None = None  # when the work in hand was begun
-    _late: bool = False  # the last sweep was
-    _waits: bool = False  # a flight ahead was refused in the last sweep
-    _wanted: bool = False  # and in this one
-    _swept: float = float("nan")  # CPU time of this thread when the sweep began [s]
+    _since: float | None = None  # start of the running work, thread CPU time [s]
+    _late: bool = False  # the previous sweep was late
+    _waits: bool = False  # a rollout was refused in the previous sweep
+    _wanted: bool = False  # a rollout was refused in this sweep
+    _swept: float = float("nan")  # CPU time of this thread at the start of the sweep [s]
 
     @property
     def limited(self) -> bool:
-        """Return whether there is a limit: not offline."""
+        """Return whether a limit applies; offline runs have none."""
         return self.limit < float("inf")
 
     def sweep(self, *, hurry: bool = False) -> None:
@@ -58,7 +58,7 @@ class Quota:
         self._spent, self.hurry = max(self._spent - self.limit, 0.0), hurry and self.limited
 
     def yield_to_telemetry(self, late: bool) -> None:
-        """Grant a share of the CPU time of the last sweep where that was late, else a little more again."""
+        """Set the limit to a share of the last sweep's CPU time if it was late; raise it slowly otherwise."""
         limit, now = min(self.limit, self.most), time.thread_time()
         used, self._swept, self._late = now - self._swept, now, late
         if not late:
@@ -67,13 +67,13 @@ class Quota:
             self.limit = min(max(EARNED * used, LEAST_S), self.most)
 
     def settle(self) -> None:
-        """End the work in hand, if any."""
+        """Stop the measurement of the running work, if any."""
         if self._since is not None:
             self._spent += time.thread_time() - self._since
             self._since = None
 
     def grants(self, work: Work) -> bool:
-        """Return whether work that is due may be begun."""
+        """Return whether due work may start, and start its measurement."""
         if work in self.aside or (self.behind and self.limited):
             return False
         if work is Work.RENEW:

@@ -1,4 +1,4 @@
-"""What a twin knew at moments of the last minutes, so that it can begin anew from before a fault, and with what."""
+"""Checkpoints of a twin over the last minutes, and the fault effects that its models contain."""
 
 from collections.abc import Iterable
 from copy import deepcopy
@@ -10,19 +10,19 @@ from twin_worker.identification.fixed_wing.derivatives_model import Coupled
 from twin_worker.identification.fixed_wing.plant import Plant
 from twin_worker.identification.fixed_wing.point_mass_model import Hybrid
 
-EVERY_S = 10.0  # between marks [s]
-MOST = 15  # kept: as far back as telemetry is
+EVERY_S = 10.0  # between checkpoints [s]
+MOST = 15  # number of checkpoints kept; covers the telemetry history
 
 
 @dataclass(frozen=True)
 class Mark:
-    """One moment.
+    """State of one twin at one instant.
 
     Attributes:
-        t: when [s since 1970]
-        wind: the wind filter, a copy
-        plant: the coupled model believed; None before any
-        hybrid: the hybrid believed; None before any
+        t: time [s since 1970]
+        wind_filter: copy of the wind filter
+        derivatives_model: verified stability-and-control model; None before the first
+        point_mass: verified point-mass model; None before the first
     """
 
     t: float
@@ -33,7 +33,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Extension:
-    """Missing physics that was put into the model in force: names of the effects, and their onset [s since 1970]."""
+    """Fault effects added to the active model: their names, and the onset [s since 1970]."""
 
     names: str
     onset: float
@@ -43,11 +43,11 @@ class Extension:
 
 
 def mark(t: float, wind: WindFilter, plants: tuple[Plant | None, ...], hybrid: Hybrid | None) -> Mark:
-    """Mark this moment; of the plants the first that is coupled counts."""
+    """Create a checkpoint with the first stability-and-control model among `models`."""
     coupled = next((one for one in plants if isinstance(one, Coupled)), None)
     return Mark(t, deepcopy(wind), coupled, hybrid)
 
 
 def before(marks: Iterable[Mark], t: float) -> Mark | None:
-    """Return the newest mark before time t [s since 1970]; None where there is none."""
+    """Return the newest checkpoint before time t [s since 1970]; None if there is none."""
     return max((one for one in marks if one.t < t), key=lambda one: one.t, default=None)

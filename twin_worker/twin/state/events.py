@@ -1,4 +1,4 @@
-"""Take an event down on the twin: the newest one is what the next prediction tells."""
+"""Record flight events on the twin; the next prediction reports the newest one."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Note:
-    """An event, when it was [s since 1970], and its sentence with particulars."""
+    """An event, its time [s since 1970], and its message with details."""
 
     event: Event
     t: float
@@ -21,13 +21,13 @@ class Note:
 
 
 def note(twin: "Twin", event: Event, t: float, particulars: str = "") -> None:
-    """Tell of an event, with a new prediction at once."""
+    """Record an event and request a new prediction."""
     said = SENTENCES[event] + (f" ({particulars})" if particulars else "")
     twin.noted, twin.predict_t = Note(event, t if np.isfinite(t) else 0.0, said), -np.inf
 
 
 def void(twin: "Twin", event: Event | None, t: float, particulars: str = "") -> None:
-    """End the running prediction: the aircraft flies by something else from `t` on; no event is told for None."""
+    """Invalidate the running prediction as of time `t`; record `event` unless it is None."""
     twin.since, twin.predict_t, twin.spread_t, twin.base, twin.put_off = t, -np.inf, -np.inf, None, None
     twin.record.forget()
     twin.contest.forget()

@@ -1,4 +1,4 @@
-"""Events that only the flight shows: take-off, landing, touch-down, and a local frame left far behind."""
+"""Detect flight phases and events from telemetry: take-off, landing, touch-down, and a distant local frame."""
 
 from dataclasses import dataclass
 from math import hypot, inf, sqrt
@@ -16,22 +16,22 @@ if TYPE_CHECKING:
 
 ROTORS = ("multirotor", "helicopter", "quadplane")
 LANDINGS = (21, 85)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND
-_OVER_S = 3.0  # it stands or flies for as long before it is believed [s]
-_STANDS, _FLIES = 1.5, 8.0  # ground speed of a wing that stands, and of one that flies [m/s]
-_HOVERS, _LOW_M = 0.4, 1.5  # speed of rotors that stand [m/s]; height above the ground of those that fly [m]
-_FAR_M = 50_000.0  # a flat earth is good so far [m]
+_OVER_S = 3.0  # a change of phase must last this long [s]
+_STANDS, _FLIES = 1.5, 8.0  # fixed wing: ground speed at standstill, minimum ground speed in flight [m/s]
+_HOVERS, _LOW_M = 0.4, 1.5  # rotorcraft: speed at standstill [m/s]; height above ground in flight [m]
+_FAR_M = 50_000.0  # the flat-earth frame is valid up to this distance [m]
 
 
 @dataclass
 class Ground:
-    """Whether it flies, and on which ground it stood.
+    """Flight phase of one aircraft, and the ground level.
 
     Attributes:
-        flies: None: not known yet
-        landed: it touched down, and was not armed anew since
-        landing: a landing item is in force
-        armed: as last told
-        height: down of the ground it last stood on, NED [m]; nan: never seen to stand
+        flying: None: unknown
+        landed: touched down and not armed again since
+        landing: a landing item is active
+        armed: newest reported arming state
+        ground_down: down coordinate of the last standstill, NED [m]; nan: no standstill observed
     """
 
     flies: bool | None = None
@@ -42,7 +42,7 @@ class Ground:
 
 
 def watch(twin: "Twin", command: int) -> None:
-    """Look once a second; `command` is the MAV_CMD of the mission item in force, 0 unknown."""
+    """Update the flight phase once a second; `command` is the MAV_CMD of the active mission item, 0 unknown."""
     _frame(twin)
     ground, now = twin.ground, twin.history.newest
     armed = twin.status is not None and twin.status.armed
@@ -51,7 +51,7 @@ def watch(twin: "Twin", command: int) -> None:
         ground.landed = False
     ground.armed = armed
     if command in LANDINGS and not ground.landing and ground.flies:
-        note(twin, Event.LANDING, now, "a landing item is in force")
+        note(twin, Event.LANDING, now, "a landing item is active")
     ground.landing = command in LANDINGS
     flies = False if disarmed else _flies(twin)
     if flies is None or flies == ground.flies:
@@ -59,19 +59,19 @@ def watch(twin: "Twin", command: int) -> None:
     before, ground.flies = ground.flies, flies
     ground.landed = before is not None and not flies
     if before is not None:
-        event, why = (Event.TAKE_OFF, "") if flies else (Event.TOUCH_DOWN, "disarmed" if disarmed else "it stands")
+        event, why = (Event.TAKE_OFF, "") if flies else (Event.TOUCH_DOWN, "disarmed" if disarmed else "standstill")
         void(twin, event, now, why)
 
 
 def _flies(twin: "Twin") -> bool | None:
-    """Judge by the last seconds of flight; None: cannot tell."""
+    """Detect flight from the last seconds of telemetry; None: undetermined."""
     assert twin.origin is not None
     t, v = twin.history.look("velocity", twin.history.newest - _OVER_S)
     _, place = twin.history.look("position", twin.history.newest - _OVER_S)
     if len(t) < 3 or not len(place) or t[-1] - t[0] < 0.6 * _OVER_S:
         return None
     slowest, level, steepest, speed = moves(v)
-    if twin.vehicle not in ROTORS and slowest > _FLIES:  # as it mostly is
+    if twin.vehicle not in ROTORS and slowest > _FLIES:  # the usual case
         return True
     down = to_ned(twin.origin, *place.T)[:, 2]
     if twin.vehicle in ROTORS:
@@ -80,7 +80,7 @@ def _flies(twin: "Twin") -> bool | None:
         flies = bool(high) or slowest > 2.0
     else:
         _, air = twin.history.look("air", twin.history.newest - _OVER_S)
-        still = not len(air) or air[:, 0].max() < _FLIES  # into the wind it may hang in the air
+        still = not len(air) or air[:, 0].max() < _FLIES  # airspeed, because ground speed can be near zero in headwind
         stands, flies = level < _STANDS and steepest < 0.5 and still, False
     if stands:
         twin.ground.height = float(down.mean())
@@ -89,7 +89,7 @@ def _flies(twin: "Twin") -> bool | None:
 
 @nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath
 def moves(v: np.ndarray) -> tuple[float, float, float, float]:
-    """Return of velocities, (n, 3) [m/s], least and greatest level speed, and the greatest up or down and in all."""
+    """Return minimum and maximum level speed, maximum vertical speed and maximum speed of velocities, (n, 3) [m/s]."""
     least, level, steepest, most = inf, 0.0, 0.0, 0.0
     for k in range(len(v)):
         over = hypot(v[k, 0], v[k, 1])
@@ -99,7 +99,7 @@ def moves(v: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def _frame(twin: "Twin") -> None:
-    """Move the origin of the local frame to an aircraft that has flown far from it."""
+    """Move the origin of the local frame to the aircraft if it is far away."""
     assert twin.origin is not None
     _, place = twin.history.look("position", twin.history.newest - 1.0)
     if not len(place):
@@ -111,4 +111,4 @@ def _frame(twin: "Twin") -> None:
         twin.ground.height = float("nan")
         twin.record.forget(moved=True)
         twin.contest.forget()
-        note(twin, Event.ORIGIN, twin.history.newest, f"it is {away * 1e-3:.0f} km from where it was first heard")
+        note(twin, Event.ORIGIN, twin.history.newest, f"{away * 1e-3:.0f} km from the previous origin")

@@ -1,14 +1,14 @@
-"""How often each kind of work is wanted, in data time; and who may do it now."""
+"""Periods of each kind of work, in data time."""
 
 import argparse
 from dataclasses import dataclass, fields
 from enum import StrEnum
 
-SOON = 0.9  # share of a period after which work that follows telemetry or a flight is due: neither keeps the beat [-]
+SOON = 0.9  # share of a period after which dependent work is due, so that jitter does not skip a cycle [-]
 
 
 class Work(StrEnum):
-    """Kinds of work, the first to be done and the last to give way first."""
+    """Kinds of work in order of priority, highest first."""
 
     RENEW = "renew"
     PREDICT = "predict"
@@ -18,15 +18,15 @@ class Work(StrEnum):
 
 @dataclass(frozen=True)
 class Pace:
-    """Periods, and how large an ensemble is.
+    """Periods of work, and the size of an ensemble.
 
     Attributes:
-        predict: between flights ahead [s]
+        predict: between rollouts [s]
         identify: between identifications [s]
         ensemble: between ensembles [s]
-        renew: between predictions that begin at the newest position without being flown anew; inf: none [s]
-        members: flights of an ensemble
-        span: how far ahead they fly; beyond, doubt grows as the method's law has it [s]
+        renew: between predictions extrapolated from the newest position without a new rollout; inf: none [s]
+        members: rollouts per ensemble
+        span: look-ahead of ensemble rollouts; beyond it, the spread grows by the method's growth law [s]
     """
 
     predict: float = 1.0
@@ -37,15 +37,15 @@ class Pace:
     span: float = 180.0
 
 
-_LIMITS = {"members": (12, 1000), "span": (10.0, 180.0)}  # of others: periods
+_LIMITS = {"members": (12, 1000), "span": (10.0, 180.0)}  # of all other fields: `_PERIOD_LIMITS`
 _PERIODS = (0.02, 3600.0)  # [s]
 
 
 def read_pace(text: str) -> Pace:
-    """Read `--pace predict=2,identify=5,members=50`.
+    """Parse `--pace predict=2,identify=5,members=50`.
 
     Raises:
-        argparse.ArgumentTypeError: when it names no such work, or no time; argparse shows the sentence.
+        argparse.ArgumentTypeError: when a name or a value is invalid; argparse prints the message.
     """
     names = [field.name for field in fields(Pace)]
     found = {}

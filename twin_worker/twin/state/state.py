@@ -1,4 +1,4 @@
-"""What one twin remembers: the telemetry, the model in force, how past predictions fared; and how it listens."""
+"""State of one twin: telemetry, active model, past predictions; and the ingestion of messages."""
 
 from collections import deque
 from dataclasses import dataclass, field, replace
@@ -36,7 +36,7 @@ from twin_worker.twin.state.schedule import Pace, Work
 from twin_worker.validation.forecast_shrinkage import Earned
 from twin_worker.validation.verify import OMEGA
 
-AUTO = "auto"  # every way of flying ahead, the best of them used
+AUTO = "auto"  # use the prediction method with the lowest error
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 
 
@@ -44,19 +44,19 @@ def _unheard() -> Verdict:
     return Verdict(outcome=Outcome.STARVED, sentence="no samples yet")
 
 
-_MODES = 64  # changes of mode remembered
-_NEWS = 0.3  # weight of the newest flight in a model's miss [-]
+_MODES = 64  # number of mode changes kept
+_NEWS = 0.3  # weight of the newest error in a model's mean closed-loop error [-]
 
 
 @dataclass
 class Believed:
-    """A verified model, and how far it strays when it flies the newest held-out data in closed loop.
+    """A verified model and its closed-loop error on the newest held-out data.
 
     Attributes:
         plant: the model
-        verdict: what it was believed on
-        t: end of the data it was believed on [s since 1970]
-        miss: mean miss on the route, smoothed over the hops [m]; nan before any route, inf once it left its envelope
+        verdict: its verification result
+        t: end of the data of the verification [s since 1970]
+        closed_loop_error: smoothed mean position error on the route [m]; nan before any route, inf outside the envelope
     """
 
     plant: Plant
@@ -65,18 +65,18 @@ class Believed:
     miss: float
 
     def flown(self, miss: float) -> None:
-        """Take the miss of one more flight; nan, where there was no route to fly, changes nothing."""
+        """Update the smoothed error with one more closed-loop run; nan (no route) changes nothing."""
         if not np.isnan(miss):
             self.miss = miss if np.isnan(self.miss) else (1 - _NEWS) * self.miss + _NEWS * miss
 
     def rank(self) -> tuple[bool, float]:
-        """Return the sort key: least miss first; those that never flew a route last, the newest of them first."""
+        """Return the sort key: lowest error first; models without a route run last, newest first."""
         return (True, -self.t) if np.isnan(self.miss) else (False, self.miss)
 
 
 @dataclass
 class Twin:
-    """One aircraft's twin: what was heard of it, the model in force, and how past predictions fared."""
+    """Digital twin of one aircraft: telemetry, active model, and errors of past predictions."""
 
     uav: int
     omega: float = OMEGA
@@ -89,35 +89,35 @@ class Twin:
     ledger: Ledger = field(default_factory=Ledger)
     rotor: Rotor = field(default_factory=Rotor)
     grey: Grey = field(default_factory=Grey)
-    modes: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=_MODES))  # changes, (when, name)
+    modes: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=_MODES))  # mode changes, (time, name)
     origin: Origin | None = None
     status: Status | None = None
     mission: Mission | None = None
     params: Params | None = None
     servos: ServoMap = field(default_factory=lambda: servo_map({}))
-    learnt: Learnt = field(default_factory=Learnt)  # of the autopilot, from flight
-    instead: Instead | None = None  # what a copy of this twin flies to answer a what-if
-    plant: Plant | None = None  # the model in force
-    near: Coupled | None = None  # newest coupled model, believed or not: the next search begins there
-    last: Coupled | None = None  # newest coupled model believed: it holds the parameters of the next
-    hybrid: Hybrid | None = None  # identified and believed
-    near_hybrid: Hybrid | None = None  # identified last, believed or not
-    strays: float = float("nan")  # how far it strays over 20 s held out, over the way [-]
+    learnt: Learnt = field(default_factory=Learnt)  # controller parameters identified from flight
+    instead: Instead | None = None  # route override for a what-if; only on copies
+    plant: Plant | None = None  # active model
+    near: Coupled | None = None  # newest derivatives model, verified or not: initial value of the next estimation
+    last: Coupled | None = None  # newest verified derivatives model: prior of the next estimation
+    hybrid: Hybrid | None = None  # active point-mass model
+    near_hybrid: Hybrid | None = None  # newest point-mass model, active or not
+    strays: float = float("nan")  # point-mass error at the end of a 20 s hold-out, over path length [-]
     contest: Contest = field(default_factory=Contest)
-    spread: np.ndarray | None = None  # of the newest ensemble, along, cross, vertical, (k, 3) [m]
+    spread: np.ndarray | None = None  # spread of the newest ensemble: along, cross, vertical, (k, 3) [m]
     earned: Earned = field(default_factory=Earned)
     marks: deque[Mark] = field(default_factory=lambda: deque(maxlen=MOST))  # of the last minutes
-    extended: Extension | None = None  # what a diagnosis has put into the models in force
-    learn_from: float = -np.inf  # nothing is learnt from telemetry before [s since 1970]
+    extended: Extension | None = None  # diagnosed effects added to the active models
+    learn_from: float = -np.inf  # start of the data used for identification [s since 1970]
     verdict: Verdict = field(default_factory=_unheard)
     pool: list[Believed] = field(default_factory=list)
-    in_force: Verdict | None = None  # the verdict `plant` was believed on
+    in_force: Verdict | None = None  # verdict of the active model
     model: Model | None = None
     prediction: Prediction | None = None
-    base: Prediction | None = None  # the newest that was flown ahead
+    base: Prediction | None = None  # newest rollout
     pace: Pace = field(default_factory=Pace)
-    quota: Quota | None = None  # of the driver, where there is one
-    control: Control | None = None  # the controller twin that flew it
+    quota: Quota | None = None  # set by the driver; None: unlimited
+    control: Control | None = None  # controller model of the newest prediction
     control_t: float = -np.inf  # and when that was last told
     state: State = State.WAITING
     tries: int = 0
@@ -129,70 +129,70 @@ class Twin:
     turned_t: float = -np.inf  # data time of the last turn of the loop
     wind_t: float = -np.inf
     identify_t: float = -np.inf
-    afresh_t: float = -np.inf  # last identified without a model to begin at
+    afresh_t: float = -np.inf  # last identification without a warm start
     predict_t: float = -np.inf
     renew_t: float = -np.inf
     score_t: float = -np.inf
-    flown_t: float = -np.inf  # models last flown in closed loop
-    told_t: float = -np.inf  # model last published
-    hybrid_t: float = -np.inf  # hybrid last identified
-    checked_t: float = -np.inf  # hybrid last flown over what was held out
-    spread_t: float = -np.inf  # ensemble last flown
-    put_off: float | None = None  # when an ensemble was due that others were preferred to [s since 1970]
-    achievable_t: float = -np.inf  # mission last judged
-    turning_t: float = np.inf  # since when predictions are a turn rate alone
-    stood: Origin | None = None  # where it last stood disarmed
-    peak: float = -np.inf  # greatest height above home since it was disarmed [m]
-    lost: bool = False  # nothing is heard
-    back_t: float = -np.inf  # link last back
-    broken: bool = False  # much is heard, but no positions
-    over: bool = False  # it has coasted up to its horizon
+    flown_t: float = -np.inf  # last closed-loop run of the models
+    told_t: float = -np.inf  # last published model
+    hybrid_t: float = -np.inf  # last point-mass identification
+    checked_t: float = -np.inf  # last hold-out check of the point-mass model
+    spread_t: float = -np.inf  # last ensemble
+    put_off: float | None = None  # due time of a deferred ensemble [s since 1970]
+    achievable_t: float = -np.inf  # last feasibility check of the mission
+    turning_t: float = np.inf  # start of the predictions by turn rate alone
+    stood: Origin | None = None  # last position at rest and disarmed
+    peak: float = -np.inf  # maximum height above home since disarmed [m]
+    lost: bool = False  # link lost
+    back_t: float = -np.inf  # last link recovery
+    broken: bool = False  # telemetry without positions
+    over: bool = False  # coasting has exceeded the confidence horizon
     bad: int = 0
 
     def may(self, work: Work) -> bool:
-        """Return whether heavy work that is due may be done now."""
+        """Return whether the compute budget allows due heavy work now."""
         return self.quota is None or self.quota.grants(work)
 
     @property
     def name(self) -> str:
-        """Return the name sentences use, e.g. uav-7."""
+        """Return the name used in texts, e.g. uav-7."""
         return f"uav-{self.uav}"
 
     @property
     def standing(self) -> str:
-        """Return the verdict of the model in force, and what became of the newest try where that is another."""
+        """Return the verdict of the active model, and the outcome of the newest identification if it differs."""
         if self.in_force is None or self.verdict.outcome is Outcome.VERIFIED:
             return self.verdict.sentence
-        return f"{self.in_force.sentence}; newest try: {self.verdict.outcome.value.replace('_', ' ')}"
+        return f"{self.in_force.sentence}; newest identification: {self.verdict.outcome.value.replace('_', ' ')}"
 
     @property
     def first_item(self) -> int:
-        """Return the number of the first mission item to fly: 0 where the mission does not hold home."""
+        """Return the sequence number of the first mission item to fly: 0 if item 0 is not home."""
         return FIRST.get(self.autopilot, 1)
 
     @property
     def autopilot(self) -> str:
-        """Return what its heartbeat calls the autopilot, e.g. px4."""
+        """Return the autopilot type from the heartbeat, e.g. px4."""
         return self.status.autopilot if self.status else "unknown"
 
     @property
     def received(self) -> dict[str, float]:
-        """Return the autopilot parameters received, in its own names and units."""
+        """Return the received autopilot parameters, in the autopilot's names and units."""
         return self.params.values if self.params else {}
 
     @property
     def vehicle(self) -> str:
-        """Return the kind of vehicle its heartbeat names, e.g. fixed_wing."""
+        """Return the vehicle type from the heartbeat, e.g. fixed_wing."""
         return self.status.vehicle if self.status else "unknown"
 
     def window(self, seconds: float) -> Window | None:
-        """Return the newest `seconds` on the grid; None while a needed kind of row is missing."""
+        """Return the newest `seconds`, equally sampled; None if a required kind of row is missing."""
         assert self.origin is not None
         newest = self.history.newest
         return self.grid.window(self.history, self.origin, self.servos, self.wind.wind, until=newest, seconds=seconds)
 
     def situation(self, window: Window) -> Situation:
-        """Return what a prediction from the end of `window` starts from."""
+        """Return the initial data of a prediction from the end of `window`."""
         assert self.origin is not None
         items = self.mission.items if self.mission else ()
         law = OWN.get(self.autopilot, self.learnt.law)
@@ -202,7 +202,7 @@ class Twin:
         return Situation(window, self.history, onboard, self.wind, self.origin)
 
     def why_no_route(self) -> str:
-        """Say why the aircraft follows no mission now; empty where it does."""
+        """Return why the aircraft follows no mission; empty if it does."""
         mode = self.status.mode if self.status else ""
         if mode not in ROUTE_MODES:
             return f"mode {mode or 'unknown'} follows no mission"
@@ -212,7 +212,7 @@ class Twin:
 
 
 def hear(twin: Twin, message: Message) -> None:
-    """Take one message from the gateway."""
+    """Ingest one message from the gateway."""
     if isinstance(message, Sample):
         twin.bad += twin.history.add(message)
         if twin.origin is None and message.position is not None:
@@ -232,7 +232,7 @@ def hear(twin: Twin, message: Message) -> None:
 
 
 def _first_place(history: History) -> Origin | None:
-    """Return the first position that can be on earth; None before any."""
+    """Return the first position within valid limits; None if there is none."""
     for lat, lon, alt in history.rows("position")[1]:
         if abs(lat) <= 9e8 and abs(lon) <= 1.8e9 and abs(alt) <= 1e8:
             return Origin(int(lat), int(lon), int(alt))
@@ -249,7 +249,7 @@ def _hear_status(twin: Twin, status: Status) -> None:
     if status.clock_jumps != before.clock_jumps:
         twin.history.clear()
         twin.grid.clear()
-        twin.wind.t = twin.wind_t = twin.identify_t = twin.score_t = -np.inf  # the new time may lie before
+        twin.wind.t = twin.wind_t = twin.identify_t = twin.score_t = -np.inf  # the new time may be earlier
         twin.flown_t = twin.told_t = twin.back_t = twin.hybrid_t = twin.checked_t = -np.inf
         twin.near = twin.last = twin.extended = None
         twin.learn_from = -np.inf
@@ -262,15 +262,15 @@ def _hear_status(twin: Twin, status: Status) -> None:
     if 0 < (step := status.clock_advance_s - before.clock_advance_s) < np.inf:
         _advance_clock(twin, step)
     if status.mode != before.mode:
-        void(twin, Event.MODE if before.mode else None, status.t, f"{status.mode[:20]}, before {before.mode[:20]}")
+        void(twin, Event.MODE if before.mode else None, status.t, f"{status.mode[:20]}, previously {before.mode[:20]}")
 
 
 def _advance_clock(twin: Twin, step: float) -> None:
-    """Follow a gateway that re-anchored telemetry times forward: what came before is dated as what comes now."""
+    """Shift all stored times forward after the gateway re-anchored the telemetry clock."""
     newest = twin.history.newest
     if not np.isfinite(newest):
         return
-    arrived = twin.delay.gateway_t - newest < 0.5 * step  # the first sample dated anew came before the status
+    arrived = twin.delay.gateway_t - newest < 0.5 * step  # the first re-anchored sample came before the status
     twin.history.advance(newest - 0.5 * step if arrived else np.inf, step)
     twin.grid.clear()
     twin.wind.t, twin.wind_t = twin.wind.t + step, twin.wind_t + step
@@ -280,5 +280,5 @@ def _advance_clock(twin: Twin, step: float) -> None:
     twin.marks.clear()
     since = twin.since + step
     void(twin, None, twin.history.newest)
-    said = f"telemetry was {step:.1f} s behind its arrival and was dated anew: what was predicted before is void"
+    said = f"telemetry was {step:.1f} s behind its arrival and was re-anchored: earlier predictions are void"
     twin.since, twin.noted = since, Note(Event.CLOCK, twin.history.newest, said)

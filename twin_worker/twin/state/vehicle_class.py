@@ -1,4 +1,4 @@
-"""Which kind of twin an aircraft has now, and the route flown by those that need no identified model."""
+"""Dispatch by vehicle class, and predictions that need no identified model."""
 
 from dataclasses import dataclass, replace
 from math import isfinite
@@ -18,22 +18,22 @@ from twin_worker.twin.state.state import ROUTE_MODES, Twin
 NO_WINGS = ("multirotor", "helicopter")
 QUADPLANE = "quadplane"
 WINGS = ("fixed_wing", QUADPLANE)
-_BACK_S = 130.0  # flight the twin's numbers come from [s]
+_BACK_S = 130.0  # flight time used to fit the kinematic models [s]
 _VTOL = (84, 85)  # MAV_CMD: NAV_VTOL_TAKEOFF, NAV_VTOL_LAND
-_RECENT = 11  # rows that tell a rotor's velocity and acceleration
-_STEERED_S = 6.0  # a multirotor told to hold that still moves after so long is steered by hand [s]
+_RECENT = 11  # rows used for a multirotor's velocity and acceleration
+_STEERED_S = 6.0  # a multirotor in a hold mode that still moves after this time is under manual control [s]
 
 
 @dataclass(frozen=True)
 class Flight:
-    """A flight ahead on the route, or the reason why there is none.
+    """A predicted path on the route, or the reason why there is none.
 
     Attributes:
-        path: NED, (k, 3) [m]; None where this twin cannot fly
+        path: NED, (k, 3) [m]; None if this method cannot predict
         method, law: as in `Prediction`
-        seq: mission item it starts on, -1 none
-        sentence: what it rests on, or why there is none
-        control: the controller twin it was flown by
+        seq: mission item at the start, -1 none
+        sentence: basis of the prediction, or the reason why there is none
+        control: controller model used
     """
 
     path: np.ndarray | None
@@ -45,18 +45,18 @@ class Flight:
 
 
 def nothing(sentence: str, seq: int = -1) -> Flight:
-    """Return no flight, and why."""
+    """Return a forecast without a path, with the reason."""
     return Flight(None, "", "", seq, sentence)
 
 
 def seen(twin: Twin, seconds: float = _BACK_S, *, turned: bool = True) -> Track | None:
-    """Return what was flown of late, from positions and velocities alone; `turned`: with its attitude."""
+    """Return the recent track from positions and velocities; `with_attitude` adds the attitude."""
     assert twin.origin is not None
     return track(twin.history, twin.origin, until=twin.history.newest, seconds=seconds, turned=turned)
 
 
 def hangs(twin: Twin) -> bool:
-    """Return whether the aircraft hangs on rotors now, or is about to by its mission."""
+    """Return whether the aircraft hovers on rotors now, or is about to by its mission."""
     if twin.vehicle in NO_WINGS:
         return True
     if twin.vehicle != QUADPLANE:
@@ -70,7 +70,7 @@ def hangs(twin: Twin) -> bool:
 
 
 def command_in_force(twin: Twin) -> int:
-    """Return the command of the mission item in force; 0 unknown."""
+    """Return the command of the active mission item; 0 unknown."""
     seq = rollout.item_in_force(twin.history.newest, twin.history.look("leg"), twin.mission)
     items = twin.mission.items if twin.mission else ()
     return next((item.command for item in items if item.seq == seq), 0) if isfinite(seq) else 0
@@ -99,7 +99,7 @@ def _wing_board(twin: Twin) -> wing.Board:
 
 
 def compare_with_flight(twin: Twin) -> None:
-    """Let the twins that need no identified model learn their few numbers from the last minute."""
+    """Fit the parameters of the kinematic models to the last minutes of flight."""
     if twin.why_no_route() or (twin.vehicle not in NO_WINGS and (twin.vehicle not in WINGS or twin.plant is not None)):
         return
     flown = seen(twin)
@@ -113,14 +113,14 @@ def compare_with_flight(twin: Twin) -> None:
 
 
 def fly_kind(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
-    """Fly the route ahead as this kind of aircraft does, without an identified model."""
+    """Predict the path on the route with the kinematic model of this vehicle class."""
     whole = flown.whole()
     if len(whole) < 20:
         return nothing("less than 2 s of unbroken positions")
     if hangs(twin):
         return _fly_rotor(twin, whole, ahead)
     if twin.vehicle not in WINGS:
-        return nothing(f"vehicle {twin.vehicle}: no law known to fly it by")
+        return nothing(f"vehicle {twin.vehicle}: no controller model available")
     if why := twin.why_no_route():
         return nothing(why)
     if twin.vehicle == QUADPLANE:
@@ -135,7 +135,7 @@ def fly_kind(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
 
 
 def _at_speed(flown: Track, instead: Instead) -> Track:
-    """Let it have moved of late at the speed that is asked for."""
+    """Return the track with the overridden speed in its newest rows."""
     if instead.speed is None:
         return flown
     v = flown.v.copy()
@@ -149,17 +149,17 @@ def _fly_rotor(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
     asked = twin.instead.asked if twin.instead else {}
     control = on_rotors(twin.received, _prefix(twin), board.limit, asked)
     if twin.status is None or not twin.status.armed:
-        return nothing("it is not armed")
+        return nothing("not armed")
     if mode in rollout.HOLD_MODES:
         if twin.history.newest - twin.since > _STEERED_S and np.linalg.norm(flown.v[-20:].mean(axis=0)) > 1.0:
-            return nothing(f"mode {mode}, but it is steered by hand")
+            return nothing(f"mode {mode}, but under manual control")
         still = rollout.hold_still(flown, board, twin.rotor, ahead)
-        return Flight(still, "copter", copter.LAW, -1, f"mode {mode} holds its place", control)
+        return Flight(still, "copter", copter.LAW, -1, f"mode {mode} holds position", control)
     if mode in rollout.RETURN_MODES and twin.vehicle in NO_WINGS:
         path = rollout.fly_home(flown, board, twin.rotor, ahead)
         said = f"returns to launch; {rollout.said(board, twin.rotor)}"
         if path is None:
-            return nothing("home is not known")
+            return nothing("home position unknown")
         return Flight(path, "copter", copter.LAW, -1, said, control)
     if why := twin.why_no_route():
         return nothing(why)
@@ -170,6 +170,6 @@ def _fly_rotor(twin: Twin, flown: Track, ahead: np.ndarray) -> Flight:
     at = int(seq[-1]) if np.isfinite(seq[-1]) else -1
     if path is None:
         return nothing(wrong, at)
-    hung = "it hangs on its rotors; " if twin.vehicle == QUADPLANE else ""
+    hung = "hovering on rotors; " if twin.vehicle == QUADPLANE else ""
     said = " ".join(filter(None, (hung + rollout.said(board, twin.rotor), wrong)))
     return Flight(path, "copter", copter.LAW, at, said, control)

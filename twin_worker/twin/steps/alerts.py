@@ -1,4 +1,4 @@
-"""Everything one aircraft is warned of by itself: link, ground, fence, short horizon, a mission it cannot fly."""
+"""Alerts of a single aircraft: link, ground, geofence, short horizon, infeasible mission."""
 
 import numpy as np
 
@@ -15,26 +15,26 @@ from twin_worker.prediction.multirotor.rollout import RETURN_MODES
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.state.vehicle_class import WINGS, hangs
 
-_SHORT_S, _LONG_S = 10.0, 12.0  # confidence horizon below which an alert is raised, above which it is withdrawn [s]
-_TOLD = 30  # past predictions below which the 90 % horizon is the prior's word, not this aircraft's [-]
-_TURNING_S = 15.0  # a turn rate alone says nothing of ground and fence farther ahead [s]
-_REACH_S = 90.0  # beyond, the tube across is as wide as fences are kept from: a warning would say little [s]
-_GUESSED_S = 30.0  # nor does a tube that is a guess [s]
-_BETTER_S = 20.0  # on a mission a turn rate is judged only where nothing better came for so long [s]
+_SHORT_S, _LONG_S = 10.0, 12.0  # an alert is raised below the first confidence horizon and cleared above the second [s]
+_TOLD = 30  # minimum number of scored predictions; below it, the 90 % horizon comes from the prior table [-]
+_TURNING_S = 15.0  # ground and geofence look-ahead of turn-rate predictions [s]
+_REACH_S = 90.0  # maximum look-ahead; beyond it, the tube is wider than usual geofence margins [s]
+_GUESSED_S = 30.0  # look-ahead for an uncalibrated tube [s]
+_BETTER_S = 20.0  # on a mission, turn-rate predictions raise alerts only after this time without a better method [s]
 _ACHIEVABLE_EVERY_S = 5.0
 _LANDING = (21, 85, 189)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND, DO_LAND_START
 _RETURN, _LAST_NAV = 20, 95  # MAV_CMD
-_ABOUT_TO = 3  # navigation items, the one in force included, among which a landing excuses little height [-]
+_ABOUT_TO = 3  # navigation items, the active one included, in which a landing suppresses ground alerts [-]
 
 
 def link(twin: Twin, now: float, silent: float) -> list[Alert]:
-    """Tell that the link was lost or came back, as `twin.lost` says; `silent` since the newest sample [s]."""
-    said = f"no sample for {silent:.1f} s; the twin flies on alone"
+    """Raise or clear the link alert according to `twin.lost`; `silence_s` since the newest sample [s]."""
+    said = f"no sample for {silent:.1f} s; the twin predicts without telemetry"
     return twin.ledger.judge(twin.uav, now, Finding(AlertKind.LINK_LOST, float(twin.lost), said, "link back"))
 
 
 def watch(twin: Twin, now: float, made: Prediction | None) -> list[Alert]:
-    """Judge the newest prediction at data time `now`; None where none could be made."""
+    """Evaluate all alerts for the newest prediction at data time `now`; None if there is no prediction."""
     flight = forecast(made) if made is not None else None
     _remember_ground(twin)
     if flight is None or flight.made.method != "imm" or not now >= twin.turning_t:
@@ -52,11 +52,11 @@ def watch(twin: Twin, now: float, made: Prediction | None) -> list[Alert]:
 
 
 def _unknown(kind: AlertKind) -> Finding:
-    return Finding(kind, 0.0, "", "it is not predicted any more")
+    return Finding(kind, 0.0, "", "no longer predicted")
 
 
 def _remember_ground(twin: Twin) -> None:
-    """Take where it stands disarmed for home, until a mission tells better, and notice that it is down."""
+    """Store the disarmed position as a fallback for home, and reset the maximum height."""
     if twin.status is None or twin.status.armed:
         return
     twin.peak = -np.inf
@@ -66,7 +66,7 @@ def _remember_ground(twin: Twin) -> None:
 
 
 def home(twin: Twin) -> Origin | None:
-    """Return home: item 0 of an ArduPilot mission, else where it was last seen disarmed; None unknown."""
+    """Return home: item 0 of an ArduPilot mission, else the last disarmed position; None if unknown."""
     items = twin.mission.items if twin.mission is not None else ()
     first = next((item for item in items if item.seq == 0), None)
     ardupilot = twin.status is not None and twin.status.autopilot == "ardupilot"
@@ -76,7 +76,7 @@ def home(twin: Twin) -> Origin | None:
 
 
 def _dangers(twin: Twin, flight: Forecast) -> list[Finding]:
-    """Judge ground and fence; without a home neither."""
+    """Evaluate ground clearance and geofence; neither without a home position."""
     base, rotors = home(twin), hangs(twin)
     if base is None:
         return [_unknown(AlertKind.GROUND), _unknown(AlertKind.GEOFENCE)]
@@ -84,7 +84,7 @@ def _dangers(twin: Twin, flight: Forecast) -> list[Finding]:
     twin.peak = max(twin.peak, float(above(flight, base)[0]))
     until = flight.made.t + _reach_s(flight.made)
     found = [_unknown(AlertKind.GROUND)]
-    low = twin.peak <= margin or _lands(twin, rotors)  # not yet up: it takes off, perhaps on rotors first
+    low = twin.peak <= margin or _lands(twin, rotors)  # still taking off, possibly on rotors
     if not low:
         found = [sinks(flight, base, margin, until)]
     limit = fence(_params(twin))
@@ -94,14 +94,14 @@ def _dangers(twin: Twin, flight: Forecast) -> list[Finding]:
 
 
 def _reach_s(made: Prediction) -> float:
-    """Return how far ahead a prediction says anything of ground and fence [s]."""
+    """Return the look-ahead up to which a prediction is used for ground and geofence alerts [s]."""
     if made.method == "imm":
         return _TURNING_S
     return _GUESSED_S if made.calibration.startswith(GUESSED) else _REACH_S
 
 
 def _lands(twin: Twin, rotors: bool) -> bool:
-    """Return whether it is landing, or about to by its mode or mission."""
+    """Return whether the aircraft is landing, or is about to by its mode or mission."""
     mode = twin.status.mode if twin.status is not None else ""
     if "LAND" in mode or (rotors and mode in RETURN_MODES):
         return True
@@ -114,16 +114,16 @@ def _lands(twin: Twin, rotors: bool) -> bool:
 
 
 def _trust(made: Prediction | None) -> Finding:
-    """Judge the confidence horizon of a prediction along the route, once the aircraft's own past bears it."""
+    """Evaluate the confidence horizon of a route prediction, once enough past predictions are scored."""
     short = 0.0
     if made is not None and made.method != "imm" and made.held_n >= _TOLD and not made.horizon_open:
         short = 1.0 if made.horizon_s < _SHORT_S else 0.5 if made.horizon_s < _LONG_S else 0.0
-    said = f"its predictions stay within 10 % for {made.horizon_s if made else 0.0:.0f} s only; rely on no more"
-    return Finding(AlertKind.SHORT_HORIZON, short, said, "its predictions hold for longer again")
+    said = f"predictions stay within 10 % for only {made.horizon_s if made else 0.0:.0f} s"
+    return Finding(AlertKind.SHORT_HORIZON, short, said, "confidence horizon recovered")
 
 
 def _mission(twin: Twin, now: float) -> Finding:
-    """Judge the legs ahead of a fixed wing that follows its mission."""
+    """Evaluate the feasibility of the legs ahead for a fixed wing that follows its mission."""
     nothing = Finding(AlertKind.NOT_ACHIEVABLE, 0.0, "", "the mission is achievable")
     _, position = twin.history.look("position", twin.history.newest - 3.0)
     if twin.vehicle not in WINGS or twin.why_no_route() or hangs(twin) or not len(position):

@@ -1,4 +1,4 @@
-"""A prediction between two flights ahead: the path of the last one, begun at the newest position."""
+"""Extrapolate a prediction between two rollouts: continue the last path from the newest position."""
 
 from math import exp, sqrt
 
@@ -10,20 +10,20 @@ from fleet.frames import to_ned
 from fleet.physics.kernel import kernel
 from twin_worker.twin.state.state import Twin
 
-LATEST_S = 10.0  # after a flight ahead it is renewed no longer [s]
-OVERDUE_S = 150.0  # the same where the next is due and has to wait for CPU time: better than nothing [s]
-_BACK_S = 10.0  # in which an aircraft is back on the path that was foreseen [s]
+LATEST_S = 10.0  # maximum age of the continued rollout [s]
+OVERDUE_S = 150.0  # the same while the next rollout is due and waits for CPU time [s]
+_BACK_S = 10.0  # time constant of the return to the predicted path [s]
 
 
 @kernel
 def shifted(ahead: np.ndarray, path: np.ndarray, passed: float, at: np.ndarray, out: np.ndarray) -> None:
-    """Fill in the rest of a path from where the aircraft is now.
+    """Compute the rest of a path, shifted to the aircraft's current position.
 
     Args:
         ahead, path: look-aheads, rising, and positions, (n,) and (n, 3) [s, m]
-        passed: time since it began [s]
-        at: where the aircraft is, (3,) [m]
-        out: positions `ahead` from now, (k, 3) [m]; the last at most `passed` before the path's end
+        elapsed: time since the start of the path [s]
+        position: current position, (3,) [m]
+        out: positions at `ahead` from now, (k, 3) [m]; the last at most `elapsed` before the path's end
     """
     off, k = np.zeros(3), 0
     for i in range(len(out)):
@@ -41,7 +41,7 @@ def shifted(ahead: np.ndarray, path: np.ndarray, passed: float, at: np.ndarray, 
 
 @kernel
 def widened(ahead: np.ndarray, tube: np.ndarray, passed: float, out: np.ndarray) -> None:
-    """Fill in half-axes by the age of the rollout, never below those of a new one.
+    """Compute the half-axes at the rollout's age, never below those of a new one.
 
     With e(tau) the rollout's error, of independent increments, and phi = exp(-tau / 10 s), the error from now on is
     e(age + tau) - phi e(age):
@@ -50,8 +50,8 @@ def widened(ahead: np.ndarray, tube: np.ndarray, passed: float, out: np.ndarray)
 
     Args:
         ahead, tube: look-aheads, rising, and half-axes, (n,) and (n, 3) [s, m]
-        passed: age of the rollout [s]
-        out: half-axes `ahead` from now, (k, 3) [m]; the last at most `passed` before the tube's end
+        elapsed: age of the rollout [s]
+        out: half-axes at `ahead` from now, (k, 3) [m]; the last at most `elapsed` before the tube's end
     Source: Bar-Shalom 2001, section 4.3 (covariance propagation of a process with independent increments).
     """
     before, later, k = np.zeros(3), np.zeros(3), 0
@@ -72,7 +72,7 @@ def widened(ahead: np.ndarray, tube: np.ndarray, passed: float, out: np.ndarray)
 
 
 def renew(twin: Twin) -> list[Message]:
-    """Return the last path that was flown ahead, from the newest position on; nothing where there is neither."""
+    """Continue the last rollout from the newest position; return nothing if either is missing."""
     if twin.base is None:
         return []
     t, rows = twin.history.look("position", max(twin.base.t, twin.history.newest - 1.0))
@@ -86,7 +86,7 @@ def renew(twin: Twin) -> list[Message]:
 
 
 def renewable(twin: Twin, t: float) -> bool:
-    """Return whether there is a path to renew at `t`: flown while telemetry came, and not long before."""
+    """Return whether a recent rollout with telemetry exists to continue at `t`."""
     base = twin.base
     if base is None or twin.lost or twin.broken or base.coast_s:
         return False
@@ -94,15 +94,15 @@ def renewable(twin: Twin, t: float) -> bool:
 
 
 def overdue(twin: Twin, t: float) -> bool:
-    """Return whether at `t` the next flight ahead is due, but was not made: it waits for CPU time."""
+    """Return whether the next rollout is due at `t` but was not made because it waits for CPU time."""
     return t >= twin.predict_t + twin.pace.predict
 
 
 def renewed(twin: Twin, t: float, position: np.ndarray) -> Prediction | None:
-    """Return last path that was flown ahead from a position on, (3,) [1e-7 deg, mm] at `t`; the twin stays as it is.
+    """Return the last rollout continued from a position, (3,) [1e-7 deg, mm] at `t`; the twin is not changed.
 
-    The departure so far, d, fades:  p(tau) = path(t - t0 + tau) + d exp(-tau / 10 s). All is in the local frame of the
-    path: that of the twin may have moved since. The horizon ends when that of the path does.
+    The offset d from the path fades:  p(tau) = path(t - t0 + tau) + d exp(-tau / 10 s). The local frame is that of the
+    path, since the twin's origin may have moved. The horizon ends at the same time as that of the path.
     """
     base = twin.base
     if base is None or twin.origin is None or not renewable(twin, t) or not (passed := t - base.t) > 0.0:

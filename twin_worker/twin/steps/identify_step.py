@@ -1,4 +1,4 @@
-"""One hop of learning: window, identification, verification on data held out, the model in force, what is published."""
+"""Identification step: window, identification, verification on held-out data, model selection, publication."""
 
 import msgspec
 import numpy as np
@@ -21,22 +21,22 @@ from twin_worker.twin.steps.point_mass_step import renew
 from twin_worker.validation.held_out import Unseen
 from twin_worker.validation.verify import told, verify
 
-LEAST_S = 30.0  # shortest stretch worth identifying [s]
-SLOW = 6.0  # air-relative forward speed below which nothing flies on its wings [m/s]
-_LENGTH = 17.0  # of the stretch identified, in U0 / g: slower modes of faster aircraft [-]
-_STRETCH_S = 35.0, 95.0  # its limits [s]
-_PAPER_S = 120.0  # the stretch of `--method paper` [s]
-_HELD_S = 8.2, 20.0, 40.2  # held out: least; most of `--method paper`; most [s]
-_HELD_SHARE = 0.3, 0.5  # of what there is, held out [-]
-_FREE_RUN_S = (2.0, 4.0, 2.0, 8.0)  # free-run length of the n-th try of `--method paper` [s]
-_SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the stretch the n-th try uses [-]
-_RUN_S, _RUN_EVERY_S = 20.0, 5.0  # free runs that show what they are worth: how long, how often [s]
-_AFRESH_S = 4.0  # between searches that begin afresh [s]
-_TELL_S = 5.0  # between models that say nothing new [s]
+LEAST_S = 30.0  # shortest window for identification [s]
+SLOW = 6.0  # forward airspeed below which no flight on wings is possible [m/s]
+_LENGTH = 17.0  # window length in U0 / g: faster aircraft have slower modes [-]
+_STRETCH_S = 35.0, 95.0  # limits of the window length [s]
+_PAPER_S = 120.0  # window length of `--method paper` [s]
+_HELD_S = 8.2, 20.0, 40.2  # hold-out length: minimum; maximum of `--method paper`; maximum [s]
+_HELD_SHARE = 0.3, 0.5  # held-out share of the window: `--method paper`, others [-]
+_FREE_RUN_S = (2.0, 4.0, 2.0, 8.0)  # free-run length of the n-th attempt of `--method paper` [s]
+_SHARE = (1.0, 1.0, 0.6, 1.0)  # share of the window used by the n-th attempt [-]
+_RUN_S, _RUN_EVERY_S = 20.0, 5.0  # free runs for the forecast shrinkage: length, period [s]
+_AFRESH_S = 4.0  # between identifications without a warm start [s]
+_TELL_S = 5.0  # between published models without a changed outcome [s]
 
 
 def learn(twin: Twin) -> list[Message]:
-    """Identify and verify once; return the model with its verdict where it is news, nothing while data are starved."""
+    """Identify and verify once; return the model with its verdict if it is due, nothing if data are insufficient."""
     compare_with_flight(twin)
     if twin.vehicle in WINGS:
         renew(twin)
@@ -74,7 +74,7 @@ def learn(twin: Twin) -> list[Message]:
 
 
 def _changed(now: Verdict, before: Verdict) -> bool:
-    """Return whether belief changed; that a model is good and an earlier one better alternates and is no news."""
+    """Return whether the outcome changed; alternation between two valid outcomes does not count."""
     sound = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST)
     return now.outcome is not before.outcome and not (now.outcome in sound and before.outcome in sound)
 
@@ -95,7 +95,7 @@ def _held_limits(twin: Twin) -> tuple[float, float]:
 
 
 def _why_not(twin: Twin, window: Window | None) -> Verdict | None:
-    """Say why there is nothing to identify yet; None where there is."""
+    """Return a verdict with the reason if identification is not possible yet; None otherwise."""
     if twin.vehicle in NO_WINGS:
         sentence = f"{twin.name}: a {twin.vehicle} has no wings to identify; {twin.rotor}"
         return Verdict(outcome=Outcome.NOT_IDENTIFIABLE, sentence=sentence)
@@ -104,15 +104,15 @@ def _why_not(twin: Twin, window: Window | None) -> Verdict | None:
         return None
     where = " on its wings" if twin.vehicle == QUADPLANE else ""
     missing = lacking(twin.history) or "wait"
-    sentence = f"{twin.name}: {below(have, LEAST_S)} s of whole data{where}, {LEAST_S:.0f} s are needed; {missing}"
+    sentence = f"{twin.name}: {below(have, LEAST_S)} s of complete data{where}, {LEAST_S:.0f} s are needed; {missing}"
     return Verdict(outcome=Outcome.STARVED, sentence=sentence)
 
 
 def _identify(twin: Twin, known: Window) -> Plant:
-    """Identify the aircraft; every further try begins elsewhere, or on another share of the window."""
+    """Identify the aircraft; each further attempt uses another initial value or another share of the window."""
     attempt, now = twin.tries % len(_SHARE), float(known.t[-1])
     if twin.method != PAPER and twin.afresh_t <= now < twin.afresh_t + _AFRESH_S:
-        attempt = 0  # a stretch that has hardly changed says from afresh what it said just now
+        attempt = 0  # a cold start on nearly the same window would return the same result
     else:
         twin.tries += 1
     known = known.part(int(len(known) * (1 - _SHARE[attempt])), len(known))
@@ -129,7 +129,7 @@ def _identify(twin: Twin, known: Window) -> Plant:
 
 
 def _on_wings(twin: Twin, window: Window | None) -> Window | None:
-    """Keep what was flown on wings: from the last row that was too slow for them or hung on rotors."""
+    """Return the rows flown on wings: all after the last row that was too slow or hovering."""
     if window is None:
         return None
     slow = window.ok & (window.columns(("u",))[:, 0] < SLOW)
@@ -141,6 +141,6 @@ def _on_wings(twin: Twin, window: Window | None) -> Window | None:
 
 
 def _after(those: np.ndarray, more: int) -> int:
-    """Return the row after the last of those, and so many more; the first where there are none."""
+    """Return the index `margin` rows after the last true row of `mask`; 0 if there is none."""
     found = np.flatnonzero(those)
     return int(found[-1]) + 1 + more if len(found) else 0

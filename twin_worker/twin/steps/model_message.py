@@ -1,4 +1,4 @@
-"""The model as it is published: the newest verdict, and the plant in force with what it stands on."""
+"""Build the published model: the newest verdict, and the active model with its data basis."""
 
 import numpy as np
 
@@ -10,12 +10,12 @@ from twin_worker.identification.fixed_wing.derivatives_model import Coupled
 from twin_worker.identification.fixed_wing.linearise import linearise
 from twin_worker.twin.state.state import Twin
 
-EARNED_S = 10.0  # look-ahead the published shares are for [s]
-_TOLD = 0.5  # share of a parameter's prior variance that data must remove to have told it [-]
+EARNED_S = 10.0  # look-ahead of the published shrinkage weights [s]
+_TOLD = 0.5  # reduction of the prior variance above which a parameter counts as determined by the data [-]
 
 
 def model_message(twin: Twin, window: Window) -> Model:
-    """Publish the newest verdict with the model in force: a failed identification never shows its numbers."""
+    """Build the message with the newest verdict and the active model; a failed identification is never published."""
     plant, derivatives = twin.plant, None
     axes: tuple[Linear | None, Linear | None] = (None, None)
     if isinstance(plant, Coupled):
@@ -42,7 +42,7 @@ def model_message(twin: Twin, window: Window) -> Model:
 
 
 def derivatives_of(plant: Coupled, airframe: str) -> Derivatives:
-    """Return the parameters with their covariance, and how much of each the data told."""
+    """Return the parameters with their covariance, and the share of each determined by the data."""
     covariance = plant.covariance
     held = np.linalg.inv(plant.precision)
     told = 1.0 - np.diag(covariance) / np.diag(held)
@@ -62,8 +62,8 @@ def derivatives_of(plant: Coupled, airframe: str) -> Derivatives:
 
 
 def _said(told: np.ndarray, airframe: str) -> str:
-    """Say what the data identified and what the prior held."""
+    """Describe which parameters come from the data and which from the prior."""
     by_data = int((told > _TOLD).sum())
     held = [name for name, share in zip(NAMES, told, strict=True) if share <= _TOLD]
-    frozen = f"; held by the prior: {' '.join(held)}" if held else ""
-    return f"{by_data} of {len(NAMES)} parameters told by the data, prior {airframe}{frozen}"
+    frozen = f"; from the prior: {' '.join(held)}" if held else ""
+    return f"{by_data} of {len(NAMES)} parameters determined by the data, prior {airframe}{frozen}"

@@ -1,4 +1,4 @@
-"""Which verified model is in force: the one that strays least when it flies what was held out in closed loop."""
+"""Select the active model: the verified model with the lowest closed-loop error on held-out data."""
 
 import msgspec
 import numpy as np
@@ -9,23 +9,23 @@ from twin_worker.identification.fixed_wing.plant import Plant
 from twin_worker.prediction.closed_loop import Flown, Start, fly_from, set_out
 from twin_worker.twin.state.state import Believed, Twin
 
-FLY_S = 6.0  # between flights of the same models [s]
-_FLIGHT_S = 20.0  # of the newest data flown [s]
-_KEEP = 3  # verified models kept to choose from
-_NEW = 1.2  # a new model's only flight so far counts as a miss this much larger [-]
+FLY_S = 6.0  # between closed-loop runs of the same models [s]
+_FLIGHT_S = 20.0  # length of the closed-loop run over the newest data [s]
+_KEEP = 3  # number of verified models kept
+_NEW = 1.2  # factor on the error of a new model, which has only one run so far [-]
 
 
 def choose(twin: Twin, window: Window, known: int, plant: Plant, verdict: Verdict) -> Verdict:
-    """Fly every verified model in closed loop over the newest data; the one that strays least is in force.
+    """Run every verified model in closed loop over the newest data and activate the one with the lowest error.
 
     Args:
-        twin: whose pool of models is renewed
-        window: flight; rows from `known` on `plant` has not seen
-        known: first of them
-        plant: the newest model
-        verdict: on it, open loop
+        twin: its list of verified models is updated
+        window: flight; rows from `n_train` on are held out
+        n_train: first held-out row
+        plant: newest model
+        verdict: open-loop verdict of `plant`
     Returns:
-        the verdict, changed where the closed loop says otherwise
+        the verdict, changed if the closed-loop result contradicts it
     """
     if twin.pool and window.t[-1] - twin.flown_t < FLY_S:
         return verdict
@@ -42,22 +42,22 @@ def choose(twin: Twin, window: Window, known: int, plant: Plant, verdict: Verdic
     best = twin.pool[0]
     twin.plant, twin.in_force = best.plant, best.verdict
     if verdict.outcome is Outcome.VERIFIED and best.plant is not plant:
-        sentence = f"{verdict.sentence}; but an earlier model strays less on the route and stays in force"
+        sentence = f"{verdict.sentence}; but an earlier model has a lower closed-loop error and stays active"
         return msgspec.structs.replace(verdict, outcome=Outcome.WORSE_THAN_LAST, sentence=sentence)
     return verdict
 
 
 def _join(twin: Twin, window: Window, plant: Plant, verdict: Verdict, miss: float) -> Verdict:
-    """Take a verified model into the pool, unless it cannot fly the route."""
+    """Add a verified model, unless its closed-loop run on the route diverges."""
     if np.isinf(miss):
-        sentence = f"{verdict.sentence}; but on the route the twin leaves its envelope; trying again"
+        sentence = f"{verdict.sentence}; but the closed-loop run leaves the flight envelope; identification is repeated"
         return msgspec.structs.replace(verdict, outcome=Outcome.DIVERGED, sentence=sentence)
     twin.pool.append(Believed(plant, verdict, float(window.t[-1]), _NEW * miss))
     return verdict
 
 
 def hindcast(begin: Start | Flown | None, window: Window, start: int, plant: Plant) -> float:
-    """Return the mean miss of a flight from row `start` to the end [m]; inf: it diverges, nan: no route to fly."""
+    """Return the mean closed-loop position error from row `start` to the end [m]; inf: diverged, nan: no route."""
     if not isinstance(begin, Start):
         return np.nan
     ahead = np.arange(0.0, int((len(window) - 1 - start) * window.dt) + 1.0)

@@ -1,4 +1,4 @@
-"""Keep the hybrid of one aircraft up to date: identify, let it fly what was held out, believe it or not."""
+"""Update the point-mass model of one aircraft: identify it, and activate it if its hold-out error is low."""
 
 import numpy as np
 
@@ -12,15 +12,15 @@ from twin_worker.prediction.fixed_wing.point_mass_rollout import fly_hybrid
 from twin_worker.twin.state.state import Twin
 
 EVERY_S = 5.0  # between identifications [s]
-_HELD_S = 20.0  # newest flight held out [s]
-_AFRESH_S = 60.0  # flight since a fault before it replaces what a diagnosis made [s]
-_CHECK_S = 10.0  # between flights over it [s]
-_MOST = 0.10  # of the way, strayed at the end of it: more is not believed [-]
+_HELD_S = 20.0  # newest flight, held out [s]
+_AFRESH_S = 60.0  # flight after a fault onset before the model adapted by a diagnosis is replaced [s]
+_CHECK_S = 10.0  # between checks on held-out flight [s]
+_MOST = 0.10  # maximum final error over path length for an active model [-]
 _NEWS = 0.3  # weight of the newest check
 
 
 def renew(twin: Twin) -> None:
-    """Identify anew where it is due; `twin.hybrid` is None until one was believed."""
+    """Identify the point-mass model if it is due; `twin.hybrid` is None until its error is low enough."""
     newest = twin.history.newest
     if twin.why_no_route() or twin.hybrid_t <= newest < twin.hybrid_t + EVERY_S:
         return
@@ -43,13 +43,13 @@ def renew(twin: Twin) -> None:
 
 
 def _whole(window: Window, since: float) -> Window:
-    """Cut what is unbroken up to the end, from `since` on [s since 1970]."""
+    """Return the last part of the window without gaps, from `since` on [s since 1970]."""
     bad = np.flatnonzero(~(window.ok & (window.t >= since)))
     return window.part(int(bad[-1]) + 1 if len(bad) else 0, len(window))
 
 
 def _strays(twin: Twin, good: Window) -> float:
-    """Fly what is identified before the held-out seconds over them; return the miss at their end over the way [-]."""
+    """Return the final error of a rollout over held-out flight, divided by its path length [-]."""
     held = int(_HELD_S / good.dt)
     known = good.part(0, len(good) - held)
     now = twin.situation(known)

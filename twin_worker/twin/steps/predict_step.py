@@ -1,4 +1,4 @@
-"""One prediction: the route flown by the best twin the aircraft has, else a turn-rate guess; tube and horizon."""
+"""Predict one path: the route flown by the best available model, else a turn-rate prediction; tube and horizon."""
 
 from dataclasses import replace
 from typing import Any
@@ -19,18 +19,18 @@ from twin_worker.twin.state.state import Twin
 from twin_worker.twin.state.vehicle_class import Flight, fly_kind, hangs, nothing, seen
 from twin_worker.twin.steps.rollouts import BOTH, HYBRID, fly_route, in_force
 
-LOOK_BACK_S = 62.0  # telemetry a prediction starts from [s]
-_TELL_S = 10.0  # between laws and parameters that are no news [s]
-_STALE_S = 3.0  # positions older than other telemetry by more say nothing of now [s]
-_MISSED = 2  # autopilot parameters that may be lacking where they count as known [-]
+LOOK_BACK_S = 62.0  # telemetry used for a prediction [s]
+_TELL_S = 10.0  # between reports of unchanged law and parameters [s]
+_STALE_S = 3.0  # maximum age of positions relative to other telemetry [s]
+_MISSED = 2  # maximum number of absent autopilot parameters in the group of known parameters [-]
 _LEARNT = (BOTH, HYBRID, DYNAMICS)
 _IMM_LAW, _NO_LAW = "none: turn rate only", "none: on the ground"
 
 
 def foresee(twin: Twin, now: float) -> list[Message]:
-    """Predict from the newest telemetry, as of data time `now`; nothing while there is too little.
+    """Predict from the newest telemetry at data time `now`; return nothing if data are insufficient.
 
-    Without positions it coasts: the twin flies on from the last good state until its confidence horizon is over.
+    Without positions the prediction coasts: it continues from the last valid state until its confidence horizon ends.
     """
     assert twin.origin is not None
     flown = seen(twin, LOOK_BACK_S, turned=False)
@@ -74,7 +74,7 @@ def foresee(twin: Twin, now: float) -> list[Message]:
 
 
 def _coasts(twin: Twin, flown: Track, now: float) -> float:
-    """Return the time flown by the twin alone [s]; 0 with telemetry. Positions alone may stop: that is an event."""
+    """Return the time since the last valid position [s]; 0 with telemetry. A position loss alone is an event."""
     broken = not twin.lost and twin.history.newest - max(float(flown.t[-1]), twin.back_t) > _STALE_S
     if broken != twin.broken and not twin.lost:
         note(twin, Event.TELEMETRY_BROKEN if broken else Event.TELEMETRY_WHOLE, now)
@@ -85,13 +85,13 @@ def _coasts(twin: Twin, flown: Track, now: float) -> float:
 
 
 def _is_over(twin: Twin, coast: float, now: float) -> bool:
-    """Return whether coasting, once it was told of, has used up the confidence horizon of the last prediction."""
+    """Return whether coasting, once published, exceeds the confidence horizon of the last prediction."""
     last = twin.prediction
     return coast > AHEAD[-1] or (last is not None and last.coast_s > 0 and now >= last.t + last.horizon_s)
 
 
 def _close(twin: Twin, coast: float, now: float) -> list[Message]:
-    """Say once that the horizon is over; after that nothing, until telemetry returns."""
+    """Publish the end of the horizon once; after that nothing until telemetry returns."""
     if twin.over or twin.prediction is None:
         return []
     twin.over = True
@@ -103,7 +103,7 @@ def _close(twin: Twin, coast: float, now: float) -> list[Message]:
         horizon_s=0.0,
         horizon_open=False,
         coast_s=coast,
-        sentence=f"{_ago(twin, coast)}: the confidence horizon is over, where it is now is not known",
+        sentence=f"{_ago(twin, coast)}: the confidence horizon is over, the current position is unknown",
         **_event(twin),
     )
     return [twin.prediction]
@@ -114,18 +114,18 @@ def _ago(twin: Twin, coast: float) -> str:
 
 
 def _with(twin: Twin, made: Flight) -> str:
-    """Say what missing physics is in the model that flew; empty where it is as learnt."""
+    """Describe the fault effects in the model used; empty if there are none."""
     return f"flown with {twin.extended};" if twin.extended is not None and made.method in _LEARNT else ""
 
 
 def _event(twin: Twin) -> dict[str, Any]:
-    """Return what the newest event tells, by the fields of a prediction."""
+    """Return the newest event as fields of a prediction."""
     told = twin.noted
     return {} if told is None else {"event": told.event, "event_t": told.t, "event_said": told.said}
 
 
 def _controller(twin: Twin, made: Flight, now: float) -> Controller | None:
-    """Return the law and parameters in force where they are news, or were told long ago."""
+    """Return the active law and parameters if they changed or the last report is old; None otherwise."""
     control = made.control or Control(made.law)
     if control == twin.control and twin.control_t <= now < twin.control_t + _TELL_S:
         return None
@@ -134,7 +134,7 @@ def _controller(twin: Twin, made: Flight, now: float) -> Controller | None:
 
 
 def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
-    """Fly the identified model, else the law of its kind, else turn on; return the flight and when it starts."""
+    """Return the forecast of the identified model, else kinematic, else turn rate; and its start."""
     window = twin.window(LOOK_BACK_S)
     whole = window is not None and bool(window.ok[-1])
     why = twin.verdict.sentence
@@ -143,7 +143,7 @@ def _best(twin: Twin, flown: Track, ahead: np.ndarray) -> tuple[Flight, float]:
         still = np.tile(flown.p[-1], (len(ahead), 1))
         return Flight(still, "imm", _NO_LAW, -1, SENTENCES[Event.TOUCH_DOWN]), float(flown.t[-1])
     if (twin.plant is not None or twin.hybrid is not None) and not hangs(twin):
-        first = nothing(twin.why_no_route() or "telemetry is broken: the model has nothing to start from")
+        first = nothing(twin.why_no_route() or "telemetry has gaps: no initial state for the model")
         if window is not None and whole and not twin.why_no_route():
             first = fly_route(twin, window, ahead)
         if _good(first):
@@ -166,7 +166,7 @@ def _good(flight: Flight) -> bool:
 
 
 def _whole(path: np.ndarray | None) -> int:
-    """Return how many look-aheads a path was flown for without a break; 0 where that is too short to be of use."""
+    """Return the number of look-aheads before the first gap; 0 if the path is too short."""
     if path is None:
         return 0
     broken = np.flatnonzero(~np.isfinite(path).all(axis=1))
@@ -175,7 +175,7 @@ def _whole(path: np.ndarray | None) -> int:
 
 
 def _group(twin: Twin, flight: Flight, flown: Track) -> str:
-    """Name the calibration group of a flight ahead."""
+    """Return the calibration group of a forecast."""
     control = flight.control
     known = "known"
     if control is not None and len(control.absent) > _MISSED:
@@ -195,7 +195,7 @@ def _state(twin: Twin, otherwise: State) -> State:
 
 
 def _trusted(twin: Twin, made: Made, trust: Trust) -> Prediction:
-    """Publish a path with its tube and up to when the 90 % error stays below 10 % of the path."""
+    """Build the message of a path with its tube and confidence horizon."""
     held, n = twin.record.held
     coverage, coverage_n = twin.record.coverage_renewed
     begin = float(made.ahead[0])

@@ -1,4 +1,4 @@
-"""The route flown ahead by every way the aircraft has, and the one that is used."""
+"""Predict the route with every available method, and select the method used."""
 
 import numpy as np
 
@@ -15,16 +15,16 @@ from twin_worker.twin.state.state import Twin
 from twin_worker.twin.state.vehicle_class import Flight, nothing
 
 HYBRID, BOTH = "hybrid", "both"
-_NEAR_S = 60.0  # the identified dynamics are flown as far; beyond, the hybrid goes on from there [s]
+_NEAR_S = 60.0  # look-ahead of the identified dynamics; beyond it the point-mass path continues [s]
 
 
 def fly_route(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
-    """Fly the route ahead, or say why not.
+    """Predict the route, or return the reason why this is not possible.
 
     Args:
-        twin: whose contest, hybrid, plant and spread are used; contest and spread are renewed
+        twin: source of the models; its method selection and ensemble are updated
         window: newest telemetry
-        ahead: wanted look-ahead times from its end, rising, (k,) [s]
+        ahead: look-ahead times from the end of `window`, rising, (k,) [s]
     """
     now = twin.situation(window)
     start = set_out(now)
@@ -34,7 +34,7 @@ def fly_route(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
     due = twin.contest.due(t)
     flown, why = paths(twin, (now, start), ahead, due)
     if not flown:
-        return nothing(why or "no model was believed yet", start.seq)
+        return nothing(why or "no verified model yet", start.seq)
     if due and len(flown) > 1 and not twin.lost:
         twin.contest.keep(t, float(np.linalg.norm(start.good.v[-1])), ahead, flown)
     _spread(twin, (now, start))
@@ -46,7 +46,7 @@ def fly_route(twin: Twin, window: Window, ahead: np.ndarray) -> Flight:
 def paths(
     twin: Twin, begin: tuple[Situation, Start], ahead: np.ndarray, due: bool
 ) -> tuple[dict[str, np.ndarray], str]:
-    """Return the path of each method that flies, NED (k, 3) [m], and why another does not; `due`: all must fly."""
+    """Return the path of each method, NED (k, 3) [m], and the reason if another failed; `due`: run all methods."""
     found: dict[str, np.ndarray] = {}
     why = ""
     if twin.hybrid is not None and twin.method in (HYBRID, "auto"):
@@ -70,13 +70,13 @@ def _kept(paths: dict[str, np.ndarray], name: str, flown: Flown) -> dict[str, np
 
 
 def _lengthened(path: np.ndarray, further: np.ndarray) -> np.ndarray:
-    """Go on from the end of `path`, (m, 3), as `further`, (k, 3), does."""
+    """Continue `path`, (m, 3), with the increments of `continuation`, (k, 3)."""
     end = len(path)
     return np.vstack([path, further[end:] + (path[-1] - further[end - 1])])
 
 
 def _spread(twin: Twin, begin: tuple[Situation, Start]) -> None:
-    """Fly the ensemble where it is due."""
+    """Run the ensemble if it is due."""
     t = float(begin[1].good.t[-1])
     known = twin.spread_t <= t < twin.spread_t + SOON * twin.pace.ensemble and twin.instead is None
     twin.put_off = None
@@ -89,9 +89,9 @@ def _spread(twin: Twin, begin: tuple[Situation, Start]) -> None:
 
 
 def fly_put_off(twin: Twin, seconds: float) -> None:
-    """Fly the ensemble that was due with the last flight, from now, looking so far back; the next one keeps the beat.
+    """Run the deferred ensemble from the current state; the schedule of the next one is unchanged.
 
-    It had to wait for others: the doubt it tells of counts for the next flight.
+    The ensemble waited for other work; its spread applies from the next prediction on.
     """
     due, twin.put_off = twin.put_off, None
     window = twin.window(seconds)
@@ -104,7 +104,7 @@ def fly_put_off(twin: Twin, seconds: float) -> None:
 
 
 def _fly_ensemble(twin: Twin, begin: tuple[Situation, Start], t: float) -> None:
-    """Fly the ensemble of `t`; beyond its span the spread goes on as the law of growth does."""
+    """Run the ensemble of time `t`; beyond its span the spread continues by the growth law."""
     assert twin.hybrid is not None
     ahead = AHEAD[: AHEAD.searchsorted(twin.pace.span, side="right")]
     rng = np.random.default_rng((twin.uav, int(t)))
@@ -116,12 +116,12 @@ def _fly_ensemble(twin: Twin, begin: tuple[Situation, Start], t: float) -> None:
 
 
 def in_force(twin: Twin, method: str, ahead: np.ndarray) -> np.ndarray | None:
-    """Return the spread of the newest ensemble at some look-aheads, (k, 3) [m]; None where it does not belong to these.
+    """Return the spread of the newest ensemble at some look-aheads, (k, 3) [m]; None if it does not apply to `method`.
 
     Args:
-        twin: whose ensemble
+        twin: source of the ensemble
         method: of the prediction
-        ahead: rising; beyond the ensemble's end the spread stays (k,) [s]
+        ahead: rising; beyond the ensemble's end the spread stays constant (k,) [s]
     """
     if twin.spread is None or method not in (HYBRID, BOTH, DYNAMICS):
         return None
