@@ -66,7 +66,7 @@ def _evidence(report: Report) -> tuple[tuple[float, float], tuple[float, float]]
 def _flown(report: Report) -> str:
     before, after = report.stray_before, report.stray_after
     return (
-        f", and the attitude error of 5 s free runs falls from {before:.1f} to {after:.1f} deg"
+        f", and the attitude error of free runs of 5 s falls from {before:.1f} to {after:.1f} deg"
         if after < 0.9 * before
         else ""
     )
