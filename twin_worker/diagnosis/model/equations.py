@@ -8,7 +8,8 @@
     c_z = m f_z / (q_bar S), c_x and c_y likewise; ^: made dimensionless by b / 2 Va, c / 2 Va
 
 Flow angles from inertial velocity are poor regressors of the moments (noise, trim). Forces per dynamic pressure
-contain the same gusts as the moments.  Source: Klein & Morelli 2006, section 5.2 (equation error); Beard & McLain 2012, chapter 4.
+contain the same gusts as the moments.
+Source: Klein & Morelli 2006, section 5.2 (equation error); Beard & McLain 2012, chapter 4.
 """
 
 from typing import Any
