@@ -53,7 +53,7 @@ class Experiment:
         uav, t: UAV id, and start of the unseen window [s since 1970]
         mode, mode_seen: flight mode of the unseen window, and of the window of equal length before it
         seconds: since the start of the unseen window, (n,) [s]
-        actual, first, refined: states in the order of `NAMES`, (n, 9) [m/s, rad/s, rad]
+        actual, first, refined: states in the order of `STATE_NAMES`, (n, 9) [m/s, rad/s, rad]
         fit: both steps over the unseen window, (2, 9) [%]
         fit_seen: both steps over the last part of the identification window, (2, 9) [%]
         outcome, sentence: verdict on the refined model

@@ -24,7 +24,7 @@ def draw(folder: Path, first: str, done: "Sequence[Experiment]", names: Sequence
     Args:
         folder: created if missing
         first: name of the first step
-        done: experiments
+        results: experiments
         names: state names of the columns
     """
     folder.mkdir(parents=True, exist_ok=True)

@@ -94,7 +94,7 @@ def _believable(base: Baseline) -> None:
     if base.card.known and base.vane and not _SLOPES[0] < slope < _SLOPES[1]:
         raise ValueError(
             f"{base.card.name}: found a lift slope of {slope:.1f} per rad with its mass and wing area, expected "
-            f"{_SLOPES[0]:g} to {_SLOPES[1]:g}; is it the card of this aircraft?"
+            f"{_SLOPES[0]:g} to {_SLOPES[1]:g}; use the card of this aircraft"
         )
 
 

@@ -20,7 +20,7 @@ _ROUNDS = 2
 _FADED = 4.0  # whitened rows per independent sample: whitening is incomplete
 _LAGS = (0.0, 0.03, 0.06, 0.1, 0.14, 0.18, 0.22, 0.28, 0.35)  # [s]
 _DELAYS = (0.0, 0.02, 0.04, 0.06)  # [s]
-_ENGINES = {  # electric motors respond in 0.1 s, piston engines in seconds; few values without fast accelerometer [s]
+_ENGINES = {  # by fast accelerometer; electric motors respond in 0.1 s, piston engines in seconds [s]
     True: (0.1, 0.14, 0.19, 0.27, 0.37, 0.51, 0.71, 0.98, 1.36, 1.88, 2.6, 3.61, 5.0),
     False: (0.1, 0.25, 0.5),
 }

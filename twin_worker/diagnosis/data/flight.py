@@ -135,7 +135,7 @@ def lay(name: str, history: History, params: dict[str, float], card: Card) -> Fl
     if flight.seconds < _LEAST_S:
         raise ValueError(
             f"{name}: found {below(flight.seconds, _LEAST_S)} s in the air, expected {_LEAST_S:.0f} s at least; "
-            "was it standing on the ground?"
+            "check that the aircraft flew"
         )
     return flight
 

@@ -31,7 +31,7 @@ from twin_worker.diagnosis.model.weather import own_weather
 _TOLD = 0.10  # or of the error of predicted forces
 _KEPT = 0.15  # least share of an effect's gain on held-out data
 _BORNE, _MUCH = 0.4, 450.0  # or a strong gain: least share of it on held-out data, and least gain
-_RARE, _LITTLE = 5.0, 150.0  # the least strong gain is this multiple of the chance gain, at least the second number
+_RARE, _LITTLE = 5.0, 150.0  # least strong gain: multiple of the chance gain, lower limit
 _STRANGE = 3.0  # largest ratio of mean square to usual without an explanation
 _LEFT = 2.6  # the same limit with the named effects included
 _EXPLAINED = 0.6  # least share of the excess that named effects explain

@@ -16,7 +16,7 @@ from twin_worker.diagnosis.model.residual import Terms
 
 _AIR_LAG_S = 4.0  # time constant of a partly blocked pressure line
 _APART_S = 25.0  # least length of data before and after the onset
-_NOBODYS = {  # terms without an effect in the catalogue: damping, stability, cross-coupled surface, moving loads
+_NOBODYS = {  # terms without an effect: damping, stability, cross-coupled surface, moving loads
     "L": ("beta", "p", "r", "delta_r"),
     "M": ("q", "c_x"),
     "N": ("beta", "p", "r", "delta_a"),

@@ -18,7 +18,7 @@ RELEASED = 2.5  # spreads beyond which a difference is no longer a nuisance
 SOUND = 3.3  # the same for sensor biases, which data sheets specify
 
 WAVES = 3  # cosine harmonics of a slow drift
-_WANDERS = {  # drift of sensors and weather during a flight: effect -> floor of the drift over the floor of the mean
+_WANDERS = {  # drift during a flight: effect -> floor of the drift over the floor of the mean
     "accel_bias": 0.4,
     "gyro_bias": 0.3,
     "heading_bias": 0.25,
