@@ -32,10 +32,10 @@ class Rule(NamedTuple):
 
 
 RULES = {
-    "odd": Rule(450.0, 3.0, 2.0, 0.5, 0.25),  # the whole equation changed, with the named effects included
-    "shift": Rule(240.0, 2.4, 1.5, 0.05, 0.05),  # the equation changed in flight, with the named effects included
+    "odd": Rule(450.0, 3.0, 2.0, 0.5, 0.25),  # the whole equation changed, given the named effects
+    "shift": Rule(240.0, 2.4, 1.5, 0.05, 0.05),  # the equation changed in flight, given the named effects
     "one": Rule(165.0, 3.0, 1.0, 0.9, 0.9),  # one coefficient changed, without the named effects
-    "tone": Rule(200.0, 2.0, 1.0, 0.0, 0.0),  # a tone, with the named effects included
+    "tone": Rule(200.0, 2.0, 1.0, 0.0, 0.0),  # a tone, given the named effects
 }
 
 
