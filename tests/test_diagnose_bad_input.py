@@ -61,7 +61,7 @@ def test_a_flight_of_ten_seconds_is_too_short() -> None:
 
 
 def test_standing_on_the_ground_is_no_flight() -> None:
-    with pytest.raises(ValueError, match=r"found 0 s in the air.*standing on the ground"):
+    with pytest.raises(ValueError, match=r"found 0 s in the air.*check that the aircraft flew"):
         lay("parked", history(120.0, 0.0), {}, UNKNOWN)
 
 
@@ -95,13 +95,13 @@ def test_without_accelerometer_the_model_asks_for_flights_like_it(nominal: list[
 @pytest.mark.recordings
 def test_another_aircraft_is_refused(nominal: list[Flight], base: Baseline) -> None:
     slow = {name: x / 2.5 if name in ("v_n", "v_e", "Va") else x for name, x in nominal[0].readings.items()}
-    with pytest.raises(ValueError, match=r"expected about 47 m/s.*give the model of this aircraft"):
+    with pytest.raises(ValueError, match=r"expected about 47 m/s.*use the model of this aircraft"):
         diagnose(replace(nominal[0], readings=slow), base)
 
 
 @pytest.mark.recordings
 def test_the_card_of_another_aircraft_is_refused(folder: Path, nominal: list[Flight]) -> None:
-    with pytest.raises(ValueError, match=r"Aerosonde.*lift slope.*is it the card of this aircraft"):
+    with pytest.raises(ValueError, match=r"Aerosonde.*lift slope.*use the card of this aircraft"):
         calibrate(
             [read_flights(folder / f"{flight.name}.tlog", read(Path("aerosonde")))[0] for flight in nominal],
             read(Path("aerosonde")),

@@ -117,9 +117,7 @@ def test_what_is_seen_once_says_so_and_where():
     unknown = made(outcome=Outcome.UNKNOWN)
     first = answered(watch, 1200.0, unknown)
     assert first.outcome is Found.SUSPECTED and first.causes[0].channel == "pitch"
-    assert (
-        first.sentence.startswith("detected once, not confirmed: a mismatch no effect") and word(first) == "suspected"
-    )
+    assert first.sentence.startswith("detected once, not confirmed: mismatch in") and word(first) == "suspected"
     assert answered(watch, 1210.0, unknown).outcome is Found.UNKNOWN
 
 

@@ -1,4 +1,4 @@
-"""`python -m twin_worker.diagnosis FLIGHT…`: what `fleet diagnose` starts."""
+"""`python -m twin_worker.diagnosis FLIGHT…`: the process behind `fleet diagnose`."""
 
 import argparse
 import sys
@@ -37,7 +37,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _against(args: argparse.Namespace) -> Against:
-    """Return what the flights are compared with."""
+    """Return the reference of the diagnosis: a model, a calibration, or the past of each flight."""
     if args.model:
         return keep.load(args.model)[0]
     card = card_of(args.airframe)
@@ -45,7 +45,7 @@ def _against(args: argparse.Namespace) -> Against:
 
 
 def _page(reports: list[Report], against: Against, folder: Path) -> None:
-    """Write figures and page, and the simulation corrected by what was named where there is one for all flights."""
+    """Write figures and pages; with a common simulation, also a model file corrected by the named effects."""
     from twin_worker.diagnosis.output.figures import stems
     from twin_worker.diagnosis.output.page import write
 

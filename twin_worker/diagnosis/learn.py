@@ -1,4 +1,4 @@
-"""`python -m twin_worker.diagnosis.learn NOMINAL…`: what `fleet calibrate` starts."""
+"""`python -m twin_worker.diagnosis.learn NOMINAL…`: the process behind `fleet calibrate`."""
 
 import argparse
 import json
@@ -19,24 +19,24 @@ from twin_worker.diagnosis.output.keep import save
 
 
 def say(word: str) -> None:
-    """Report progress."""
+    """Log a progress message."""
     tell("diagnose", word)
 
 
 def card_of(path: Path | None) -> Card:
-    """Read the card, or say that there is none."""
+    """Read the aircraft card, or return `UNKNOWN` with a log message."""
     if path is not None:
         return read(path)
-    say("no airframe card: a unit body is assumed; masses and coefficients are shares, not kilograms")
+    say("no airframe card: assuming unit mass and geometry; masses and coefficients are relative, not in kg")
     return UNKNOWN
 
 
 def flights_of(files: Sequence[Path], card: Card) -> list[Flight]:
-    """Read the flights in recordings.
+    """Read the flights of all recordings.
 
     Raises:
-        ValueError: when one of them holds none.
-        OSError: when one cannot be read.
+        ValueError: if a recording has no usable flight.
+        OSError: if a file cannot be read.
     """
     found = []
     for path in files:
@@ -46,7 +46,7 @@ def flights_of(files: Sequence[Path], card: Card) -> list[Flight]:
 
 
 def learn(files: Sequence[Path], card: Card, until: float | None = None) -> Baseline:
-    """Calibrate on recordings, or on what each did before `until` [s, on its own clock]; one flight on its own past."""
+    """Calibrate on recordings, or on the part of each before `until` [s, on its own clock]."""
     flights = flights_of(files, card)
     if until is None:
         base = calibrate(flights, card, say)
@@ -65,7 +65,7 @@ def _run(args: argparse.Namespace) -> int:
     base = learn(args.file, card_of(args.airframe), args.until)
     save(args.out, base)
     explained = ", ".join(f"{name} {x:.0%}" for name, x in base.r2.items())
-    print(f"{args.out.name}: calibrated on {len(base.flights)} flights; explained: {explained}")
+    print(f"{args.out.name}: calibrated on {len(base.flights)} flights; variance explained: {explained}")
     if args.json:
         args.json.write_text(json.dumps({"flights": base.flights, "r2": base.r2, "chance": base.chance}, indent=1))
     return 0

@@ -1,4 +1,4 @@
-"""Share recordings, or flights already read, among processes."""
+"""Diagnose recordings, or flights already read, in parallel processes."""
 
 import multiprocessing
 import signal
@@ -14,20 +14,20 @@ from twin_worker.diagnosis.model.baseline import Baseline
 
 Say = Callable[[str], None]
 Against = Baseline | OwnPast
-Told = tuple[list[Report], str]  # of one task: its flights' reports, and why it was refused, or empty
+Told = tuple[list[Report], str]  # reports of one task, and the error message or an empty string
 
 
 def shared(
     tasks: Sequence[Path | Flight], against: Against, jobs: int, say: Say, conceal: Sequence[str] = ()
 ) -> Iterator[Told]:
-    """Diagnose every recording or flight, in order; one that is refused loses no other.
+    """Diagnose every recording or flight, in order; an error in one does not affect the others.
 
     Args:
         tasks: recordings, or flights
-        against: the calibrated simulation, or how much of each flight's own past to calibrate one on
-        jobs: processes
-        say: takes words of progress, where there is one process
-        conceal: channels of these flights not to look at, of `hidden.NAMES`
+        reference: the calibrated simulation, or the past of each flight
+        jobs: number of processes
+        progress: callback for progress messages, used with one process only
+        conceal: channels to conceal, of `hidden.NAMES`
     """
     if jobs == 1:
         yield from (_told(task, against, say, conceal) for task in tasks)
@@ -41,7 +41,7 @@ _conceal: Sequence[str]
 
 
 def _begin(against: Against, conceal: Sequence[str]) -> None:
-    """Begin a process of the pool: Ctrl-C is the parent's business."""
+    """Initialise a pool process; only the parent handles Ctrl-C."""
     global _against, _conceal
     _against, _conceal = against, conceal
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,1 +1,1 @@
-"""Experiments of Huang et al. 2021, repeated."""
+"""Reproduction of the experiments of Huang et al. 2021."""

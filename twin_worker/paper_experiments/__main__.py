@@ -1,8 +1,8 @@
 """`python -m twin_worker.paper_experiments identify FILE…`: the paper's identification experiment on recorded flights.
 
-Every few seconds of flight the two linear models (4 states along, 5 across) are identified on the stretch before, by a
-first step and by its prediction-error refinement without any prior, and both run free over the next seconds, which they
-have not seen. The mode of those seconds decides under which of climb, level, turn and descent the pair counts.
+Every few seconds of flight, the two linear models (4 longitudinal, 5 lateral states) are identified on the preceding
+window, by a first step and by its prediction-error refinement without prior. Both then run free over the following
+unseen seconds. The flight mode of those seconds (climb, level, turn, descent) groups the results.
 
 Source: Huang 2021, section 4.2, figures 7 and 8.
 """
@@ -26,7 +26,7 @@ from twin_worker.paper_experiments.figures import draw
 from twin_worker.paper_experiments.recorded_flights import Flown, flown
 from twin_worker.telemetry.flight_phase import MODES
 
-_SAY_EVERY = 20  # experiments between two words of progress
+_SAY_EVERY = 20  # experiments between two progress messages
 
 EXAMPLES = """
   python -m twin_worker.paper_experiments identify flight.tlog
@@ -35,10 +35,9 @@ EXAMPLES = """
 
 
 def summary(done: list[Experiment]) -> dict[str, dict[str, Any]]:
-    """Give each mode's row: counts, medians over the states' mean fit, the paired gain, quartiles per state, verdicts.
+    """Summarise each mode: count, median of the mean fit over states, paired gain, quartiles per state, verdicts.
 
-    `p` is the one-sided signed-rank probability that the gain is chance; experiments next to each other share data, so
-    it flatters.
+    `p` is the one-sided signed-rank p-value of the gain; it is too small, because adjacent experiments share data.
     """
     rows = {}
     for mode in MODES:
@@ -67,12 +66,12 @@ def _row(its: list[Experiment], seen: list[np.ndarray]) -> dict[str, Any]:
 
 
 def _steps(pair: np.ndarray) -> dict[str, Any]:
-    """Name the values of both steps."""
+    """Return the values of both steps by name."""
     return dict(zip(("first", "refined"), np.round(pair, 1).tolist(), strict=True))
 
 
 def text(first: str, rows: dict[str, dict[str, Any]]) -> str:
-    """Return the rows as lines to read."""
+    """Format the summary as text."""
     lines = [f"first step: {first}; fit over unseen seconds, median [%]"]
     for mode, row in rows.items():
         step = row["fit"]
@@ -82,7 +81,7 @@ def text(first: str, rows: dict[str, dict[str, Any]]) -> str:
         )
         if seen := row["fit_seen"]:
             lines.append(
-                f"           over data identified on: first {seen['first']:.1f}, refined {seen['refined']:.1f}"
+                f"           over identification data: first {seen['first']:.1f}, refined {seen['refined']:.1f}"
             )
         told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in sorted(row["verdicts"].items()))
         lines.append(f"           {told}; e.g. {row['sentence']}")
@@ -95,11 +94,11 @@ def _run(args: argparse.Namespace) -> int:
         tell("paper", f"reading {path.name}")
         flights += flown(path)
     if not flights:
-        raise ValueError("paper: found no flight with attitude, velocity, position and servo rows; name another FILE")
+        raise ValueError("paper: found no flight with attitude, velocity, position and servo rows; use another FILE")
     plan = Plan(args.seen, args.unseen, args.every)
     total = sum(len(list(flight.starts(plan.seen_s, plan.unseen_s, plan.every_s))) for flight in flights)
     if not total:
-        raise ValueError(f"paper: found no {plan.seen_s + plan.unseen_s:.0f} s of whole data; fly longer")
+        raise ValueError(f"paper: found no {plan.seen_s + plan.unseen_s:.0f} s of data without gaps; record longer")
     result: dict[str, Any] = {"plan": asdict(plan), "first_step": {}}
     for first in FIRST if args.first == "both" else (args.first,):
         done = _carried_out(experiments(flights, first, plan), total, first)
@@ -113,7 +112,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _carried_out(tried: Iterable[Experiment | str], total: int, first: str) -> list[Experiment]:
-    """Collect experiments under a progress line; what could not be done is said once for each reason."""
+    """Collect experiments and log progress; log each reason for failed experiments once, with its count."""
     done: list[Experiment] = []
     refused: Counter[str] = Counter()
     for k, one in enumerate(tried):
@@ -124,20 +123,24 @@ def _carried_out(tried: Iterable[Experiment | str], total: int, first: str) -> l
         if (k + 1) % _SAY_EVERY == 0:
             tell("paper", f"{first}, {k + 1} of {total} experiments")
     for sentence, count in refused.items():
-        tell("paper", f"{count} not done, {sentence}")
+        tell("paper", f"{count} experiments failed, {sentence}")
     return done
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the experiment on the recordings named on the command line."""
-    about = "Carry out the paper's identification experiment on recorded flights."
+    about = "Run the identification experiment of the paper on recorded flights."
     parser = parser_for("python -m twin_worker.paper_experiments", about, EXAMPLES)
     parser.add_argument("experiment", choices=("identify",), help="identify: figures 7 and 8 of the paper")
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recording, e.g. flight.tlog.xz")
     parser.add_argument(
-        "--first", choices=(*FIRST, "both"), default="both", help="first step: the paper's, PBSID, both"
+        "--first", choices=(*FIRST, "both"), default="both", help="first step: projection (paper), PBSID, or both"
     )
-    for name, text_ in (("seen", "identified on"), ("unseen", "run free over"), ("every", "between experiments")):
+    for name, text_ in (
+        ("seen", "identification window"),
+        ("unseen", "free run"),
+        ("every", "interval of experiments"),
+    ):
         default = getattr(Plan(), f"{name}_s")
         parser.add_argument(f"--{name}", type=_seconds, default=default, metavar="S", help=f"{text_} ({default:.0f} s)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="draw the figures into DIR")
@@ -146,10 +149,11 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _seconds(words: str) -> float:
-    """Read a length of 5 s or more: shorter free runs are never verified.
+    """Parse a duration of 5 s or more; shorter free runs are never verified.
 
     Raises:
-        ValueError: when it is none; argparse shows the sentence.
+        ArgumentTypeError: if the value is out of range.
+        ValueError: if it is no number.
     """
     value = float(words)
     if not 5 <= value <= 600:

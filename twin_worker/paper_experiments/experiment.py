@@ -1,7 +1,7 @@
-"""One experiment of the paper: two linear models identified on a stretch, run free over the seconds after it.
+"""One experiment of the paper: identify two linear models on a window, and run them free over the seconds after it.
 
-The first step (the paper's projection, or PBSID) and its refinement by the prediction error, without any prior; the
-models have 4 states along and 5 across.  Source: Huang 2021, sections 3.1 and 4.2.
+First step: projection (as in the paper) or PBSID; then prediction-error refinement without prior. The models have
+4 longitudinal and 5 lateral states.  Source: Huang 2021, sections 3.1 and 4.2.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -25,17 +25,17 @@ from twin_worker.validation.verify import fit_percent, verify
 
 FIRST: dict[str, Callable[..., StateSpace]] = {"projection": projection, "pbsid": pbsid}
 NAMES = tuple(name for axis in AXES for name in STATES[axis])
-_LOOSE = 1e-3  # precision that only keeps the normal equations regular [-]
+_LOOSE = 1e-3  # prior precision that only regularises the normal equations [-]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What one experiment is.
+    """Settings of an experiment.
 
     Attributes:
-        seen_s: stretch identified on [s]
-        unseen_s: stretch run free over [s]
-        every_s: between the starts of two experiments [s]
+        seen_s: length of the identification window [s]
+        unseen_s: length of the free run [s]
+        every_s: interval between the starts of two experiments [s]
         segment_s: free-run length of the refinement [s]
     """
 
@@ -47,15 +47,15 @@ class Plan:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One pair of models, and how it fared over what it had not seen.
+    """One pair of models with its free run over unseen data.
 
     Attributes:
-        uav, t: whose, and when the unseen stretch begins [s since 1970]
-        mode, mode_seen: of the unseen stretch, of the one before it
-        seconds: since the start of the unseen stretch, (n,) [s]
-        actual, first, refined: states in the order of `NAMES`, (n, 9) [m/s, rad/s, rad]
-        fit: both steps over the unseen stretch, (2, 9) [%]
-        fit_seen: both steps over that stretch before, the last they were identified on, (2, 9) [%]
+        uav, t: UAV id, and start of the unseen window [s since 1970]
+        mode, mode_seen: flight mode of the unseen window, and of the window of equal length before it
+        seconds: since the start of the unseen window, (n,) [s]
+        actual, first, refined: states in the order of `STATE_NAMES`, (n, 9) [m/s, rad/s, rad]
+        fit: both steps over the unseen window, (2, 9) [%]
+        fit_seen: both steps over the last part of the identification window, (2, 9) [%]
         outcome, sentence: verdict on the refined model
     """
 
@@ -74,15 +74,15 @@ class Experiment:
 
 
 def both_steps(axis: str, seen: Window, first: str, segment_s: float) -> tuple[Axis, Axis]:
-    """Identify one axis: the first step, and that refined by the prediction error of free runs, without a prior.
+    """Identify one axis by the first step, and refine it by the prediction error of free runs, without prior.
 
     Args:
         axis: `longitudinal` or `lateral`
-        seen: data
+        seen: identification window
         first: name of the first step, `projection` or `pbsid`
         segment_s: free-run length of the refinement [s]
     Raises:
-        ValueError: when the data are too short or too poor; the sentence says what is missing.
+        ValueError: if the data are too short or not informative; the message names the reason.
     """
     states, inputs = STATES[axis], INPUTS[axis]
     y, u, ok = seen.columns(states), seen.columns(inputs), seen.ok
@@ -99,10 +99,10 @@ def both_steps(axis: str, seen: Window, first: str, segment_s: float) -> tuple[A
 
 
 def experiment(flight: Flown, start: int, first: str, plan: Plan) -> Experiment:
-    """Identify before row `start` and run free from it.
+    """Identify on the window before row `start` and run free from it.
 
     Raises:
-        ValueError: when the data are too short or too poor; the sentence says what is missing.
+        ValueError: if the data are too short or not informative; the message names the reason.
     """
     window = flight.window(start, plan.seen_s, plan.unseen_s)
     known, length = round(plan.seen_s / window.dt), round(plan.unseen_s / window.dt)
@@ -128,13 +128,13 @@ def experiment(flight: Flown, start: int, first: str, plan: Plan) -> Experiment:
 
 
 def _runs(pair: tuple[Axis, Axis], window: Window, start: int, length: int) -> np.ndarray:
-    """Run both axes freely from the measured states of a row, (length, 9)."""
+    """Run both axes free from the measured states of a row, (length, 9)."""
     order = [ALL.index(name) for name in NAMES]
     return Unseen(pair, window.part(start, start + length), 0).runs(length)[:, order]
 
 
 def experiments(flights: Iterable[Flown], first: str, plan: Plan) -> Iterator[Experiment | str]:
-    """Carry out every experiment the flights allow; a sentence where one could not be."""
+    """Run all possible experiments; yield the reason as text where one fails."""
     for flight in flights:
         for start in flight.starts(plan.seen_s, plan.unseen_s, plan.every_s):
             try:

@@ -1,4 +1,4 @@
-"""The paper's figures 7 and 8, drawn from experiments of one's own."""
+"""Draw figures 7 and 8 of the paper from own experiments."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,10 +22,10 @@ def draw(folder: Path, first: str, done: "Sequence[Experiment]", names: Sequence
     """Draw figure 7 for every mode and figure 8, over unseen and seen data, into a folder; return the files.
 
     Args:
-        folder: made where it is missing
+        folder: created if missing
         first: name of the first step
-        done: experiments
-        names: of their columns
+        results: experiments
+        names: state names of the columns
     """
     folder.mkdir(parents=True, exist_ok=True)
     its = {mode: some for mode in MODES if (some := [one for one in done if one.mode == mode])}
@@ -34,26 +34,26 @@ def draw(folder: Path, first: str, done: "Sequence[Experiment]", names: Sequence
     seen = {mode: np.array(some) for mode, some in before.items() if some}
     figures = {f"fig7_{first}_{mode}.png": _runs(_usual(some), names, first) for mode, some in its.items()}
     figures[f"fig8_{first}.png"] = _boxes(fits, names, f"{first} and refined, over unseen data")
-    figures[f"fig8_{first}_seen.png"] = _boxes(seen, names, f"{first} and refined, over data identified on")
+    figures[f"fig8_{first}_seen.png"] = _boxes(seen, names, f"{first} and refined, over identification data")
     for name, figure in figures.items():
         figure.savefig(folder / name, dpi=130)
     return [folder / name for name in figures]
 
 
 def _usual(some: "list[Experiment]") -> "Experiment":
-    """Pick the experiment whose refined model has the median fit: neither the best nor the worst is shown."""
+    """Return the experiment with the median fit of the refined model."""
     return sorted(some, key=lambda one: float(one.fit[1].mean()))[len(some) // 2]
 
 
 def _runs(one: "Experiment", names: Sequence[str], first: str) -> Figure:
-    """Draw every state of one experiment: flown, first step, refined."""
+    """Draw every state of one experiment: measured, first step, refined."""
     figure = Figure(figsize=(11, 7), layout="constrained")
     for k, (ax, name) in enumerate(zip(figure.subplots(3, 3, sharex=True).flat, names, strict=True)):
-        ax.plot(one.seconds, one.actual[:, k], color=INK, lw=1.6, label="flown")
+        ax.plot(one.seconds, one.actual[:, k], color=INK, lw=1.6, label="measured")
         for step, colour, label in _STEPS:
             run = getattr(one, step)[:, k]
             ax.plot(one.seconds, run, color=colour, lw=1.1, label=label)
-        # a run that leaves the picture has lost the flight; the flown line stays readable
+        # scale to the measured line: a diverged run may leave the axes
         low, high = spread(one.actual[:, k], least=0.02)
         ax.set_ylim(low - (high - low), high + (high - low))
         fits = " → ".join(f"{one.fit[i, k]:.0f}" for i in (0, 1))
@@ -65,7 +65,7 @@ def _runs(one: "Experiment", names: Sequence[str], first: str) -> Figure:
 
 
 def _boxes(fits: dict[str, np.ndarray], names: Sequence[str], title: str) -> Figure:
-    """Draw the box plots of fit per state, a panel for every mode: fits (N, 2, 9) [%]."""
+    """Draw box plots of the fit per state, one panel per mode: fits (N, 2, 9) [%]."""
     figure = Figure(figsize=(11, 7.5), layout="constrained")
     panels = figure.subplots(2, 2, sharey=True, squeeze=False).flat
     places = np.arange(len(names))

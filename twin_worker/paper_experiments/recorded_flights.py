@@ -1,4 +1,4 @@
-"""Whole recorded flights as windows with the wind taken out, and the mode each stretch was flown in."""
+"""Read recorded flights as windows of air-relative velocities."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,8 +15,8 @@ from twin_worker.estimation.wind_filter import WindFilter
 from twin_worker.telemetry.history import History
 from twin_worker.telemetry.resample import preprocess
 
-_WIND_S = 0.2  # between rows the wind filter takes [s]
-_SETTLE_S = 20.0  # before the wind is known [s]
+_WIND_S = 0.2  # sampling interval of the wind filter [s]
+_SETTLE_S = 20.0  # convergence time of the wind filter [s]
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class Flown:
 
     Attributes:
         uav: id
-        whole: all of it, velocities over the ground
-        wind: as it was known at each row, NED, (n, 3) [m/s]
+        recording: whole flight, velocities over the ground
+        wind: filtered wind at each row, NED, (n, 3) [m/s]
     """
 
     uav: int
@@ -34,7 +34,7 @@ class Flown:
     wind: np.ndarray
 
     def window(self, start: int, seen_s: float, unseen_s: float) -> Window:
-        """Cut what lies around row `start`, velocities through the air by the wind known then."""
+        """Return the window around row `start`, with air-relative velocities from the wind at `start`."""
         dt = self.whole.dt
         part = self.whole.part(start - round(seen_s / dt), start + round(unseen_s / dt))
         phi, theta, psi = part.columns(("phi", "theta", "psi")).T
@@ -42,7 +42,7 @@ class Flown:
         return replace(part, x=np.hstack([air, part.x[:, 3:]]))
 
     def starts(self, seen_s: float, unseen_s: float, every_s: float) -> Iterator[int]:
-        """Return the rows at which unseen stretches may begin; the stretch itself is whole."""
+        """Yield the start rows of unseen windows without gaps."""
         dt = self.whole.dt
         seen, unseen, every = (round(s / dt) for s in (seen_s, unseen_s, every_s))
         for start in range(round(_SETTLE_S / dt) + seen, len(self.whole) - unseen + 1, every):
@@ -51,7 +51,7 @@ class Flown:
 
 
 def flown(path: Path, offset: int = 0) -> Iterator[Flown]:
-    """Read every flight of a recording that has all kinds of rows.
+    """Read every flight of a recording that has all required rows.
 
     Args:
         path: recording, e.g. flight.tlog.xz

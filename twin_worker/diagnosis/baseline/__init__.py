@@ -1,1 +1,1 @@
-"""Calibration of the baseline model, also from the aircraft's own past."""
+"""Calibration of the baseline on nominal flights or on the first part of the same flight."""

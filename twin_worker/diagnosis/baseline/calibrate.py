@@ -1,4 +1,4 @@
-"""Calibrate the simulation on nominal flights: coefficients, timing, noise, spread between flights, threshold."""
+"""Calibrate the simulation on nominal flights: coefficients, actuator timing, noise, spread, chance gains."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,35 +17,35 @@ from twin_worker.diagnosis.model.baseline import CHANNELS, Baseline, Noise, is_w
 from twin_worker.diagnosis.model.residual import Case
 from twin_worker.diagnosis.model.weather import fit_wind, wind
 
-_ROUNDS = 10  # of expectation and maximisation
-_FADED = 4.0  # residual rows that count as one while spreads are learnt: whitening is never whole
-_SAFE = 1.05  # noise of flights not calibrated on, over that of those that were
-_SLOPES = 2.5, 10.0  # a wing's lift slope [1/rad]
-_ODD = 4.0  # rms residual of a flight over that of the others, from which it is not nominal
-_FLOWN = CHANNELS.index("gps_x")  # channels before compare the simulation, those after two sensors
-_LEAST_USUAL = 0.6
+_ROUNDS = 10  # expectation-maximisation rounds
+_FADED = 4.0  # whitened rows per independent sample: whitening is incomplete
+_SAFE = 1.05  # noise of new flights over that of the calibration flights
+_SLOPES = 2.5, 10.0  # plausible lift slopes [1/rad]
+_ODD = 4.0  # largest rms residual of a nominal flight over that of the others
+_FLOWN = CHANNELS.index("gps_x")  # the first channels test the simulation, the rest compare two sensors
+_LEAST_USUAL = 0.6  # least usual mean square of a channel
 
 Say = Callable[[str], None]
 
 
 def calibrate(flights: Sequence[Flight], card: Card, say: Say = lambda word: None) -> Baseline:
-    """Calibrate.
+    """Calibrate the simulation on nominal flights.
 
     Args:
-        flights: nominal ones, the more and the livelier the better
+        flights: nominal flights; more flights and more excitation improve the result
         card: the aircraft, or `card.UNKNOWN`
-        say: takes words of progress
+        progress: callback for progress messages
     Raises:
-        ValueError: when there is no flight.
+        ValueError: if there is no flight, or the flights are not nominal flights of one aircraft.
     """
     if not flights:
-        raise ValueError("calibrate: found no nominal flight, expected one at least; name recordings")
+        raise ValueError("calibrate: found no nominal flight, expected one at least; add recordings")
     vane = all(flight.vane for flight in flights)
-    say("timing of servos and engine")
+    say("fitting the lags of servos and engine")
     timing = fit_timing(flights, card, vane)
     card = replace(card, body=replace(card.body, lag=timing.servo + timing.delay))
     base, winds = fit(flights, card, timing, vane)
-    say("leaving each flight out in turn")
+    say("fitting without each flight in turn")
     parts = list(flights) if len(flights) > 1 else halves(flights[0])
     left = [fit([f for f in parts if f is not one], card, timing, vane)[0] for one in parts]
     cases = [Case(one, without) for one, without in zip(parts, left, strict=True)]
@@ -59,17 +59,17 @@ def calibrate(flights: Sequence[Flight], card: Card, say: Say = lambda word: Non
 def settled(
     base: Baseline, cases: Sequence[Case], winds: Sequence[np.ndarray], say: Say, level: bool = False
 ) -> Baseline:
-    """Return the baseline with noise, spreads, usual residuals and chance learnt from flights left out.
+    """Return the baseline with noise, spreads, usual residuals and chance gains from left-out flights.
 
     Args:
-        base: fitted on all
-        cases: each flight as the others foretell it
-        winds: each flight's weather, (4,)
-        say: takes words of progress
-        level: each flight's mean residual is no noise
+        base: fitted on all flights
+        modelled_flights: each flight under the coefficients of the others
+        winds: weather of each flight, (4,)
+        progress: callback for progress messages
+        remove_mean: subtract the mean residual of each flight
     """
     base = _with_noise(base, cases, winds, level)
-    say("what nominal flights reach by chance")
+    say("computing the chance gains of nominal flights")
     chance: dict[str, float] = {}
     usual = []
     for case, w in zip(cases, winds, strict=True):
@@ -83,23 +83,23 @@ def settled(
 
 
 def _believable(base: Baseline) -> None:
-    """Refuse what cannot be nominal flights of this aircraft."""
+    """Reject a calibration that contradicts itself or the aircraft card."""
     worst = min(base.r2, key=lambda name: base.r2[name])
     if base.r2[worst] < 0.0:
         raise ValueError(
-            f"{', '.join(base.flights)}: found that they contradict each other ({worst} explained to "
-            f"{base.r2[worst]:.0%}), expected nominal flights of one aircraft; leave out those with a fault or wind"
+            f"{', '.join(base.flights)}: found {worst} explained to {base.r2[worst]:.0%}, expected "
+            "consistent nominal flights of one aircraft; leave out flights with a fault or wind"
         )
     slope = -1.0 / base.coef["alpha"][1]
     if base.card.known and base.vane and not _SLOPES[0] < slope < _SLOPES[1]:
         raise ValueError(
             f"{base.card.name}: found a lift slope of {slope:.1f} per rad with its mass and wing area, expected "
-            f"{_SLOPES[0]:g} to {_SLOPES[1]:g}; is it the card of this aircraft?"
+            f"{_SLOPES[0]:g} to {_SLOPES[1]:g}; use the card of this aircraft"
         )
 
 
 def _alike(cases: list[Case]) -> None:
-    """Refuse nominal flights of which one is none."""
+    """Reject nominal flights if one deviates from the others."""
     rows = [case.residuals(wind(fit_wind(case, np.zeros(4))))[case.ok] for case in cases]
     rms = np.array([np.sqrt((x**2).mean(axis=0)) for x in rows])
     for k, case in enumerate(cases):
@@ -114,13 +114,13 @@ def _alike(cases: list[Case]) -> None:
 
 
 def halves(flight: Flight) -> list[Flight]:
-    """Return a flight's halves, each trusted where the other is not."""
+    """Split a flight into halves with disjoint valid rows."""
     middle = np.median(flight.t[flight.ok])
     return [replace(flight, ok=flight.ok & side) for side in (flight.t < middle, flight.t >= middle)]
 
 
 def replaced(case: Case, base: Baseline) -> Case:
-    """Return a case with the noise and spread of another baseline."""
+    """Return the flight under its coefficients with the noise and spreads of another baseline."""
     own = replace(
         case.base, noise=base.noise, spread=base.spread, usual=base.usual, chance=base.chance, others=base.others
     )
@@ -128,7 +128,7 @@ def replaced(case: Case, base: Baseline) -> Case:
 
 
 def _with_noise(base: Baseline, cases: Sequence[Case], winds: Sequence[np.ndarray], level: bool) -> Baseline:
-    """Learn noise, and the spread of every nuisance, from flights left out."""
+    """Estimate the noise and the spread of every nuisance from left-out flights."""
     granted = [wind(w) for w in winds]
     rows = [case.residuals(g) for case, g in zip(cases, granted, strict=True)]
     if level:
@@ -148,7 +148,7 @@ def _with_noise(base: Baseline, cases: Sequence[Case], winds: Sequence[np.ndarra
 
 
 def _slopes(case: Case, granted: tuple[Guess, ...], rows: np.ndarray) -> np.ndarray:
-    """Return how residuals change with each nuisance, (n, c, nuisances)."""
+    """Return the derivative of the residuals with respect to each nuisance, (n, c, nuisances)."""
     several = nuisances(case.base.vane)
     own = np.stack([(case.residuals((*granted, n.guess(n.step))) - rows) / n.step for n in several], axis=2)
     return np.concatenate([own, wandering(own, wanders(several, case.base.vane), case.t)], axis=2)
@@ -157,9 +157,9 @@ def _slopes(case: Case, granted: tuple[Guess, ...], rows: np.ndarray) -> np.ndar
 def _spreads(
     noise: Noise, cases: Sequence[Case], rows: list[np.ndarray], slopes: list[np.ndarray]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Learn the nuisances' standard deviations by expectation and maximisation; return them and each flight's values.
+    """Estimate the spreads of the nuisances by expectation-maximisation; return them and the values of each flight.
 
-    A nuisance that a flight says nothing about leaves its spread where it was.  Source: Dempster, Laird & Rubin 1977.
+    A nuisance that is not observable on a flight does not change its spread.  Source: Dempster, Laird & Rubin 1977.
     """
     several = nuisances(cases[0].base.vane)
     floors = np.array([*(n.floor for n in several), *(one.floor for one in wanders(several, cases[0].base.vane))])
@@ -178,7 +178,7 @@ def _spreads(
 
 
 def _noise(rows: list[np.ndarray], cases: Sequence[Case]) -> Noise:
-    """Fit each channel's autoregression of order two and its innovations."""
+    """Fit a second-order autoregression and its innovations to each channel."""
     n = len(CHANNELS)
     ar, sigma = np.zeros((n, 2)), np.ones(n)
     for c in range(n):

@@ -1,4 +1,4 @@
-"""Fit the baseline's coefficients to nominal flights, the wind of each flight beside them."""
+"""Fit the coefficients of the baseline to nominal flights, jointly with the wind of each flight."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -13,14 +13,14 @@ from twin_worker.diagnosis.model.residual import RHO_0, Case, Terms
 from twin_worker.diagnosis.model.weather import CORRELATED, fit_wind, scale, wind
 from twin_worker.numerics.ridge_regression import ridge
 
-RIDGE = 3e-4  # pull of a coefficient towards zero, as a share of its term's length
-_ORDER = 3  # of the residuals' autoregression
-_WHITENINGS = {True: 2, False: 1}  # rounds by the accelerometer, and without: terms are noisier then
+RIDGE = 3e-4  # ridge weight, as a share of the regressor norm
+_ORDER = 3  # order of the residual autoregression
+_WHITENINGS = {True: 2, False: 1}  # rounds with and without fast accelerometer, where terms are noisier
 _ROUNDS = 2
-_FADED = 4.0  # residual rows that count as one: whitening is never whole
+_FADED = 4.0  # whitened rows per independent sample: whitening is incomplete
 _LAGS = (0.0, 0.03, 0.06, 0.1, 0.14, 0.18, 0.22, 0.28, 0.35)  # [s]
 _DELAYS = (0.0, 0.02, 0.04, 0.06)  # [s]
-_ENGINES = {  # an electric motor turns up in a tenth, a piston engine in seconds; velocity tells less [s]
+_ENGINES = {  # by fast accelerometer; electric motors respond in 0.1 s, piston engines in seconds [s]
     True: (0.1, 0.14, 0.19, 0.27, 0.37, 0.51, 0.71, 0.98, 1.36, 1.88, 2.6, 3.61, 5.0),
     False: (0.1, 0.25, 0.5),
 }
@@ -29,10 +29,10 @@ _ENGINES = {  # an electric motor turns up in a tenth, a piston engine in second
 def fit(
     flights: Sequence[Flight], card: Card, timing: Timing, vane: bool, pull: float = RIDGE
 ) -> tuple[Baseline, list[np.ndarray]]:
-    """Fit every equation, and the weather of each flight, (4,); little data wants a stronger pull to zero.
+    """Fit every equation and the weather of each flight, (4,); short data need a larger `ridge_share`.
 
     Raises:
-        ValueError: when the flights do not excite an equation at all.
+        ValueError: if the flights do not excite an equation at all.
     """
     speed = float(np.median(np.concatenate([np.hypot(f.readings["v_n"], f.readings["v_e"])[f.ok] for f in flights])))
     base = Baseline(card, {}, speed, timing=timing, vane=vane, flights=tuple(f.name for f in flights))
@@ -56,7 +56,7 @@ def _with(cases: list[Case], base: Baseline) -> list[Case]:
 
 
 def _moments(cases: list[Case], made: list[Terms], base: Baseline, pull: float) -> Baseline:
-    """Fit forces and moments, the flow angles given."""
+    """Fit forces and moments for known flow angles."""
     coef, r2 = dict(base.coef), {}
     both, r2["X"] = _solve(axial(cases, made, pull), 0)
     coef["X"], coef["T"] = both[: len(eq.X)], both[len(eq.X) :]
@@ -70,10 +70,10 @@ def _moments(cases: list[Case], made: list[Terms], base: Baseline, pull: float) 
 
 
 def _side(rows: "Rows", made: list[Terms], vane: bool) -> np.ndarray:
-    """Fit sideslip: by the accelerometer, side force on measured sideslip, turned round.
+    """Fit the sideslip equation; with a fast accelerometer, regress side force on sideslip and invert.
 
-    Sideslip over the ground lacks the gusts that the side force feels: regressed on the force it would be shrunk. A
-    side force taken from the velocity is noisy itself: there sideslip is regressed on it.
+    Sideslip over the ground lacks the gusts in the side force: a regression on the force would be biased to zero.
+    A side force derived from the velocity is itself noisy: there sideslip is regressed on the force.
     """
     if not vane:
         return _solve(rows, 0)[0]
@@ -85,7 +85,7 @@ def _side(rows: "Rows", made: list[Terms], vane: bool) -> np.ndarray:
 
 
 class Rows:
-    """An equation's terms, dimensional, (n, k), and measured side, (n,), over all flights; which rows to trust."""
+    """Regression data of one equation over all flights: dimensional regressors (n, k), measured side (n,), masks."""
 
     def __init__(
         self,
@@ -114,11 +114,11 @@ class Rows:
         self.ok, self.whole = np.concatenate(ok), np.concatenate(whole)
 
     def told(self, x: np.ndarray) -> np.ndarray:
-        """Return measured less simulated on trusted rows, (m,)."""
+        """Return measured less simulated on valid rows, (m,)."""
         return (self.y - self.A @ x)[self.ok]
 
     def whitener(self, x: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """Return the filter that whitens the residuals of these coefficients."""
+        """Return the autoregressive filter that whitens the residuals of these coefficients."""
         e = self.y - self.A @ x
         lags = np.stack([np.roll(e, k) for k in range(1, _ORDER + 1)], axis=1)
         ar = np.linalg.lstsq(lags[self.whole], e[self.whole], rcond=None)[0]
@@ -128,8 +128,8 @@ class Rows:
 def _solve(rows: Rows, whitenings: int | None = None) -> tuple[np.ndarray, float]:
     """Solve by generalised least squares; return coefficients and the share of variance explained.
 
-    The residuals of a flight in gusts, under an autopilot that answers them, are coloured, and plain least squares
-    shrinks the derivatives: both sides are filtered by the residuals' own autoregression.
+    Residuals in gusts under feedback control are coloured, and ordinary least squares biases the derivatives to zero.
+    The autoregression of the residuals therefore filters both sides.
     Source: Clarke 1967 (generalised least squares); Klein & Morelli 2006, section 5.2.
     """
     x = _held(rows.A[rows.ok], rows.y[rows.ok], rows, CORRELATED)
@@ -151,9 +151,9 @@ def _r2(fitted: np.ndarray, y: np.ndarray) -> float:
 
 
 def _held(A: np.ndarray, y: np.ndarray, of: Rows, as_one: float) -> np.ndarray:
-    """Solve by least squares, held to zero a little, and to what is usual as far as the residuals leave it open.
+    """Solve by least squares with a ridge and the prior `data.prior_std` of the coefficients.
 
-    `as_one` residual rows count as one.
+    `rows_per_sample` residual rows count as one independent sample.
     """
     x = ridge(A, y, of.pull)
     noise = np.sqrt(as_one * np.mean((y - A @ x) ** 2))
@@ -162,9 +162,9 @@ def _held(A: np.ndarray, y: np.ndarray, of: Rows, as_one: float) -> np.ndarray:
 
 
 def loose(cases: list[Case], winds: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """Return how drag's coefficients may be wrong together where flight does not tell: one standard deviation.
+    """Return the joint uncertainty of the drag coefficients that flight data do not separate: one standard deviation.
 
-    That of the elevator, held to what is usual, moves by its own doubt; those told only together with it follow.
+    The elevator coefficient, limited by its prior, changes by its standard deviation; correlated coefficients follow.
     """
     coef = cases[0].base.coef
     rows = axial(cases, [case.terms(wind(w)) for case, w in zip(cases, winds, strict=True)])
@@ -178,7 +178,7 @@ def loose(cases: list[Case], winds: Sequence[np.ndarray]) -> dict[str, np.ndarra
 
 
 def _airspeed(cases: list[Case], made: list[Terms]) -> float:
-    """Return reported over indicated airspeed."""
+    """Fit the ratio of reported to indicated airspeed."""
     if any("Va" not in case.flight.readings for case in cases):
         return 1.0
     rows = zip(cases, made, strict=True)
@@ -189,17 +189,17 @@ def _airspeed(cases: list[Case], made: list[Terms]) -> float:
 
 
 def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
-    """Find the lags and the delay that leave the least innovations, lag and delay of the servos together.
+    """Fit the lags and the delay with the least innovation variance, lag and delay of the servos jointly.
 
-    Pitch and yaw tell of the servos: in roll, damping and lag look alike within the band. Axial force tells of the
-    engine.
+    Pitch and yaw determine the servos: in roll, damping and lag are not separable within the band. Axial force
+    determines the engine.
     """
     best = Timing()
     base, winds = fit(flights, card, best, vane)
     cases = [Case(flight, base) for flight in flights]
 
     def left(timing: Timing) -> dict[str, float]:
-        """Return what pitch and yaw leave unexplained, and axial force."""
+        """Return the log innovation variance of pitch and yaw (servo) and of axial force (engine)."""
         timed = _with(cases, replace(base, timing=timing))
         made = [case.terms(wind(w)) for case, w in zip(timed, winds, strict=True)]
         along = axial(timed, made)
@@ -207,7 +207,7 @@ def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
         yaw = Rows(timed, made, "N")
         return {"servo": _surprise(pitch(timed, made, coef)) + _surprise(yaw), "engine": _surprise(along)}
 
-    # a longer lag looks much like a longer delay: one after the other stops beside the best pair
+    # lag and delay are strongly correlated: a search in turn would miss the best pair
     pairs = [replace(best, servo=servo, delay=delay) for servo in _LAGS for delay in _DELAYS]
     best = min(pairs, key=lambda timing: left(timing)["servo"])
     engines = [replace(best, engine=engine) for engine in _ENGINES[vane]]
@@ -215,10 +215,10 @@ def fit_timing(flights: Sequence[Flight], card: Card, vane: bool) -> Timing:
 
 
 def pitch(cases: list[Case], made: list[Terms], coef: dict[str, np.ndarray], pull: float = RIDGE) -> Rows:
-    """Return the rows of the pitching moment, thrust's own among its terms."""
+    """Return the regression data of the pitching moment, with the moment of thrust as a term."""
     return Rows(cases, made, "M", pull, more=lambda m: (coef["T"] @ m.terms["T"])[None])
 
 
 def axial(cases: list[Case], made: list[Terms], pull: float = RIDGE) -> Rows:
-    """Return the rows of axial force, drag's terms before those of thrust."""
+    """Return the regression data of axial force, drag terms before thrust terms."""
     return Rows(cases, made, "X", pull, more=lambda m: m.terms["T"])

@@ -1,4 +1,4 @@
-"""Conceal channels of a flight before it is diagnosed: what would give an answer away is compared afterwards."""
+"""Conceal channels of a flight before its diagnosis, to test the diagnosis without them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -13,29 +13,28 @@ _READINGS = {
     "imu": ("a_x", "a_y", "a_z"),
     "pressure": ("baro",),
     "gnss": ("gnss",),
-    "wind": (),  # the estimator's wind and a battery's state are nowhere read: concealing them changes nothing
+    "wind": (),  # not read: the diagnosis uses neither the estimated wind nor the battery state
     "battery": (),
 }
 _COMMANDS = {"aileron": 0, "elevator": 1, "rudder": 2, "throttle": 3}
 NAMES = (*_READINGS, *_COMMANDS)
-"""What may be concealed."""
-
+"""Channels that can be concealed."""
 
 _EQUATION = {"aileron": "L", "elevator": "M", "rudder": "N", "throttle": "X"}
 
 
 def check(names: Iterable[str]) -> None:
-    """Refuse names of channels there are none of.
+    """Reject unknown channel names.
 
     Raises:
-        ValueError: the sentence lists those there are.
+        ValueError: if a name is unknown; the message lists the valid names.
     """
     if strange := [name for name in names if name not in NAMES]:
-        raise ValueError(f"--conceal: found {strange[0]!r}, expected some of {', '.join(NAMES)}; name those")
+        raise ValueError(f"--conceal: found {strange[0]!r}, expected names of {', '.join(NAMES)}; correct it")
 
 
 def concealed(flight: Flight, names: Sequence[str], usual: Flight) -> Flight:
-    """Return a flight without some channels; an unknown command stands where it usually stood in `usual`."""
+    """Return a flight without some channels; a concealed command is replaced by its median in `typical`."""
     if not names:
         return flight
     gone = {reading for name in names for reading in _READINGS.get(name, ())}
@@ -48,5 +47,5 @@ def concealed(flight: Flight, names: Sequence[str], usual: Flight) -> Flight:
 
 
 def deaf(base: Baseline, names: Iterable[str]) -> Baseline:
-    """Return a baseline that does not judge axes whose commands are concealed: it cannot tell what they should do."""
+    """Return a baseline that ignores the axes whose commands are concealed."""
     return silenced(base, [_EQUATION[name] for name in names if name in _EQUATION])

@@ -1,4 +1,4 @@
-"""Judge flights by their own past: what came later and was not there before."""
+"""Diagnose a flight against its own past: find changes after a trusted first part."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,15 +13,15 @@ from twin_worker.diagnosis.inference.diagnose import diagnose
 from twin_worker.diagnosis.inference.report import Outcome, Report
 from twin_worker.diagnosis.inference.words import sentence
 
-LEAST_AFTER_S = 10.0  # of trusted flight to diagnose
-_EARLIER_S = 5.0  # before the end of the trusted past an onset may still be found
+LEAST_AFTER_S = 10.0  # least length of valid flight to diagnose
+_EARLIER_S = 5.0  # onsets may precede the end of the trusted past by this
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class OwnPast:
-    """What to judge flights by: what each did itself, as this aircraft.
+    """Reference of a diagnosis: the trusted first part of each flight itself.
 
     Attributes:
         until: end of the trusted past [s, on the flight's own clock]
@@ -32,10 +32,10 @@ class OwnPast:
     card: Card
 
     def diagnose(self, flight: Flight, say: Say = lambda word: None, conceal: Sequence[str] = ()) -> Report:
-        """Diagnose what the flight did after that by what it did before; channels are concealed after it only.
+        """Diagnose the flight after `until` with a calibration before it; calibrate coefficients with all channels.
 
         Raises:
-            ValueError: when there is too little before or after; the sentence says how much.
+            ValueError: if there is too little flight before or after; the message gives its length.
         """
         after = since(flight, self.until).seconds
         if after < LEAST_AFTER_S:
@@ -46,18 +46,18 @@ class OwnPast:
         shown = hidden.concealed(flight, conceal, before(flight, self.until))
         base = calibrate_past(flight, self.until, self.card, say, shown if conceal else None)
         told = (
-            f"calibrated on {flight.seconds - after:.0f} s of its own past: what was there from the start is no "
-            "finding, a mean wind is weather, and the barometer is not judged"
+            f"calibrated on {flight.seconds - after:.0f} s of its own past: effects present from the start and a mean "
+            "wind count as nominal; the barometer is not checked"
         )
         report = diagnose(replace(since(shown, self.until - BEFORE_S), lacks=(*shown.lacks, told)), base, say)
         return later(report, lost(flight, self.until), self.until)
 
 
 def later(report: Report, gone: Lost | None, until: float) -> Report:
-    """Return the report without what is strange in the trusted past only, and with what was held until then and lost.
+    """Return the report without mismatches in the trusted past alone, and with a tracking loss after it.
 
-    An effect that would have begun in the trusted past contradicts that trust: it is suspected, and no name. Turbulence
-    has no onset, and gusts of a minute say nothing about the next: it is weather here, like the wind.
+    An effect that starts in the trusted past contradicts the assumption: the outcome is suspected instead of named.
+    Turbulence has no onset and varies between minutes: it counts as weather, like the wind.
     """
     if any(one.guess.effect.variance for one in report.findings):
         report = replace(report, outcome=Outcome.NONE, findings=())

@@ -1,8 +1,8 @@
-"""Calibrate on a flight's own trusted past, so that what follows can be diagnosed without any other flight.
+"""Calibrate on the trusted first part of a flight, to diagnose the rest without other flights.
 
-A short past excites few axes. What it leaves open stays open: every direction in which the coefficients are doubtful,
-and which the rest of the flight makes use of, is a nuisance; an equation that does not foretell the pieces left out is
-not covered; what was there from the start is part of the baseline, and never a finding.
+A short past excites few axes. Every uncertain direction of the coefficients that the rest of the flight excites becomes
+a nuisance. An equation that does not predict the left-out pieces is not covered. Effects present from the start are
+part of the baseline and never a finding.
 """
 
 from collections.abc import Callable
@@ -22,19 +22,19 @@ from twin_worker.diagnosis.model.baseline import CHANNELS, DEAF, Baseline, Noise
 from twin_worker.diagnosis.model.residual import Case, Terms
 from twin_worker.diagnosis.model.weather import CORRELATED, wind
 
-PIECES = 4  # of the past, each foretold by the others
-LEAST_S = 40.0  # of trusted past
-BEFORE_S = 30.0  # of the past stay in what is diagnosed, so that an onset has something before it
-NEVER = 1e9  # gain that nothing reaches
-_RIDGE = 0.02  # little data determine few numbers
-_FADED = 4.0  # rows that count as one where the coefficients' doubt is reckoned: whitening is never whole
-_SHOWS = 0.1  # of an equation's own scatter, from which a doubtful direction is kept
-_LEAST_GAIN = 400.0  # of any effect
-_WIND = 2.5  # a mean wind is weather, and known no better [m/s]
-_ANY_BIAS = 50.0  # floors of a sensor's bias, in which any is found
+PIECES = 4  # pieces of the past, each predicted from the others
+LEAST_S = 40.0  # least length of valid past
+BEFORE_S = 30.0  # past included in the diagnosed part, as data before an onset
+NEVER = 1e9  # a gain that no hypothesis reaches
+_RIDGE = 0.02  # ridge share for short data
+_FADED = 4.0  # whitened rows per independent sample: whitening is incomplete
+_SHOWS = 0.1  # least effect of an uncertain direction, as a share of the equation scatter
+_LEAST_GAIN = 400.0  # least chance gain of any effect
+_WIND = 2.5  # least spread of the mean wind [m/s]
+_ANY_BIAS = 50.0  # prior of a sensor bias, in floors
 _AIRSPEED = 0.3  # least scatter of airspeed [m/s]
-_PRIOR = (0.1, 10.0, 10.0, 1.0, 1.0)  # of airspeed's scale, of wind [m/s], of its growth with height [m/s per 100 m]
-_WORSE = -0.5  # share of variance foretold, below which an equation says nothing
+_PRIOR = (0.1, 10.0, 10.0, 1.0, 1.0)  # airspeed scale, wind [m/s], wind shear [m/s per 100 m]
+_WORSE = -0.5  # least share of variance predicted; equations below are ignored
 
 Say = Callable[[str], None]
 
@@ -42,16 +42,16 @@ Say = Callable[[str], None]
 def calibrate_past(
     flight: Flight, until: float, card: Card, say: Say = lambda word: None, shown: Flight | None = None
 ) -> Baseline:
-    """Calibrate on what a flight did before `until` [s, on its own clock].
+    """Calibrate on the part of a flight before `until` [s, on its own clock].
 
     Args:
-        flight: all that was recorded, of which only the past is used, the rest for what it makes use of
+        flight: whole recording; the part after `until` only determines which directions it excites
         until: end of the trusted past
         card: the aircraft, or `card.UNKNOWN`
-        say: takes words of progress
-        shown: the same with channels concealed as they will be later: noise and chance are learnt from it
+        progress: callback for progress messages
+        concealed: the same flight with concealed channels, to estimate noise and chance gains
     Raises:
-        ValueError: when that holds too little flight; the sentence says how much.
+        ValueError: if the past is too short; the message gives its length.
     """
     past = before(flight, until)
     if past.seconds < LEAST_S:
@@ -59,7 +59,7 @@ def calibrate_past(
             f"{flight.name}: found {below(past.seconds, LEAST_S)} s of trusted flight before {until:.0f} s, expected "
             f"{LEAST_S:.0f} s at least; trust a longer past, or calibrate on other flights"
         )
-    say(f"{flight.name}: its own past, {past.seconds:.0f} s of trusted flight")
+    say(f"{flight.name}: calibrating on its own past, {past.seconds:.0f} s of trusted flight")
     timing = fit_timing([past], card, past.vane)
     card = replace(card, body=replace(card.body, lag=timing.servo + timing.delay))
     base, (weather,) = fit([past], card, timing, past.vane, _RIDGE)
@@ -100,14 +100,14 @@ def _part(flight: Flight, rows: slice) -> Flight:
 
 
 def split(past: Flight, pieces: int = PIECES) -> list[Flight]:
-    """Return pieces of equal trusted length, each trusted where the others are not."""
+    """Split the past into pieces of equal valid length, with disjoint valid rows."""
     edges = np.quantile(past.t[past.ok], np.linspace(0.0, 1.0, pieces + 1)[1:-1])
     which = np.searchsorted(edges, past.t, side="right")
     return [replace(past, ok=past.ok & (which == k)) for k in range(pieces)]
 
 
 def _rows(cases: list[Case], made: list[Terms]) -> dict[str, Rows]:
-    """Return the rows of every equation that is fitted on its own."""
+    """Return the regression data of every separately fitted equation."""
     coef = cases[0].base.coef
     out = {name: Rows(cases, made, name) for name in ("alpha", "beta", "L", "N")}
     return out | {"X": axial(cases, made), "M": pitch(cases, made, coef)}
@@ -118,7 +118,7 @@ def _joined(coef: dict[str, np.ndarray], name: str) -> np.ndarray:
 
 
 def _foretold(cases: list[Case], winds: list[np.ndarray]) -> dict[str, float]:
-    """Return the share of variance of every equation that the other pieces foretell."""
+    """Return the share of variance of every equation that the other pieces predict."""
     missed: dict[str, list[np.ndarray]] = {}
     told: dict[str, list[np.ndarray]] = {}
     for case, w in zip(cases, winds, strict=True):
@@ -130,10 +130,10 @@ def _foretold(cases: list[Case], winds: list[np.ndarray]) -> dict[str, float]:
 
 
 def _doubts(flight: Flight, past: Flight, base: Baseline, weather: np.ndarray) -> tuple[dict[str, np.ndarray], ...]:
-    """Return directions in which coefficients may be wrong by one standard deviation, those the flight makes use of.
+    """Return the uncertain coefficient directions that the flight excites, one standard deviation each.
 
-    The posterior of each equation's coefficients under a prior as wide as each term alone explaining everything,
-    turned to the axes along which it is felt most on the whole flight.
+    The posterior covariance of the coefficients of each equation, under a prior in which each term alone may explain
+    all variance, in the principal axes of its effect on the whole flight.
     Source: Klein & Morelli 2006, section 5.1 (Bayesian estimation); Golub & Van Loan 2013, section 8.7.
     """
     here, whole = Case(past, base), Case(flight, base)
@@ -161,12 +161,12 @@ def _direction(base: Baseline, name: str, d: np.ndarray) -> dict[str, np.ndarray
 
 
 def _without_baro(noise: Noise) -> Noise:
-    """Return noise, the barometer's said to be anything: it drifts over minutes, pieces of the past are too short."""
+    """Return noise that ignores the barometer: it drifts over minutes, and the pieces of the past are too short."""
     return Noise(noise.ar, np.where(np.arange(len(CHANNELS)) == CHANNELS.index("baro"), DEAF, noise.sigma))
 
 
 def _biases(case: Case, weather: np.ndarray) -> dict[str, float]:
-    """Return spreads as wide as the biases that sensors had in the past: they are no finding later."""
+    """Return spreads of at least twice the sensor biases in the past, so that they are no finding later."""
     sight = Sight(case, wind(weather))
     floors = np.array([n.floor for n in sight.nuisances])
     sensors = np.array([n.effect.stage is Stage.SENSOR for n in sight.nuisances])
@@ -179,9 +179,9 @@ def _biases(case: Case, weather: np.ndarray) -> dict[str, float]:
 
 
 def _weather(case: Case, weather: np.ndarray) -> dict[str, float]:
-    """Return spreads that leave open what the past cannot tell: wind, and airspeed's scale without turns to and fro.
+    """Return spreads of wind and airspeed scale, which a past with few headings does not determine.
 
-    Airspeed on the headings and at the heights flown tells scale, wind and its growth with height together.
+    Airspeed over the headings and heights of the past determines scale, wind and wind shear jointly.
     """
     s, flow = case.sensed(()), case.terms(wind(weather)).flow
     along = np.array([s["v_n"], s["v_e"]]) / np.maximum(np.hypot(s["v_n"], s["v_e"]), 1.0)
@@ -196,9 +196,9 @@ def _weather(case: Case, weather: np.ndarray) -> dict[str, float]:
 
 
 def _chance(base: Baseline, longer: float) -> dict[str, float]:
-    """Return what the rest of the flight may reach by chance, pieces being so many times shorter.
+    """Return the chance gains for the rest of the flight, `duration_ratio` times longer than a piece.
 
-    What acts all along acted in the past: it is part of the baseline.
+    A permanent effect was active in the past and is part of the baseline: its gain is unreachable.
     """
     out = {kind: max(_LEAST_GAIN, longer * gain) for kind, gain in base.chance.items()}
     for effect in catalogue().values():

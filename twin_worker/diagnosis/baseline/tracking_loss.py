@@ -1,7 +1,7 @@
-"""What the autopilot held in the past and lost later: where and since when, without a word on why.
+"""Detect signals that the autopilot tracked in the past and permanently lost later, without isolating the cause.
 
-Where commands are not told (surfaces, throttle) no simulation can say what should have happened. But an autopilot holds
-energy, and an aircraft turns as it banks; when that leaves its past range for good, something is different since then.
+Without surface and throttle commands no simulation is possible. But an autopilot controls energy, and the turn rate
+follows the bank angle. If such a signal permanently leaves its past range, something has changed.
 """
 
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from twin_worker.diagnosis.data.smooth import DT
 
 ENERGY, TURN, PITCH = "energy held", "turn by bank", "pitch attitude"
 _MEAN_S = 2.0  # running mean
-_STAYS_S = 2.0  # what returns sooner was a gust
-_GOOD = 0.7  # share of what is left of the flight that it must be out
-_BEYOND = 0.5  # of its past range, above and below it
-_USUAL = 5.0, 95.0  # percentiles that make the past range
+_STAYS_S = 2.0  # a shorter deviation is a gust
+_GOOD = 0.7  # least share of the remaining flight outside the range
+_BEYOND = 0.5  # margin above and below the past range, as a share of it
+_USUAL = 5.0, 95.0  # percentiles of the past range
 _CLEAR = {ENERGY: 4.0, TURN: np.radians(4.0), PITCH: np.radians(6.0)}  # least excess [m, rad/s, rad]
 
 
 @dataclass(frozen=True)
 class Lost:
-    """What was held no more: of which signal, since when [s], by how many past ranges at most."""
+    """Loss of tracking: signal, onset [s], largest excess in units of the margin."""
 
     what: str
     since: float
@@ -31,14 +31,14 @@ class Lost:
 
 
 def lost(flight: Flight, until: float) -> Lost | None:
-    """Return the first signal that left for good the range it kept before `until` [s, on the flight's clock]."""
+    """Return the first signal that permanently left its range before `until` [s, on the flight's clock]."""
     t = flight.t
     found = [one for name, x in _signals(flight).items() if (one := _left(name, t, x, flight.ok, until)) is not None]
     return min(found, key=lambda one: one.since, default=None)
 
 
 def _signals(flight: Flight) -> dict[str, np.ndarray]:
-    """Give what should be held, (n,) each: energy lacking as a height [m], turn rate over that of the bank [rad/s]."""
+    """Return the tracked signals, (n,) each: energy error as height [m], turn rate less that of the bank [rad/s]."""
     r = flight.readings
     speed = np.maximum(r.get("Va", np.hypot(r["v_n"], r["v_e"])), 5.0)
     turning = np.gradient(np.unwrap(r["psi"]), DT)

@@ -1,1 +1,1 @@
-"""Recorded flight, aircraft card and fault hypotheses."""
+"""Input data: recorded flight, aircraft card, fault hypotheses."""

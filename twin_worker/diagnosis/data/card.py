@@ -1,4 +1,4 @@
-"""The operator's card of an aircraft: mass, inertia, geometry, servo mapping; an airframe TOML or a JSON card."""
+"""Read the aircraft card (mass, inertia, geometry, servo mapping) from an airframe TOML or a JSON file."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -19,14 +19,14 @@ _THROWS = ("aileron", "elevator", "throttle", "rudder")
 
 @dataclass(frozen=True)
 class Card:
-    """What is known of the aircraft before any flight.
+    """Properties of the aircraft that are known before any flight.
 
     Attributes:
-        name: whose card
+        name: of the aircraft
         body: mass and geometry
         inertia: J_x J_y J_z J_xz [kg m2]
         throw: surface angle at full command, down and up, aileron elevator rudder, (3, 2) [rad]; ones where unknown
-        pulses: the card's own servo mapping, else the autopilot's parameters tell
+        pulses: use the servo mapping of the card instead of the autopilot parameters
         known: False for the unit body of an aircraft without a card
     """
 
@@ -38,7 +38,7 @@ class Card:
     known: bool = True
 
     def commands(self, pulses: np.ndarray, params: Mapping[str, float]) -> np.ndarray:
-        """Turn servo pulses (n, 8) [us] into delta_a delta_e delta_r delta_t in shares of full command, (n, 4)."""
+        """Convert servo pulses (n, 8) [us] to delta_a delta_e delta_r delta_t as shares of full command, (n, 4)."""
         if not self.pulses:
             return servo_map(params).inputs(pulses)
         u = (pulses[:, [0, 1, 3]] - 1500.0) / 500.0
@@ -55,11 +55,11 @@ UNKNOWN = Card("no card", Body(), (1.0, 1.0, 1.0, 0.0), known=False)
 
 
 def read(path: Path) -> Card:
-    """Read a card.
+    """Read an aircraft card.
 
     Raises:
-        ValueError: when it is none; the sentence names what to mend.
-        OSError: when there is no such file.
+        ValueError: if the file is no valid card; the message names the wrong entry.
+        OSError: if the file does not exist.
     """
     if path.suffix != ".json":
         return _of_airframe(load(str(path) if path.suffix or path.exists() else path.name))

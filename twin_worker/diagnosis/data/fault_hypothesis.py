@@ -1,4 +1,4 @@
-"""A guess: one effect, on what, how large, since when."""
+"""Fault hypothesis: one effect with its target, parameters and onset profile."""
 
 from dataclasses import dataclass, replace
 
@@ -9,14 +9,14 @@ from fleet.effects import Effect, Onset
 
 @dataclass(frozen=True)
 class When:
-    """The course of an effect: from the start, or from t0 on [s since the flight's zero], growing or passing over T."""
+    """Onset profile of an effect: always, or from t0 on [s since the start]; a ramp or bump lasts T [s]."""
 
     kind: Onset = Onset.ALWAYS
     t0: float = 0.0
     T: float = 0.0
 
     def gate(self, t: np.ndarray) -> np.ndarray:
-        """Return what the parameters are multiplied by, 0..1, (n,)."""
+        """Return the factor of the parameters at times t, 0..1, (n,)."""
         if self.kind is Onset.ALWAYS:
             return np.ones_like(t)
         if self.kind is Onset.STEP:
@@ -26,7 +26,7 @@ class When:
 
     @property
     def size(self) -> int:
-        """Return how many numbers it takes."""
+        """Return the number of parameters of the profile."""
         return {Onset.ALWAYS: 0, Onset.STEP: 1}.get(self.kind, 2)
 
     def moved(self, dt: float) -> "When":
@@ -34,7 +34,7 @@ class When:
         return replace(self, t0=self.t0 + dt)
 
     def stretched(self, by: float) -> "When":
-        """Stretch the duration; what passes by is stretched about its middle."""
+        """Scale the duration; a bump is scaled about its middle."""
         earlier = 0.5 * (by - 1.0) * self.T if self.kind is Onset.BUMP else 0.0
         return replace(self, t0=self.t0 - earlier, T=self.T * by)
 
@@ -44,13 +44,13 @@ ALWAYS = When()
 
 @dataclass(frozen=True)
 class Guess:
-    """One effect at work.
+    """One active effect.
 
     Attributes:
-        effect: which
-        of: on what, one of `effect.of`, or empty
-        par: its parameters, (k,)
-        when: its course
+        effect: the effect
+        of: target, one of `effect.of`, or empty
+        par: parameters, (k,)
+        onset: onset profile
     """
 
     effect: Effect
@@ -60,16 +60,16 @@ class Guess:
 
     @property
     def label(self) -> str:
-        """Return effect and what it befalls, e.g. `actuator_lag:elevator`."""
+        """Return effect and target, e.g. `actuator_lag:elevator`."""
         return f"{self.effect.name}:{self.of}" if self.of else self.effect.name
 
     @property
     def size(self) -> int:
-        """Return how many numbers it is charged for, those of its course included."""
+        """Return the number of parameters, those of the onset profile included."""
         return self.effect.price + self.when.size
 
     def at(self, par: np.ndarray, when: When | None = None) -> "Guess":
-        """Return the same with other parameters, kept within what is physically possible."""
+        """Return a copy with other parameters, limited to their physical bounds."""
         low, high = (np.array([getattr(p, side) for p in self.effect.parameters]) for side in ("low", "high"))
         within = np.clip(np.asarray(par, float), low, high)
         return replace(self, par=tuple(float(x) for x in within), when=when or self.when)

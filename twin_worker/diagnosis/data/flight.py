@@ -1,4 +1,4 @@
-"""A recording as one flight on one grid: every reading the diagnosis uses, and where it may be trusted."""
+"""Read a recording and resample each flight to one grid, with a mask of valid rows."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +13,14 @@ from twin_worker.diagnosis.data.card import Card
 from twin_worker.diagnosis.data.smooth import DT
 from twin_worker.telemetry.history import History
 
-VANE_HZ = 18.0  # from here on the accelerometer is the vane; slower samples alias gusts [Hz]
+VANE_HZ = 18.0  # least accelerometer rate to measure flow angles; slower samples alias gusts [Hz]
 _SEA_LEVEL, _LAPSE, _POWER = 101325.0, 2.25577e-5, 5.2559  # ISA: p = p0 (1 - lapse h)^power  [Pa, 1/m, -]
-_WIDEST = {"attitude": 0.25, "velocity": 0.45, "servo": 0.3, "air": 0.7}  # gaps that are filled [s]; or
-_SLOW = 1.9  # so many usual ones where telemetry is slower than that
-_FASTER = 0.5  # gaps of gyros over those of attitude, from which rates are theirs
+_WIDEST = {"attitude": 0.25, "velocity": 0.45, "servo": 0.3, "air": 0.7}  # longest gaps that are interpolated [s];
+_SLOW = 1.9  # or this multiple of the median gap where telemetry is slower
+_FASTER = 0.5  # rates come from the gyros if their gaps are below this share of the attitude gaps
 _AROUND_GAP_S = 0.3
-_SETTLE_S = 5.0, 1.5  # left out at the start and at the end [s]
-_LEAST_S = 25.0  # of trusted flight
+_SETTLE_S = 5.0, 1.5  # excluded at the start and at the end [s]
+_LEAST_S = 25.0  # least length of valid flight
 _ROTORS = ("multirotor", "helicopter")
 _CLEAR_M = 30.0  # above the ground after a take-off in the recording
 _LEAST_SPEED = 6.0  # [m/s]
@@ -32,16 +32,16 @@ class Flight:
 
     Attributes:
         name: of the recording
-        t: since its first attitude, equally spaced, (n,) [s]
-        zero: that first instant [s since 1970]
-        readings: by the names in `fleet.effects.READINGS`, (n,) each, psi unwrapped; also gnss, the satellites'
-            height, and low, slow: wanted less flown, height [m] and airspeed [m/s]
+        t: time since the first attitude, equally spaced, (n,) [s]
+        t_start: time of the first attitude [s since 1970]
+        readings: by the names in `fleet.effects.READINGS`, (n,) each, psi unwrapped; also gnss, the satellite
+            height, and low, slow: commanded less measured height [m] and airspeed [m/s]
         commands: delta_a delta_e delta_r delta_t as commanded, (n, 4) [-]
-        place: north and east from the first position, (n, 2) [m]
+        position: north and east of the first position, (n, 2) [m]
         ground: height of home above mean sea level [m]
-        ok: trusted, (n,) bool
-        vane: the accelerometer is fast enough to be the vane
-        lacks: what power is lost for want of data, in sentences
+        ok: valid rows, (n,) bool
+        vane: the accelerometer is fast enough to measure flow angles (`VANE_HZ`)
+        limitations: detection power lost because of missing data, in sentences
     """
 
     name: str
@@ -57,7 +57,7 @@ class Flight:
 
     @property
     def seconds(self) -> float:
-        """Return the length of what is trusted [s]."""
+        """Return the length of the valid rows [s]."""
         return float(self.ok.sum() * DT)
 
 
@@ -65,8 +65,8 @@ def read_flights(path: Path, card: Card) -> list[Flight]:
     """Read every aircraft of a recording.
 
     Raises:
-        ValueError: when there is no flight in it to diagnose; the sentence says why.
-        OSError: when it cannot be opened.
+        ValueError: if the recording has no usable flight; the message names the reason.
+        OSError: if the file cannot be opened.
     """
     told: dict[int, tuple[History, dict[str, float]]] = {}
     rotors: dict[int, str] = {}
@@ -85,7 +85,7 @@ def read_flights(path: Path, card: Card) -> list[Flight]:
     for uav, (history, params) in sorted(told.items()):
         name = stem if len(told) == 1 else f"{stem}-uav{uav}"
         if uav in rotors:
-            refused.append(f"{name}: found a {rotors[uav]}, expected wings; its simulation knows no rotors")
+            refused.append(f"{name}: found a {rotors[uav]}, expected a fixed wing; diagnose fixed-wing flights only")
             continue
         try:
             flights.append(lay(name, history, params, card))
@@ -97,10 +97,10 @@ def read_flights(path: Path, card: Card) -> list[Flight]:
 
 
 def lay(name: str, history: History, params: dict[str, float], card: Card) -> Flight:
-    """Lay one aircraft's telemetry on the grid.
+    """Resample the telemetry of one aircraft to the grid.
 
     Raises:
-        ValueError: when something indispensable is missing; the sentence says what.
+        ValueError: if required telemetry is missing; the message names it.
     """
     rows = {kind: history.rows(kind) for kind in ("attitude", "velocity", "position", "servo", "air", "imu")}
     length = np.ptp(rows["attitude"][0]) if len(rows["attitude"][0]) else 0.0
@@ -135,7 +135,7 @@ def lay(name: str, history: History, params: dict[str, float], card: Card) -> Fl
     if flight.seconds < _LEAST_S:
         raise ValueError(
             f"{name}: found {below(flight.seconds, _LEAST_S)} s in the air, expected {_LEAST_S:.0f} s at least; "
-            "was it standing on the ground?"
+            "check that the aircraft flew"
         )
     return flight
 
@@ -148,7 +148,7 @@ def _on(t: np.ndarray, rows: tuple[np.ndarray, np.ndarray], zero: float) -> np.n
 def _readings(
     rows: dict[str, tuple[np.ndarray, np.ndarray]], history: History, t: np.ndarray, zero: float, lacks: list[str]
 ) -> tuple[dict[str, np.ndarray], bool]:
-    """Return the readings on the grid, and whether the accelerometer is the vane."""
+    """Return the readings on the grid, and whether the accelerometer is fast enough to measure flow angles."""
     at, attitude = rows["attitude"]
     angles = np.column_stack([attitude[:, :2], np.unwrap(attitude[:, 2]), attitude[:, 3:]])
     out = dict(zip(("phi", "theta", "psi", "p", "q", "r"), _on(t, (at, angles), zero).T, strict=True))
@@ -163,14 +163,14 @@ def _readings(
             out |= dict(zip(("p", "q", "r"), gyros.T, strict=True))
     if not vane:
         rate = "no accelerometer" if not np.isfinite(usual) else f"the accelerometer at {1 / usual:.0f} Hz"
-        lacks.append(f"{rate}: forces are taken from the velocity; gusts and small changes of lift are seen less well")
+        lacks.append(f"{rate}: forces come from the velocity, with less sensitivity to gusts and small lift changes")
     if (gap := float(np.median(np.diff(at)))) > _WIDEST["attitude"]:
-        lacks.append(f"attitude at {1 / gap:.1f} Hz: only what lasts several seconds is seen")
+        lacks.append(f"attitude at {1 / gap:.1f} Hz: only effects of several seconds are detectable")
     air_t, air = rows["air"]
     if len(air_t) > 50 and np.ptp(air[:, 0]) > 0.5:
         out["Va"] = np.interp(t, air_t - zero, air[:, 0])
     else:
-        lacks.append("no airspeed: wind, air density and the airspeed sensor cannot be told apart, nor wind from none")
+        lacks.append("no airspeed: wind, air density and airspeed sensor faults are not separable")
     wanted_t, wanted = history.rows("command")
     if len(wanted_t) > 50:
         out |= dict(zip(("low", "slow"), _on(t, (wanted_t, wanted[:, 3:5]), zero).T, strict=True))
@@ -179,15 +179,15 @@ def _readings(
         height = (1.0 - (np.clip(pressure[:, 0], 2e4, 1.2e5) / _SEA_LEVEL) ** (1 / _POWER)) / _LAPSE
         out["baro"] = np.interp(t, pressure_t - zero, height)
         gnss_t, gnss = history.rows("gnss")
-        if len(gnss_t) > 50:  # an estimator's height follows the barometer: only the satellites' can judge it
+        if len(gnss_t) > 50:  # the estimator height follows the barometer; only the satellite height is independent
             out["gnss"] = np.interp(t, gnss_t - zero, gnss[:, 0] * 1e-3)
     else:
-        lacks.append("no static pressure: the barometer cannot be judged")
+        lacks.append("no static pressure: barometer faults are not detectable")
     return out, vane
 
 
 def _ground(history: History, h: np.ndarray, t: np.ndarray, zero: float) -> float:
-    """Return the height of home above mean sea level, else the least height flown [m]."""
+    """Return the height of home above mean sea level, or the least height of the flight if unknown [m]."""
     at, above = history.rows("height")
     if len(at) < 50:
         return float(h.min())
@@ -201,7 +201,7 @@ def _trusted(
     zero: float,
     ground: float,
 ) -> np.ndarray:
-    """Tell which grid times stand on measurements taken in the air."""
+    """Return the grid times with measurements without gaps, taken in flight, (n,) bool."""
     bad = np.zeros(len(t), bool)
     for kind, widest in _WIDEST.items():
         at = rows[kind][0] - zero

@@ -1,4 +1,4 @@
-"""One flight against the calibrated simulation: locate, name, model, prove."""
+"""Diagnose one flight with the calibrated simulation: locate, isolate, estimate and validate effects."""
 
 import time
 from collections.abc import Callable
@@ -28,17 +28,17 @@ from twin_worker.diagnosis.model.baseline import CHANNELS, SHOWN_BY, Baseline
 from twin_worker.diagnosis.model.residual import Case
 from twin_worker.diagnosis.model.weather import own_weather
 
-_TOLD = 0.10  # or of the error of forces told
-_KEPT = 0.15  # of an effect's gain that must show on held-out data too
-_BORNE, _MUCH = 0.4, 450.0  # or the gain itself, where it is much: the share of it on held-out data, and how much;
-_RARE, _LITTLE = 5.0, 150.0  # less where nominal flights never come near: times what they reach by chance, and least
-_STRANGE = 3.0  # a channel's residual over its usual that is not let pass unexplained
-_LEFT = 2.6  # and the same beside named effects
-_EXPLAINED = 0.6  # share of the excess that names must explain
-_DOUBT = 2.0  # standard deviations below which a number is none
-_OTHER = 1.7  # another aircraft flies faster or slower by this factor
-_GUESSED = 0.2  # doubt of a turbulence's intensity, as a share of it
-_GUSTY = 450.0  # gain of turbulence
+_TOLD = 0.10  # or of the error of predicted forces
+_KEPT = 0.15  # least share of an effect's gain on held-out data
+_BORNE, _MUCH = 0.4, 450.0  # or a strong gain: least share of it on held-out data, and least gain
+_RARE, _LITTLE = 5.0, 150.0  # least strong gain: multiple of the chance gain, lower limit
+_STRANGE = 3.0  # largest ratio of mean square to usual without an explanation
+_LEFT = 2.6  # the same limit with the named effects included
+_EXPLAINED = 0.6  # least share of the excess that named effects explain
+_DOUBT = 2.0  # a parameter below this many standard deviations is not significant
+_OTHER = 1.7  # a larger speed ratio means another aircraft
+_GUESSED = 0.2  # relative standard deviation of a turbulence intensity
+_GUSTY = 450.0  # least gain of turbulence
 _TELLING = [CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed", "baro")]
 
 Say = Callable[[str], None]
@@ -48,10 +48,11 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     """Diagnose one flight.
 
     Args:
-        flight: as read; base: as calibrated
-        say: takes words of progress
+        flight: recorded flight
+        base: calibrated simulation
+        progress: callback for progress messages
     Raises:
-        ValueError: when the flight cannot be of this aircraft; the sentence says why.
+        ValueError: if the flight cannot belong to this aircraft; the message names the reason.
     """
     begun = time.perf_counter()
     _fits(flight, base)
@@ -60,12 +61,12 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
     sight = Sight(case, weather)
     before, white_before = sight.left() / base.usual, _profiled(sight)
     gusts, _ = turbulent(sight)
-    say("naming")
+    say("selecting effects")
     plain = copy(sight)
     named, ranked = decide(sight, weather, say)
     if gusts > _GUSTY and gusts > sum(one.found.gain for one in named):
         named = []
-    say("proving")
+    say("validating on held-out data")
     named, proof, findings = _proven(plain, named, before)
     sight.grant((*weather, *(one.found.guess for one in named)))
     after, white_after = sight.left() / base.usual, _profiled(sight)
@@ -116,7 +117,7 @@ def diagnose(flight: Flight, base: Baseline, say: Say = lambda word: None) -> Re
 
 
 def _fits(flight: Flight, base: Baseline) -> None:
-    """Refuse a flight this simulation cannot be of."""
+    """Reject a flight that cannot belong to the aircraft of this simulation."""
     if base.vane and not flight.vane:
         raise ValueError(
             f"{flight.name}: found no accelerometer at 18 Hz or more, expected one as on the nominal flights; "
@@ -126,23 +127,23 @@ def _fits(flight: Flight, base: Baseline) -> None:
     if not 1 / _OTHER < speed / base.speed < _OTHER:
         raise ValueError(
             f"{flight.name}: found {speed:.0f} m/s, expected about {base.speed:.0f} m/s as on the nominal flights; "
-            "give the model of this aircraft"
+            "use the model of this aircraft"
         )
 
 
 def uncovered(base: Baseline) -> tuple[str, ...]:
-    """Say which axes the nominal flights did not calibrate."""
+    """Describe the axes that the nominal flights did not calibrate."""
     cure = {"L": "aileron", "M": "elevator", "N": "rudder"}
     return tuple(
-        f"{SHOWN_BY[name]} not covered: the nominal flights explain {base.r2.get(name, 0.0):.0%} of it; "
-        f"it needs {surface} doublets"
+        f"{SHOWN_BY[name]} not covered: the calibration explains {base.r2.get(name, 0.0):.0%} of its variance; "
+        f"calibrate on flights with {surface} doublets"
         for name, surface in cure.items()
         if base.r2.get(name, 1.0) <= WELL
     )
 
 
 def _ranking(ranked: list[Found], named: list[Named]) -> tuple[Tried, ...]:
-    """List what was tried, each label once with its best course; the named and their rivals beside them."""
+    """List every hypothesis tested, named and rival ones included, once per label with its best onset."""
     best: dict[str, Found] = {}
     for one in (*ranked, *(found for n in named for found in (n.found, *n.rivals))):
         if one.guess.label not in best or one.gain > best[one.guess.label].gain:
@@ -157,7 +158,7 @@ def _profiled(sight: Sight) -> np.ndarray:
 
 
 def _proven(plain: Sight, named: list[Named], before: np.ndarray) -> tuple[list[Named], Proof, tuple[Finding, ...]]:
-    """Prove what was named; what stands beside the first and is not borne out on held-out data goes."""
+    """Cross-validate the selected effects; remove those after the first that held-out data do not confirm."""
     sight, weather = copy(plain), plain.granted
     while True:
         if not named:
@@ -211,7 +212,7 @@ def _segment(guess: Guess, first: float, last: float) -> tuple[float, float]:
 
 
 def _gusts(sight: Sight, alone: bool) -> Finding | None:
-    """Name turbulence where what is left scatters as gusts do."""
+    """Return turbulence as a finding if the residuals scatter as gusts do."""
     gain, louder = turbulent(sight)
     if gain < _GUSTY or not alone:
         return None
@@ -229,7 +230,7 @@ def _gusts(sight: Sight, alone: bool) -> Finding | None:
 def _outcome(
     findings: tuple[Finding, ...], proof: Proof, enough: tuple[float, float], before: np.ndarray, after: np.ndarray
 ) -> Outcome:
-    """Decide; `enough`: the share of the error of forces held out that went, and the gain that is much."""
+    """Decide the outcome; `force_evidence`: relative drop of the held-out force error, and least strong gain."""
     told, much = enough
     gusty = any(one.guess.effect.variance for one in findings)
     borne_out = all(one.held >= _BORNE for one in findings) and sum(one.gain for one in findings) > much
@@ -247,7 +248,7 @@ def _outcome(
 
 
 def _much(base: Baseline, one: Finding) -> float:
-    """Return the gain that is much for an effect: as far as it goes, by what nominal flights reach by chance."""
+    """Return the gain that counts as strong for an effect, from the gain that nominal flights reach by chance."""
     if not base.vane:
         return _MUCH
     chance = max((x for kind, x in base.chance.items() if kind.startswith(f"{one.guess.label}|")), default=0.0)
@@ -255,13 +256,13 @@ def _much(base: Baseline, one: Finding) -> float:
 
 
 def _significant(one: Finding) -> bool:
-    """Return whether any number that counts is larger than its doubt."""
+    """Return whether any parameter except nuisances is significantly different from zero."""
     counted = zip(one.guess.effect.parameters, one.guess.par, one.doubt, strict=True)
     return any(abs(x) > _DOUBT * doubt and not p.aside for p, x, doubt in counted)
 
 
 def _at_its_end(one: Finding) -> bool:
-    """Tell whether a number that counts stopped at what is physically possible, a whole share apart: no explanation."""
+    """Return whether a parameter except nuisances is at its physical bound; a share of 1 is allowed there."""
     counted = zip(one.guess.effect.parameters, one.guess.par, strict=True)
     return any(x and x in (p.low, p.high) and x != 1.0 and not p.aside for p, x in counted)
 

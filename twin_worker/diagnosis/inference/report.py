@@ -1,4 +1,4 @@
-"""What a diagnosis says: one frozen report a flight, for files, figures and people."""
+"""Result of a diagnosis: one frozen report per flight, for files, figures and pages."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -9,7 +9,7 @@ from twin_worker.diagnosis.data.fault_hypothesis import Guess
 
 
 class Outcome(StrEnum):
-    """What became of it."""
+    """Outcome of a diagnosis."""
 
     NONE = "none"
     NAMED = "named"
@@ -19,18 +19,18 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One effect.
+    """One named or suspected effect.
 
     Attributes:
-        guess: as fitted
+        hypothesis: as fitted
         gain: drop of the whitened sum of squares
-        told, sigma: its numbers in the units people want, and their standard deviations
-        doubt: standard deviations of the effect's own parameters
-        rivals: names of effects it cannot be told from
-        apart: for each of them, what to fly so that they can
-        channel, surface: where it lives; surface may be empty
-        segments: when, seconds since the flight's zero
-        held: share of the gain that shows on data held out
+        reported, sigma: its values in reporting units, and their standard deviations
+        parameter_sigma: standard deviations of the effect's own parameters
+        rivals: names of effects that this flight does not separate from it
+        manoeuvres: for each rival, the manoeuvre that separates the two
+        channel, surface: location; surface may be empty
+        segments: start and end times since the start of the flight [s]
+        held_out_share: share of the gain that is present on held-out data
     """
 
     guess: Guess
@@ -48,7 +48,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Tried:
-    """One candidate of the ranking."""
+    """One candidate of the ranking: label, onset in words, gain."""
 
     label: str
     since: str
@@ -57,13 +57,13 @@ class Tried:
 
 @dataclass(frozen=True)
 class Series:
-    """What the figures show, on the thinned grid.
+    """Time series of the figures, on the decimated grid.
 
     Attributes:
-        t: (n,) [s]; ok: trusted, (n,); place: north, east, up, (n, 3) [m]
+        t: (n,) [s]; ok: valid rows, (n,) bool; position: north, east, up, (n, 3) [m]
         before, after: residual of each channel in standard deviations of nominal flights, (n, channels)
         measured, base, model: specific force FRD, (n, 3) [m/s2]: recorded, simulated without and with the effects
-        held: rows held out of the fit, (n,) bool
+        held_out: rows held out of the fit, (n,) bool
     """
 
     t: np.ndarray
@@ -82,19 +82,19 @@ class Report:
     """One flight's diagnosis.
 
     Attributes:
-        flight: its name; outcome; sentence: all of it in one sentence
+        flight: name; outcome; sentence: summary in one sentence
         findings: named or suspected, best first
-        ratio_before, ratio_after: each channel's mean square over its usual, by channel
-        fit_before, fit_after: whitened rms on held-out blocks; nan where nothing was found
+        ratio_before, ratio_after: channel -> mean square over its usual
+        fit_before, fit_after: whitened rms on held-out blocks; nan without effects
         force_before, force_after: rms error of simulated specific force on held-out blocks [m/s2]
-        stray_before, stray_after: rms attitude error of free flights of 5 s on held-out blocks [deg]
+        free_run_error_before, free_run_error_after: rms attitude error of 5 s free runs on held-out blocks [deg]
         where: for unknown: channel and segments
-        odd: by kind of evidence, channel and term, what a change that nobody named would gain, over what chance reaches
-        terms: for unknown: a sparse free-form term, no physics: `term -> coefficient`
-        tried: the ranking of candidates
-        lacks: what power was lost for want of data
+        anomaly_ratio: anomaly kind -> gain over its chance limit
+        terms: for unknown: sparse free-form fit without physical meaning, `term -> coefficient`
+        ranking: candidates, best first
+        limitations: detection power lost because of missing data, in sentences
         series: for the figures
-        seconds: what it took
+        seconds: computing time [s]
     """
 
     flight: str

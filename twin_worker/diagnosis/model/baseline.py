@@ -1,4 +1,4 @@
-"""The calibrated simulation: coefficients of every equation, timing, noise, spread from flight to flight."""
+"""Calibrated simulation: coefficients of all equations, actuator timing, noise, spread between flights."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -13,12 +13,12 @@ CHANNELS = (
 )
 """Residuals: fx [m/s2]; beta, alpha [deg]; p', q', r' [rad/s2]; airspeed [m/s]; dV/dt against the accelerometer
 [m/s2]; Euler rates against the gyros [rad/s]; barometric height [m]."""
-WEATHER_MPS = 1.0  # nominal flights that differ by more had weather: a mean wind is then never a finding
+WEATHER_MPS = 1.0  # larger wind spread between nominal flights: a mean wind is then nominal
 
 
 @dataclass(frozen=True)
 class Timing:
-    """What passes between a command and its effect: lag of servos and engine, transport delay [s]."""
+    """Actuator dynamics: lag of servos and engine, transport delay [s]."""
 
     servo: float = 0.0
     engine: float = 0.25
@@ -27,7 +27,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Noise:
-    """Innovations of each residual: e(k) = x(k) - a1 x(k-1) - a2 x(k-2), of standard deviation sigma; (c, 2), (c,)."""
+    """Autoregressive noise of each residual: e(k) = x(k) - a1 x(k-1) - a2 x(k-2), std(e) = sigma; (c, 2), (c,)."""
 
     ar: np.ndarray
     sigma: np.ndarray
@@ -41,27 +41,27 @@ class Noise:
 
 
 def no_noise() -> Noise:
-    """Return the whitener that does nothing."""
+    """Return unit white noise, with which `whiten` does not filter."""
     n = len(CHANNELS)
     return Noise(np.zeros((n, 2)), np.ones(n))
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """The simulation as calibrated on nominal flights.
+    """Simulation calibrated on nominal flights; the field names are the keys of the model file.
 
     Attributes:
         card: the aircraft
         coef: equation -> coefficients, in the order of `equations.TERMS`
         speed: usual airspeed [m/s]
-        airspeed: reported over indicated airspeed, of the healthy sensor [-]
+        airspeed: reported over indicated airspeed of the healthy sensor [-]
         timing: of servos and engine
-        vane: the accelerometer served as the vane
+        vane: flow angles come from the accelerometer
         r2: equation -> share of variance explained on the nominal flights
         noise: of the residuals
-        spread: nuisance -> how much it varies from flight to flight, in its own unit
-        chance: guess and kind of onset -> gain that nominal flights left out reach
-        others: coefficients with each nominal flight left out, less those of all: how far they may be trusted
+        spread: nuisance -> standard deviation between flights, in its own unit
+        chance: hypothesis and kind of onset -> largest gain on left-out nominal flights
+        others: coefficients with each nominal flight left out, less those of all flights: their uncertainty
         usual: mean square of each whitened residual on nominal flights, (c,)
         flights: names of the nominal flights
     """
@@ -81,7 +81,7 @@ class Baseline:
     flights: tuple[str, ...] = ()
 
     def varied(self, k: int) -> "Baseline":
-        """Return the baseline with its coefficients moved towards those of the k-th left out."""
+        """Return the baseline with the coefficients of the k-th entry of `others`."""
         coef = {name: x + self.others[k][name] for name, x in self.coef.items()}
         return replace(self, coef=coef)
 
@@ -89,11 +89,11 @@ class Baseline:
 SHOWN_BY = {"X": "force_x", "beta": "side", "alpha": "lift", "L": "roll", "M": "pitch", "N": "yaw"}
 """Equation -> channel of its residual."""
 
-DEAF = 1e6  # noise of a channel that says nothing
+DEAF = 1e6  # noise sigma of an ignored channel
 
 
 def silenced(base: Baseline, equations: Iterable[str]) -> Baseline:
-    """Return a baseline in which some equations are not judged, their residuals counting for nothing."""
+    """Return a baseline that ignores the residuals of some equations."""
     sigma, r2 = base.noise.sigma.copy(), dict(base.r2)
     for name in equations:
         sigma[CHANNELS.index(SHOWN_BY[name])] = DEAF
@@ -102,5 +102,5 @@ def silenced(base: Baseline, equations: Iterable[str]) -> Baseline:
 
 
 def is_weather(base: Baseline) -> bool:
-    """Return whether the nominal flights had wind, so that a mean wind is nobody's finding."""
+    """Return whether the nominal flights had wind, so that a mean wind is nominal."""
     return max(base.spread.get(f"wind_steady:{axis}", 0.0) for axis in ("w_n", "w_e")) > WEATHER_MPS

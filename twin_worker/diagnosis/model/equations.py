@@ -1,4 +1,4 @@
-"""The simulation's equations in coefficient form: what each is regressed on. The accelerometer is the vane.
+"""Equations of the simulation in coefficient form. The accelerometer provides the flow angles.
 
     alpha = A . (1, c_z, c_z2, q^, c_z'^, delta_e)     beta = B . (1, c_y, p^, r^, delta_r)
     m f_x = q_bar S X . (1, c_z, c_z2, delta_e, |beta|) + T . thrust terms
@@ -7,8 +7,9 @@
 
     c_z = m f_z / (q_bar S), c_x and c_y likewise; ^: made dimensionless by b / 2 Va, c / 2 Va
 
-Regressing moments on flow angles from inertial velocity fails (noise, trim); forces per dynamic pressure feel the same
-air as the moments do.  Source: Klein & Morelli 2006, section 5.2 (equation error); Beard & McLain 2012, chapter 4.
+Flow angles from inertial velocity are poor regressors of the moments (noise, trim). Forces per dynamic pressure
+contain the same gusts as the moments.
+Source: Klein & Morelli 2006, section 5.2 (equation error); Beard & McLain 2012, chapter 4.
 """
 
 from typing import Any
@@ -30,8 +31,8 @@ USUAL = {
     "beta": (np.inf, np.inf, 0.1, 0.3, 0.06),
     "X": (np.inf, np.inf, np.inf, 0.3, np.inf, *6 * (np.inf,)),
 }
-"""Equation -> how large the coefficients of a wing usually are, where flight by itself does not tell: at every trim the
-elevator goes with the lift. Of beta: those of the side force it is turned round from; of X: thrust behind it."""
+"""Equation -> prior standard deviation of coefficients that flight data alone do not determine, because the elevator
+follows the lift at every trim. Beta: coefficients of the side force equation before inversion. X: drag, then thrust."""
 
 
 def alpha_terms(c_z: Any, c_z_dot: Any, q_hat: Any, delta_e: Any) -> np.ndarray:
@@ -50,13 +51,13 @@ def force_terms(c_z: Any, delta_e: Any, beta: Any) -> np.ndarray:
 
 
 def lateral_terms(beta: Any, rates: tuple[Any, Any], deltas: tuple[Any, Any], c_z: Any) -> np.ndarray:
-    """Stack the terms of rolling and yawing moment coefficients, (9, n); c_z for weight beside the middle."""
+    """Stack the terms of rolling and yawing moment coefficients, (9, n); c_z: lateral offset of the weight."""
     p, r = rates
     return np.array([np.ones_like(c_z), beta, p, r, *deltas, c_z * r, c_z * p, c_z])
 
 
 def pitch_terms(c_z: Any, q_hat: Any, delta_e: Any, c_z_dot: Any, c_x: Any) -> np.ndarray:
-    """Stack the terms of the pitching moment coefficient, (7, n); c_x for drag above or below the centre of gravity."""
+    """Stack the terms of the pitching moment coefficient, (7, n); c_x: vertical offset of the drag."""
     return np.array([np.ones_like(c_z), c_z, q_hat, delta_e, c_z_dot, c_z * c_z, c_x])
 
 

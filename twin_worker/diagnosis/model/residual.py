@@ -1,4 +1,4 @@
-"""Measured less simulated, channel by channel, with any guesses at work in the simulation."""
+"""Residuals of all channels, measured less simulated, with hypotheses active in the simulation."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -25,12 +25,12 @@ Series = dict[str, np.ndarray]
 
 def density(h: Any) -> Any:
     """Return the density of the standard atmosphere at height h [m], [kg/m3]."""
-    return RHO_0 * np.clip(1.0 - 2.25577e-5 * h, 0.1, 2.0) ** 4.2559  # a free flight may stray beyond the air
+    return RHO_0 * np.clip(1.0 - 2.25577e-5 * h, 0.1, 2.0) ** 4.2559  # a free run may leave the atmosphere
 
 
 @dataclass
 class Terms:
-    """Everything the equations are made of, thinned: terms (k, n) by equation, measured sides (n,), and the flow."""
+    """Equation terms on the decimated grid: flow, regressors (k, n) and measured side (n,) by equation."""
 
     flow: Flow
     add: Series
@@ -41,11 +41,11 @@ class Terms:
 
 
 class Case:
-    """One flight seen through one baseline."""
+    """One flight evaluated under one baseline."""
 
     def __init__(self, flight: Flight, base: Baseline, like: "Case | None" = None) -> None:
         self.flight, self.base = flight, base
-        if like is not None:  # the same flight: what was filtered is filtered
+        if like is not None:  # same flight: reuse the filtered series
             self._smooth, self._still = like._smooth, like._still
             if like.base.timing == base.timing:
                 self._delta = like._delta
@@ -62,8 +62,8 @@ class Case:
         return self._agreement(self._smooth)
 
     def agreement(self, s: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what only a sensor fault changes: body axes (3, 3, n), dV/dt less gravity in them (3, n) [m/s2], and
-        how far sensors disagree, (n, 6): channels gps_x to gyro_yaw.
+        """Return the quantities that only sensor faults change: rotation to body axes (3, 3, n), dV/dt less gravity in
+        body axes (3, n) [m/s2], and the difference between sensors, (n, 6), channels gps_x to gyro_yaw.
         """
         return self._still if s is self._smooth else self._agreement(s)
 
@@ -78,7 +78,7 @@ class Case:
 
     @cached_property
     def trend(self) -> np.ndarray:
-        """Return the recorded barometer's offset, sea level pressure and lapse rate being unknown, (n,) [m]."""
+        """Fit the barometer offset from unknown sea level pressure and lapse rate, (n,) [m]."""
         h = self._smooth["h"]
         A = np.column_stack([np.ones_like(h), h - h.mean()])
         off = self._smooth["baro"] - self._smooth.get("gnss", h)
@@ -95,7 +95,7 @@ class Case:
         return out
 
     def surface(self, column: int, acting: Iterable[Guess]) -> np.ndarray:
-        """Return what one input does behind servo, lag and delay: angle [rad] or throttle, on the grid."""
+        """Return one actuator output after servo faults, lag and delay: angle [rad] or throttle, on the flight grid."""
         timing = self.base.timing
         u = np.ascontiguousarray(self.flight.commands[:, column], float)
         tau = timing.engine if column == 3 else timing.servo
@@ -105,7 +105,7 @@ class Case:
             if guess.effect.takes_lag:
                 par[0], tau = par[0] + tau, 0.0
             guess.effect.act(u, memory, DT, np.ascontiguousarray(par))
-        if tau > 1e-3:  # exact between commands joined by straight lines
+        if tau > 1e-3:  # exact for linearly interpolated commands
             a = exp(-DT / tau)
             mean = (1 - a) * tau / DT
             b = [1 - mean, mean - a]
@@ -115,7 +115,7 @@ class Case:
         return u if column == 3 else self.base.card.angles(column)(u)
 
     def sensed(self, guesses: tuple[Guess, ...]) -> Series:
-        """Return the smooth readings, guessed sensor faults undone."""
+        """Return the filtered readings, corrected for the hypothesised sensor faults."""
         faults = [guess for guess in guesses if guess.effect.stage is Stage.SENSOR]
         if not faults:
             return self._smooth
@@ -124,9 +124,9 @@ class Case:
             par = [-x * guess.when.gate(self.flight.t) for x in guess.par]
             try:
                 undone = guess.effect.act(readings, *par, **_of(guess))
-            except KeyError:  # the flight has no such reading: the fault cannot show
+            except KeyError:  # the flight lacks this reading: the fault has no influence
                 continue
-            if "Va" in undone and self.base.vane:  # raw noise shrinks or grows with the reading
+            if "Va" in undone and self.base.vane:  # the raw noise scales with the reading
                 faster = guess.effect.act({**readings, "Va": readings["Va"] + 1.0}, *par, **_of(guess))
                 readings["Va_share"] = readings.get("Va_share", 1.0) * (faster["Va"] - undone["Va"])
             readings |= undone
@@ -134,7 +134,7 @@ class Case:
         return {**self._smooth, **self._filtered(changed)}
 
     def inputs(self, guesses: tuple[Guess, ...]) -> np.ndarray:
-        """Return aileron, elevator, rudder angle and throttle as they act, (4, n)."""
+        """Return the actuator outputs, aileron, elevator, rudder angle [rad] and throttle, (4, n)."""
         acting = [guess for guess in guesses if guess.effect.stage is Stage.DELTA]
         if not acting:
             return self._delta
@@ -155,7 +155,7 @@ class Case:
         return total
 
     def terms(self, guesses: tuple[Guess, ...] = ()) -> Terms:
-        """Lay out every equation's terms, with guesses at work."""
+        """Compute the terms of all equations with the hypotheses active."""
         base, body = self.base, self.base.card.body
         s, (d_a, d_e, d_r, d_t) = self.sensed(guesses), self.inputs(guesses)
         flow = Flow(self.t, s["h"], s["h"] - self.flight.ground, body, delta_t=d_t, used=self.used)
@@ -183,7 +183,7 @@ class Case:
         add = self._increments(flow, guesses, (Stage.WRENCH, Stage.MASS))
         mass = body.mass * (1.0 + add.get("mass", 0.0))
         force = mass * f
-        # what the clean aircraft must do: lift gained and added by effects is taken off first
+        # coefficients of the clean aircraft: remove the scaling and increments of effects first
         c_z = (force[2] / q_S + add.get("C_L", 0.0)) / (1.0 + add.get("lift", 0.0))
         c_y = (force[1] / q_S - add.get("C_Y", 0.0)) * (1.0 + add.get("side", 0.0))
         c_z_dot = np.gradient(c_z, STEP_S) * chord
@@ -221,13 +221,13 @@ class Case:
 
 
 def channels(case: Case, made: Terms) -> np.ndarray:
-    """Return every channel's residual of what was laid out, (n, channels)."""
+    """Return the residuals of all channels from the equation terms, (n, channels)."""
     base, flow, add, aside = case.base, made.flow, made.add, made.aside
     q_S = made.scale["X"]
     T = (base.coef["T"] @ made.terms["T"]) * (1.0 + add.get("thrust", 0.0))
     alpha, beta = base.coef["alpha"] @ made.terms["alpha"], base.coef["beta"] @ made.terms["beta"]
     c_z = aside["c_z"]
-    lift = add.get("lift", 0.0) * -c_z + add.get("C_L", 0.0)  # what effects added to the clean lift coefficient
+    lift = add.get("lift", 0.0) * -c_z + add.get("C_L", 0.0)  # increment of effects over the clean lift coefficient
     X = q_S * (valued(base, add, "X", made.terms["X"]) + lift * np.sin(alpha) - add.get("C_D", 0.0) * np.cos(alpha)) + T
     L = made.scale["L"] * (valued(base, add, "L", made.terms["L"]) + add.get("C_l", 0.0)) + add.get("L", 0.0)
     N = made.scale["N"] * (valued(base, add, "N", made.terms["N"]) + add.get("C_n", 0.0)) + add.get("N", 0.0)
@@ -238,7 +238,7 @@ def channels(case: Case, made: Terms) -> np.ndarray:
     )
     if "x_cg" in add or "y_cg" in add:
         x, y, force = add.get("x_cg", 0.0), add.get("y_cg", 0.0), aside["force"]
-        # gravity passes through the centre of gravity; the air's force no longer does
+        # gravity acts at the centre of gravity, the aerodynamic force at an offset from it
         M, N, L = M + x * force[2], N - x * force[1] + y * force[0], L - y * force[2]
     J_x, J_y, J_z, _ = base.card.inertia
     out = np.zeros((len(case.t), len(CHANNELS)))
@@ -251,7 +251,7 @@ def channels(case: Case, made: Terms) -> np.ndarray:
     readings = case.flight.readings
     if "Va" in readings:
         out[:, 6] = made.measured["airspeed"] / base.airspeed - flow.Va * np.sqrt(flow.rho / RHO_0)
-        out[:, 6] /= aside["Va_share"]  # as the sensor would read it
+        out[:, 6] /= aside["Va_share"]  # in units of the faulty sensor
     out[:, 7:13] = aside["apart"]
     if "baro" in readings:
         out[:, 13] = aside["baro"] - case.trend - add.get("baro", 0.0)
@@ -259,7 +259,7 @@ def channels(case: Case, made: Terms) -> np.ndarray:
 
 
 def valued(base: Baseline, add: Series, equation: str, terms: np.ndarray) -> np.ndarray:
-    """Return an equation's value, derivatives scattered by shares where so said, (n,)."""
+    """Evaluate an equation, with relative errors of its derivatives from `add`, (n,)."""
     coef = base.coef[equation][: len(terms)]
     out = coef @ terms
     for k, name in enumerate(eq.TERMS[equation][: len(terms)]):
@@ -269,7 +269,7 @@ def valued(base: Baseline, add: Series, equation: str, terms: np.ndarray) -> np.
 
 
 def _turning(s: Series) -> np.ndarray:
-    """Return Euler rates less what the gyros make of them, (n, 3) [rad/s]."""
+    """Return Euler rates less those computed from the gyros, (n, 3) [rad/s]."""
     sf, cf, p, q, r = np.sin(s["phi"]), np.cos(s["phi"]), s["p"], s["q"], s["r"]
     turn = (q * sf + r * cf) / np.cos(s["theta"])
     rates = (s["phi_dot"] - p - np.sin(s["theta"]) * turn, s["theta_dot"] - (q * cf - r * sf), s["psi_dot"] - turn)

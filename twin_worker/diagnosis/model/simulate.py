@@ -1,8 +1,8 @@
-"""Fly the calibrated simulation, with any effects at work: many runs side by side, commands recorded or from a pilot.
+"""Simulate the calibrated aircraft with active effects: parallel runs, commands recorded or from a pilot.
 
-    m a = m g + R (X, Y, Z)      J omega' = moments, inertia coupled where the card tells it      (NED, FRD)
+    m a = m g + R (X, Y, Z)      J omega' = moments, inertia coupling if the card is known      (NED, FRD)
 
-Forces are the calibration's equations turned round: c_z from alpha, c_y from beta.
+Forces follow from the inverted equations of the calibration: c_z from alpha, c_y from beta.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,17 +19,17 @@ from twin_worker.diagnosis.model.baseline import Baseline
 from twin_worker.diagnosis.model.residual import RHO_0, density
 
 STATE = ("v_n", "v_e", "v_d", "p", "q", "r", "phi", "theta", "psi", "h")
-_STEEP = 1.45  # pitch is not integrated beyond [rad]
-_SLOWEST = 3.0  # airspeed the equations are used down to [m/s]
-_WILDEST = 8.0  # body rates beyond which a run counts as lost [rad/s]
+_STEEP = 1.45  # limit of the pitch angle [rad]
+_SLOWEST = 3.0  # least airspeed in the equations [m/s]
+_WILDEST = 8.0  # body rate above which a run counts as diverged [rad/s]
 
 Pilot = Callable[[int, np.ndarray], np.ndarray]
-Memories = dict[tuple[int, int, int], np.ndarray]  # run, input, effect -> what its servo remembers
+Memories = dict[tuple[int, int, int], np.ndarray]  # run, input, effect -> servo memory
 
 
 @dataclass(frozen=True)
 class Runs:
-    """What was flown: states (n, 10, runs), force FRD (n, 3, runs), commands (n, 4, runs); Va, rho (n, runs)."""
+    """Simulated series: states (n, 10, runs), force FRD (n, 3, runs), commands (n, 4, runs); Va, rho (n, runs)."""
 
     states: np.ndarray
     force: np.ndarray
@@ -39,12 +39,12 @@ class Runs:
 
 
 class Simulation:
-    """Several runs of one aircraft, each with effects of its own.
+    """Parallel runs of one aircraft, each with its own effects.
 
     Args:
         base: the calibrated simulation
-        guesses: effects at work, for each run
-        begins: time of each run's start, (runs,) [s]
+        hypotheses: active effects of each run
+        start_times: start time of each run, (runs,) [s]
         ground: height of the ground [m]
     """
 
@@ -58,7 +58,7 @@ class Simulation:
         self._no_wind = np.zeros((3, self.runs))
 
     def fly(self, start: np.ndarray, pilot: Pilot, n: int) -> Runs:
-        """Fly n steps of `DT`; commands are held over a step, servos and engine follow them.
+        """Simulate n steps of `DT`; commands are constant over a step, servos and engine follow with lag.
 
         Args:
             start: states in the order of `STATE`, (10, runs)
@@ -90,13 +90,13 @@ class Simulation:
         return Runs(states, force, commands, speed, rho)
 
     def airspeed(self, x: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Return true airspeed, (runs,) [m/s], in states (10, runs) at times (runs,) [s]: what a pilot may go by."""
+        """Return true airspeed, (runs,) [m/s], of states (10, runs) at times (runs,) [s], as an input of the pilot."""
         flow = Flow(t, x[9], x[9] - self.ground, self.base.card.body)
         self._gate(t)
         return np.sqrt(((x[:3] - self._wind(self._increments(flow, (Stage.AIR,)))) ** 2).sum(axis=0))  # type: ignore[no-any-return]
 
     def _share(self, dt: float) -> np.ndarray:
-        """Return how far servos and engine come to what is commanded within dt, (4, runs)."""
+        """Return the share of a command step that servos and engine reach within dt, (4, runs)."""
         timing = self.base.timing
         tau = np.array([timing.servo + timing.delay] * 3 + [timing.engine])
         share = np.repeat((1.0 - np.exp(-dt / np.maximum(tau, 1e-3)))[:, None], self.runs, axis=1)
@@ -107,7 +107,7 @@ class Simulation:
         return share
 
     def _moved(self, commands: np.ndarray, t: np.ndarray, memories: Memories) -> np.ndarray:
-        """Have faulty servos do to the commands what they do."""
+        """Apply the servo faults to the commands, (4, runs)."""
         out = commands.copy()
         for run, guess in self._servos:
             for column, name in enumerate(SURFACES):
@@ -123,7 +123,7 @@ class Simulation:
         return out
 
     def _gate(self, t: np.ndarray) -> None:
-        """Set the parameters of every effect in the air for one step, by its course."""
+        """Set the parameters of all grouped effects for one step from their onset profiles."""
         for group in self._groups:
             group.gate(t)
 
@@ -149,11 +149,11 @@ class Simulation:
     def rates(
         self, x: np.ndarray, delta: np.ndarray, t: np.ndarray, used: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Give d state / dt (10, runs), specific force FRD (3, runs) [m/s2], airspeed [m/s], density [kg/m3], (runs,).
+        """Return d state/dt (10, runs), specific force FRD (3, runs) [m/s2], airspeed [m/s], density [kg/m3], (runs,).
 
         Args:
             x: states, (10, runs)
-            delta: surfaces as they stand [rad] and throttle, (4, runs)
+            delta: surface angles [rad] and throttle, (4, runs)
             t: time [s]; used: throttle integrated over time [s]; each (runs,)
         """
         base, body = self.base, self.base.card.body
@@ -221,7 +221,7 @@ class Simulation:
 
 
 def lift_of(A: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Solve A1 c_z + A2 c_z2 = rest for c_z, the root near zero."""
+    """Solve A1 c_z + A2 c_z2 = lift_angle for c_z, the root near zero."""
     c_z = rest / A[1]
     for _ in range(3):
         c_z = c_z - (A[1] * c_z + A[2] * c_z**2 - rest) / (A[1] + 2 * A[2] * c_z)
@@ -229,13 +229,13 @@ def lift_of(A: np.ndarray, rest: np.ndarray) -> np.ndarray:
 
 
 class _Group:
-    """Guesses of one effect on one thing, and the runs they are at work in."""
+    """Hypotheses of one effect on one target, and the runs in which they are active."""
 
     def __init__(self, guesses: list[Guess], runs: list[int]) -> None:
         self.effect, self._whens = guesses[0].effect, [guess.when for guess in guesses]
         self._runs, self._of = np.array(runs), {"of": guesses[0].of} if guesses[0].of else {}
         side_by_side = np.array_equal(self._runs, np.arange(runs[0], runs[0] + len(runs)))
-        self.rows = slice(runs[0], runs[0] + len(runs)) if side_by_side else self._runs  # a view where it can be one
+        self.rows = slice(runs[0], runs[0] + len(runs)) if side_by_side else self._runs  # a slice yields views
         self._full = self._par = np.array([guess.par for guess in guesses]).T
         self._comes = any(when.kind is not Onset.ALWAYS for when in self._whens)
 
@@ -246,13 +246,13 @@ class _Group:
             self._par = self._full * np.array(gates)
 
     def act(self, flow: Flow) -> dict[str, np.ndarray]:
-        """Return the increments of the runs it is at work in."""
+        """Return the increments of the active runs."""
         part = Flow(**{name: x[self.rows] if isinstance(x, np.ndarray) else x for name, x in flow.__dict__.items()})  # type: ignore[arg-type]
         return self.effect.act(part, *self._par, **self._of)  # type: ignore[no-any-return]
 
 
 def _grouped(guesses: Sequence[Sequence[Guess]]) -> list[_Group]:
-    """Collect guesses of one effect on one thing over the runs."""
+    """Group the hypotheses of all runs by effect and target."""
     groups: dict[str, list[tuple[Guess, int]]] = {}
     for run, all_ in enumerate(guesses):
         for guess in all_:

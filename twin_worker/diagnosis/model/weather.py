@@ -1,4 +1,4 @@
-"""A flight's own weather: its wind and how that grows with height; and the airspeed sensor's scale beside it."""
+"""Estimate the weather of a flight (wind and wind shear) and the scale of the airspeed sensor."""
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -9,23 +9,23 @@ from twin_worker.diagnosis.data.smooth import thinned
 from twin_worker.diagnosis.model.baseline import is_weather
 from twin_worker.diagnosis.model.residual import RHO_0, Case
 
-CORRELATED = 50.0  # residual rows that count as one
-_SHEAR = 1.0  # usual growth of wind with height [m/s per 100 m]
+CORRELATED = 50.0  # residual rows per independent sample
+_SHEAR = 1.0  # prior standard deviation of the wind shear [m/s per 100 m]
 _SIDE = 0.5  # weight of sideslip in the wind fit [-]
 _CALM = np.array([0.0, 0.0, 1.0])  # no wind [m/s], true airspeed [-]
-_STILL = np.array([0.5, 0.5, 100.0])  # how far a flight is held to that
+_STILL = np.array([0.5, 0.5, 100.0])  # prior weights: inverse standard deviations
 
 
 def wind(w: np.ndarray) -> tuple[Guess, ...]:
-    """Return a flight's own weather as guesses: wind, (2,) [m/s], and its growth with height, (2,) [m/s per 100 m]."""
+    """Return weather (4,) as hypotheses: wind, (2,) [m/s], and wind shear, (2,) [m/s per 100 m]."""
     known = catalogue()
     return Guess(known["wind_steady"], "", tuple(w[:2].tolist())), Guess(known["wind_shear"], "", tuple(w[2:].tolist()))
 
 
 def scale(cases: list[Case]) -> float:
-    """Return reported over indicated airspeed before anything else is known: on circles wind and scale come apart.
+    """Estimate reported over indicated airspeed first: circling flight separates wind and scale.
 
-    Started from a scale of one, the winds would take it up, and hand it on to the sideslip.
+    Without this start value, the wind estimates would absorb the scale error and bias the sideslip.
     """
     found = []
     for case in cases:
@@ -44,7 +44,7 @@ def scale(cases: list[Case]) -> float:
 
 
 def fit_wind(case: Case, w: np.ndarray) -> np.ndarray:
-    """Fit a flight's weather, (4,) as in `wind`, to airspeed (it needs turns) and sideslip; robustly."""
+    """Fit the weather of a flight, (4,), robustly to airspeed (needs turns) and sideslip."""
     if "Va" not in case.flight.readings and "beta" not in case.base.coef:
         return w
 
@@ -70,5 +70,5 @@ def fit_wind(case: Case, w: np.ndarray) -> np.ndarray:
 
 
 def own_weather(case: Case) -> tuple[Guess, ...]:
-    """Return the flight's own mean wind as granted, where wind is weather."""
+    """Return the fitted weather as hypotheses where wind is nominal, else none."""
     return wind(fit_wind(case, np.zeros(4))) if is_weather(case.base) else ()

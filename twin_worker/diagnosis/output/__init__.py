@@ -1,1 +1,1 @@
-"""Report, figures and files of a diagnosis."""
+"""Output of a diagnosis: figures, page, JSON and model files."""

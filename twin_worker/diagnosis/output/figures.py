@@ -1,4 +1,4 @@
-"""Pictures of a diagnosis: where on the path, residuals, measured against simulated, what else was thought of."""
+"""Figures of a diagnosis: location on the path, residuals, measured against simulated force, candidates."""
 
 import io
 import warnings
@@ -22,24 +22,24 @@ from twin_worker.diagnosis.output.written import safe
 from twin_worker.numerics.plot_style import house
 
 KINDS = ("path", "residuals", "simulated", "candidates")
-_LETTERS = 50  # of a flight's name in a file's name, which holds 255 bytes
-_TITLE = 40  # of a flight's name in a title
-_BARS = 12
-_FEWEST = 4  # bars there is room for, lest one alone fill the picture
+_LETTERS = 50  # letters of a flight name in a file name, which is limited to 255 bytes
+_TITLE = 40  # letters of a flight name in a title
+_BARS = 12  # candidates in the figure
+_FEWEST = 4  # least number of rows, so that a single bar stays thin
 _RIVAL: Any = {"facecolor": "white", "edgecolor": INK, "hatch": "////", "lw": 0.8}
 _OTHER: Any = {"color": MUTED, "alpha": 0.45}
 _SMALL: Any = {"fontsize": 8, "color": INK, "va": "center"}
-_DPI = 110  # a page is about as wide as the figures
-_INKS = 96  # a picture of so many colours is a third as large, and a page holds four for every flight
+_DPI = 110  # figures are about as wide as a page
+_INKS = 96  # a palette reduces the file size to a third; a page contains four figures per flight
 
 
 def draw(report: Report, folder: Path, stem: str = "") -> list[Path]:
-    """Draw the pictures of one flight into a folder; return the files, in the order of `KINDS`.
+    """Draw the figures of one flight into a folder; return the files, in the order of `KINDS`.
 
     Args:
         report: of the flight
-        folder: made where it is missing
-        stem: what the files' names begin with; otherwise made from the flight's name
+        folder: created if missing
+        stem: start of the file names; default: from the flight name
     """
     folder.mkdir(parents=True, exist_ok=True)
     stem = stem or stems([report.flight])[0]
@@ -47,14 +47,14 @@ def draw(report: Report, folder: Path, stem: str = "") -> list[Path]:
     shown = replace(report, flight=name if len(name) <= _TITLE else name[: _TITLE - 2] + " …")
     made = [folder / f"{stem}-{kind}.png" for kind in KINDS]
     with matplotlib.rc_context({"text.parse_math": False}), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # a letter no font has is a box, not an error
+        warnings.simplefilter("ignore", UserWarning)  # a letter without a glyph becomes a box
         for path, picture in zip(made, (_path, residuals, simulated, _candidates), strict=True):
             _save(picture(shown), path)
     return made
 
 
 def _save(figure: Figure, path: Path) -> None:
-    """Save a picture small."""
+    """Save a figure as a PNG with a reduced palette."""
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=_DPI)
     with Image.open(drawn) as picture:
@@ -62,7 +62,7 @@ def _save(figure: Figure, path: Path) -> None:
 
 
 def stems(flights: Sequence[str]) -> list[str]:
-    """Return every flight a name for its files that cannot leave the folder, no two alike."""
+    """Return a unique, safe file stem for every flight."""
     out: list[str] = []
     for flight in flights:
         found, number = safe(flight)[:_LETTERS], 1
@@ -74,7 +74,7 @@ def stems(flights: Sequence[str]) -> list[str]:
 
 
 def _path(report: Report) -> Figure:
-    """Draw the flight from above and its height over time, what was located in colour."""
+    """Draw the path from above and the height over time, located segments in colour."""
     series = report.series
     figure = Figure(figsize=(11, 5.4), layout="constrained")
     above, height = figure.subplots(1, 2, width_ratios=(1.15, 1))
@@ -102,7 +102,7 @@ def _path(report: Report) -> Figure:
 
 
 def _located(ax: Any, report: Report, x: np.ndarray, y: np.ndarray) -> None:
-    """Colour what was located; several at one time lie on each other, the longest beneath and widest."""
+    """Draw the located segments in colour; where they overlap, longer ones are wider and below."""
     t = report.series.t
     found = sorted(marks(report), key=lambda mark: -int(mark.rows(t).sum()))
     for k, mark in enumerate(found):
@@ -113,20 +113,20 @@ def _located(ax: Any, report: Report, x: np.ndarray, y: np.ndarray) -> None:
 
 
 def _candidates(report: Report) -> Figure:
-    """Draw what every candidate gains: the chosen in colour, what cannot be told from them hatched."""
+    """Draw the gain of every candidate: selected ones in colour, inseparable ones hatched."""
     tried = sorted(report.tried, key=lambda one: -one.gain)[:_BARS]
     figure = Figure(figsize=(11, 0.3 * max(len(tried), _FEWEST) + 1.5), layout="constrained")
     ax = figure.subplots()
     chosen = {one.guess.label: mark.colour for one, mark in zip(report.findings, marks(report), strict=False)}
     rivals = {name for one in report.findings for name in one.rivals}
-    proven = "proven" if report.outcome is Outcome.NAMED else "not proven"
+    proven = "confirmed" if report.outcome is Outcome.NAMED else "not confirmed"
     key: dict[str, Patch] = {}
     for place, one in enumerate(tried):
         words, looks = "others", _OTHER
-        if one.label in chosen:  # the best of its label; further ones come at other times
-            words, looks = f"chosen, {proven}: {one.label}", {"color": chosen.pop(one.label)}
+        if one.label in chosen:  # the best onset of its label; further ones have other onsets
+            words, looks = f"selected, {proven}: {one.label}", {"color": chosen.pop(one.label)}
         elif one.label.split(":")[0] in rivals:
-            words, looks = "cannot be told from it", _RIVAL
+            words, looks = "not separable from it", _RIVAL
         key[words] = Patch(**looks, label=words)
         ax.barh(place, max(one.gain, 0.0), height=0.68, **looks)
         ax.annotate(f"{one.gain:,.0f}", (max(one.gain, 0.0), place), (4, 0), textcoords="offset points", **_SMALL)
@@ -142,6 +142,6 @@ def _candidates(report: Report) -> Figure:
     if tried:
         figure.legend(handles=list(key.values()), loc="outside lower center", ncols=4, **LEGEND)
     else:
-        empty(ax, "no candidate gained anything worth ranking")
+        empty(ax, "no candidate with a significant gain")
         ax.set(xticks=[], xlabel="")
     return figure

@@ -1,4 +1,4 @@
-"""The calibrated simulation as a file, with the effects that were found: what `simulate` and `diagnose` load."""
+"""Save and load the calibrated simulation with its effects as a JSON model file."""
 
 import json
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ FORMAT = "parauav.simulation.1"
 
 
 def save(path: Path, base: Baseline, findings: Sequence[Finding] = ()) -> None:
-    """Write the simulation; effects with their numbers, standard deviations and course."""
+    """Write the simulation and its effects, with parameters, standard deviations and onset profiles."""
     effects = [
         {
             "effect": one.guess.effect.name,
@@ -37,11 +37,11 @@ def save(path: Path, base: Baseline, findings: Sequence[Finding] = ()) -> None:
 
 
 def load(path: Path) -> tuple[Baseline, tuple[Guess, ...]]:
-    """Read a simulation and the effects in it.
+    """Read a simulation and its effects.
 
     Raises:
-        ValueError: when it is none; the sentence says what is wrong.
-        OSError: when it cannot be read.
+        ValueError: if the file is no valid model; the message names the fault.
+        OSError: if the file cannot be read.
     """
     try:
         found = json.loads(path.read_text())
@@ -55,7 +55,9 @@ def load(path: Path) -> tuple[Baseline, tuple[Guess, ...]]:
     try:
         return _baseline(found), tuple(_guess(one) for one in found["effects"])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"{path.name}: found {error!r}, expected a whole model; make it anew") from None
+        raise ValueError(
+            f"{path.name}: found {error!r}, expected a complete model; make it with `fleet calibrate`"
+        ) from None
 
 
 def _plain(value: Any) -> Any:
@@ -98,13 +100,13 @@ def _coefficients(found: dict[str, list[float]]) -> dict[str, np.ndarray]:
 def _array(found: Any, shape: tuple[int, ...]) -> np.ndarray:
     array = np.array(found, float)
     if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"numbers of shape {array.shape} where {shape} finite ones belong")
+        raise ValueError(f"shape {array.shape} or non-finite numbers, expected finite numbers of shape {shape}")
     return array
 
 
 def _number(found: Any) -> float:
     if not isinstance(found, int | float) or not isfinite(found) or found <= 0:
-        raise ValueError(f"{found!r} where a number above 0 belongs")
+        raise ValueError(f"{found!r}, expected a number above 0")
     return float(found)
 
 

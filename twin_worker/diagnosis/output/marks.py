@@ -1,4 +1,4 @@
-"""Where and when, in colours and words: what the figures and the page of a diagnosis share."""
+"""Names, colours and time segments shared by the figures and the page of a diagnosis."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -27,25 +27,25 @@ MEANING = {
     "gyro_yaw": "attitude against gyro, yaw",
     "baro": "barometric height",
 }
-"""What each channel of a residual is, for people."""
+"""Display name of each residual channel."""
 
 SAID = {
     Outcome.NONE: "no mismatch",
     Outcome.NAMED: "named",
-    Outcome.SUSPECTED: "suspected, not proven",
+    Outcome.SUSPECTED: "suspected, not confirmed",
     Outcome.UNKNOWN: "unknown",
 }
-"""What is written for each outcome."""
+"""Display text of each outcome."""
 
 BEFORE, AFTER = LINES[1], LINES[0]  # without and with the effects, in every figure
-_COLOURS = (LINES[4], LINES[2], LINES[3], LINES[7])  # of what was located, apart from those two
-_EDGE_S = 1.0  # what begins no later than this has been there all along [s]
-_MOST = 3  # segments written out
+_COLOURS = (LINES[4], LINES[2], LINES[3], LINES[7])  # of located segments, distinct from those two
+_EDGE_S = 1.0  # an effect that starts earlier counts as present throughout [s]
+_MOST = 3  # segments listed in full
 LEGEND: Any = {"frameon": False, "fontsize": 8, "labelcolor": INK}
 
 
 class Mark(NamedTuple):
-    """Something located: its name, colour, segments [s], and since when where it came in flight [s]."""
+    """Located effect or mismatch: name, colour, segments [s], and onset if it started in flight [s]."""
 
     name: str
     colour: str
@@ -53,21 +53,21 @@ class Mark(NamedTuple):
     onset: float | None
 
     def rows(self, t: np.ndarray) -> np.ndarray:
-        """Tell which times lie in its segments, (n,) bool."""
+        """Return which times lie in the segments, (n,) bool."""
         found = np.zeros(len(t), bool)
         for start, stop in self.segments:
             found |= (t >= start) & (t <= stop)
         return found
 
     def begins(self, span: tuple[float, float]) -> list[float]:
-        """Return when it begins within the flight [s]; not where it was there all along."""
+        """Return the onsets within the flight [s]; none for an effect that is present throughout."""
         if self.onset is not None:
             return [self.onset]
         return [start for start, _ in self.segments if start > span[0] + _EDGE_S]
 
 
 def marks(report: Report) -> list[Mark]:
-    """Return what was located: a mark for every effect, and one for what stays unknown."""
+    """Return one mark for every finding, and one for an unknown mismatch."""
     found = [
         (one.guess.label, one.segments, None if one.guess.when.kind is Onset.ALWAYS else one.guess.when.t0)
         for one in report.findings
@@ -79,25 +79,25 @@ def marks(report: Report) -> list[Mark]:
 
 
 def times(segments: Segments) -> str:
-    """Write segments in words: `83–95, 102–110 s`."""
+    """Format segments, e.g. `83–95, 102–110 s`."""
     if not segments:
-        return "at no certain time"
+        return "no definite time"
     words = ", ".join(f"{start:.0f}–{stop:.0f}" for start, stop in segments[:_MOST]) + " s"
     more = len(segments) - _MOST
     return f"{words} and {more} more" if more > 0 else words
 
 
 def runs(t: np.ndarray, held: np.ndarray) -> list[tuple[float, float]]:
-    """Return first and last time of every stretch of true rows, (n,) bool."""
+    """Return first and last time of every run of true rows, (n,) bool."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(int)))
     return [(float(t[i]), float(t[j - 1])) for i, j in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def span(series: Series) -> tuple[float, float]:
-    """Return the limits of the axis of time [s]."""
+    """Return the limits of the time axis [s]."""
     return (float(series.t[0]), max(float(series.t[-1]), float(series.t[0]) + 1.0)) if len(series.t) else (0.0, 1.0)
 
 
 def empty(ax: Any, words: str) -> None:
-    """Say in a panel why there is nothing in it."""
+    """Show in a panel why it is empty."""
     ax.text(0.5, 0.5, words, ha="center", va="center", transform=ax.transAxes, fontsize=9, color=MUTED)

@@ -1,4 +1,4 @@
-"""One self-contained page a flight, for people: what was found in every flight, how it shows, what else it may be."""
+"""Write a self-contained HTML page per flight: findings, evidence, figures and rivals."""
 
 import base64
 from collections.abc import Iterator, Sequence
@@ -11,7 +11,7 @@ from twin_worker.diagnosis.inference.report import Finding, Outcome, Report
 from twin_worker.diagnosis.output.figures import draw, stems
 from twin_worker.diagnosis.output.marks import MEANING, SAID, times
 
-_UNITS = {  # the last letters of a number's name; the first that fits
+_UNITS = {  # suffix of a parameter name -> unit; the first match counts
     "mps_per_100m": "m/s per 100 m",
     "_per_100s": "per 100 s",
     "_per_rad": "1/rad",
@@ -25,19 +25,19 @@ _UNITS = {  # the last letters of a number's name; the first that fits
     "_s": "s",
 }
 _CAPTIONS = (
-    "Where: the path from above and the height over time, what was located in colour",
-    "How it shows: residuals before and after",
-    "Proof: measured against simulated; shaded blocks were held out of the fit",
-    "Candidates: what each would gain, and what cannot be told from the chosen",
+    "Location: path from above and height over time, located segments in colour",
+    "Signature: residuals before and after",
+    "Evidence: measured against simulated force; shaded blocks were held out of the fit",
+    "Candidates: gain of each, and those not separable from the selected",
 )
 
 
 def write(reports: Sequence[Report], folder: Path) -> Path:
-    """Write a page for every flight with its figures inside, and an overview of several; return what to open first.
+    """Write a page with figures for every flight, and an overview of several; return the page to open first.
 
     Args:
-        reports: one for each flight, in the order they shall appear
-        folder: made where it is missing; the figures stand in it too
+        reports: one per flight, in display order
+        folder: created if missing; also contains the figure files
     """
     folder.mkdir(parents=True, exist_ok=True)
     _, *names = stems(["index", *(report.flight for report in reports)])
@@ -53,13 +53,13 @@ def write(reports: Sequence[Report], folder: Path) -> Path:
 
 
 def _overview(title: str, reports: Sequence[Report], names: Sequence[str]) -> str:
-    """Tabulate every flight with its sentence."""
+    """Return a table of all flights with their summary sentences."""
     rows = "".join(
         f'<tr><td>{_chip(one.outcome)}</td><td><a href="{name}.html">{safe(one.flight)}</a></td>'
         f'<td>{safe(one.sentence)}</td><td class="num">{_change(one.fit_before, one.fit_after)}</td></tr>'
         for name, one in zip(names, reports, strict=True)
     )
-    head = "<tr><th>outcome</th><th>flight</th><th>in a sentence</th><th class='num'>held-out residual</th></tr>"
+    head = "<tr><th>outcome</th><th>flight</th><th>summary</th><th class='num'>held-out residual</th></tr>"
     return f'<h1>{title}</h1>\n<table class="all">{head}{rows}</table>'
 
 
@@ -77,7 +77,7 @@ def _section(report: Report, figures: Sequence[Path]) -> str:
 
 
 def _cards(report: Report) -> str:
-    """Say what the proof is: errors on data held out, before and after."""
+    """Return cards with the errors on held-out data, before and after."""
     told = {
         "residual on held-out blocks, whitened rms": _change(report.fit_before, report.fit_after),
         "simulated specific force on held-out blocks, rms error [m/s²]": _change(
@@ -90,7 +90,7 @@ def _cards(report: Report) -> str:
 
 
 def _finding(one: Finding) -> str:
-    """Describe one effect: numbers, where and when, what it cannot be told from."""
+    """Return the section of one effect: parameters, location, time, rivals."""
     effect = one.guess.effect
     where = ", ".join(filter(None, (one.channel, one.surface)))
     rows = "".join(
@@ -99,8 +99,8 @@ def _finding(one: Finding) -> str:
         for name, value in one.told.items()
     )
     rivals = "".join(_rival(name, apart, effect) for name, apart in zip(one.rivals, one.apart, strict=True))
-    apart = f"<p>Cannot be told from:</p><ul>{rivals}</ul>" if rivals else "<p>Told apart from every other effect.</p>"
-    held = f"{100 * one.held:.0f} % of its gain shows on held-out data too; gain" if one.held else "Gain"
+    apart = f"<p>Not separable from:</p><ul>{rivals}</ul>" if rivals else "<p>Separable from every other effect.</p>"
+    held = f"{100 * one.held:.0f} % of its gain is present on held-out data; gain" if one.held else "Gain"
     return (
         f"<h3>{safe(one.guess.label)}</h3><p><code>{safe(effect.equation)}</code></p>"
         f"<p>Where: {safe(where)}. When: {times(one.segments)}. "
@@ -111,18 +111,18 @@ def _finding(one: Finding) -> str:
 
 
 def _rival(name: str, apart: str, effect: Effect) -> str:
-    """Name a rival, what tells it apart where the effect knows, and what to fly."""
+    """Return one rival with the known difference and the manoeuvre that separates it."""
     known = effect.confused.get(name)
-    words = ". ".join(filter(None, (known, f"To tell them apart: {apart}")))
+    words = ". ".join(filter(None, (known, f"To separate them: {apart}")))
     return f'<li><b>{safe(name)}</b> <span class="soft">{safe(words)}.</span></li>'
 
 
 def _unknown(report: Report) -> str:
-    """Say where something unknown lives, and the term that describes it."""
+    """Return the section of an unknown mismatch: location, time, free-form term."""
     if report.outcome is not Outcome.UNKNOWN:
         return ""
     channel, segments = report.where
-    where = safe(MEANING.get(channel, channel) or "no one channel")
+    where = safe(MEANING.get(channel, channel) or "no single channel")
     said = f"<h3>Unknown</h3><p>Where: {where}. When: {times(segments)}.</p>"
     if not report.terms:
         return said
@@ -131,13 +131,13 @@ def _unknown(report: Report) -> str:
         for term, coefficient in report.terms.items()
     )
     head = '<tr><th>term</th><th class="num">coefficient</th></tr>'
-    words = "A free-form term that fits it. It is no physics: it describes, it does not explain."
+    words = "Sparse free-form fit of the residual, without physical meaning."
     return f"{said}<p>{words}</p><table>{head}{rows}</table>"
 
 
 def _lacks(report: Report) -> str:
     items = "".join(f"<li>{safe(words)}</li>" for words in report.lacks)
-    return f"<h3>What was lacking</h3><ul>{items}</ul>" if items else ""
+    return f"<h3>Limitations</h3><ul>{items}</ul>" if items else ""
 
 
 def _figures(report: Report, figures: Sequence[Path]) -> Iterator[str]:
@@ -150,7 +150,7 @@ def _figures(report: Report, figures: Sequence[Path]) -> Iterator[str]:
 
 
 def amount(value: float, sigma: float) -> str:
-    """Write a value and its standard deviation, both to the second digit of the latter."""
+    """Format a value and its standard deviation, both to the second digit of the latter."""
     if not isfinite(value):
         return "not known"
     if not (isfinite(sigma) and sigma > 0.0):
@@ -160,14 +160,14 @@ def amount(value: float, sigma: float) -> str:
 
 
 def unit(name: str, effect: Effect) -> str:
-    """Return the unit of a number: its name's suffix, or what the effect says of a parameter of that name."""
+    """Return the unit of a value, from the suffix of its name or from the effect parameter of that name."""
     suffix = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
     own = next((p.unit for p in effect.parameters if p.name == name), "")
     return suffix or own.removeprefix("-") or "–"
 
 
 def _change(before: float, after: float) -> str:
-    """Write before → after and the share gone; nothing where nothing is known."""
+    """Format before → after and the relative change; empty if unknown."""
     if not (isfinite(before) and isfinite(after)):
         return f"{before:.2f}" if isfinite(before) else ""
     share = f" ({100 * (after / before - 1):+.0f} %)".replace("-", "−") if before > 0.0 else ""

@@ -1,4 +1,4 @@
-"""Pictures over time: residuals before and after, and measured against simulated specific force."""
+"""Figures over time: residuals before and after, and measured against simulated specific force."""
 
 from typing import Any
 
@@ -13,8 +13,8 @@ from twin_worker.diagnosis.output.marks import AFTER, BEFORE, LEGEND, MEANING, e
 from twin_worker.numerics.plot_style import house
 
 _MOST = 8  # channels drawn
-_FEW = 4  # drawn where none differs: that there is nothing must be seen
-_NOMINAL = 2.0  # shaded: where nominal flights mostly lie [standard deviations]
+_FEW = 4  # channels drawn if none differs from its usual
+_NOMINAL = 2.0  # half width of the shaded nominal band [standard deviations]
 _FORCES = ("forward", "right", "down")
 
 
@@ -29,7 +29,7 @@ def residuals(report: Report) -> Figure:
     for ax in panels[len(names) :]:
         ax.set_visible(False)
     for ax in panels[max(len(names) - 2, 0) : len(names)]:
-        ax.tick_params(labelbottom=True)  # a column may end a row earlier
+        ax.tick_params(labelbottom=True)  # the right column may have one row less
         ax.set_xlabel("time [s]", fontsize=9, color=INK)
     if names:
         panels[0].set_xlim(*span(report.series))
@@ -40,7 +40,7 @@ def residuals(report: Report) -> Figure:
 
 
 def chosen(report: Report) -> tuple[list[str], str]:
-    """Choose the channels to draw, worst first, and say how many are at their usual, and how many without data."""
+    """Return the channels to draw, worst first, and a title that counts nominal channels and those without data."""
     ratio = {name: report.ratio_before.get(name, np.nan) for name in CHANNELS}
     known = [name for name in CHANNELS if np.isfinite(ratio[name]) and np.isfinite(_trusted(report, name)[0]).any()]
     worst = sorted(known, key=lambda name: -ratio[name])
@@ -56,7 +56,7 @@ def chosen(report: Report) -> tuple[list[str], str]:
 
 
 def _trusted(report: Report, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return a channel before and after, nan where rows are not trusted, (n,) each."""
+    """Return a channel before and after, nan on invalid rows, (n,) each."""
     series, c = report.series, CHANNELS.index(name)
     before, after = (np.where(series.ok, x[:, c], np.nan) for x in (series.before, series.after))
     return before, after
@@ -74,19 +74,19 @@ def _residual(ax: Any, report: Report, name: str) -> None:
     for mark in marks(report):
         for k, onset in enumerate(mark.begins(span(report.series))):
             ax.axvline(onset, color=mark.colour, lw=1.6, ls="--", label=None if k else f"begins: {mark.name}")
-    # a few peaks may leave the picture, what lasts may not
+    # short peaks may exceed the axis, lasting deviations may not
     most = np.nanpercentile(np.abs(np.concatenate([before, after if report.findings else before])), 99.7)
     ax.set_ylim(-max(1.15 * most, 2.0 * _NOMINAL), max(1.15 * most, 2.0 * _NOMINAL))
     house(ax, f"{said} × the usual mean square")
 
 
 def simulated(report: Report) -> Figure:
-    """Draw measured specific force against that simulated without and with the effects; on the right a closer look."""
+    """Draw measured specific force and that simulated without and with the effects; on the right one block enlarged."""
     series = report.series
     figure = Figure(figsize=(11, 6.8), layout="constrained")
     panels = figure.subplots(3, 2, sharex="col", sharey="row", width_ratios=(2.6, 1), squeeze=False)
     near = _usual(report)
-    closer = "one held-out block" + (", that of median gain" if report.findings else "") if near else "nothing held out"
+    closer = "one held-out block" + (", of median gain" if report.findings else "") if near else "no held-out block"
     for i, pair in enumerate(panels):
         for ax, width in zip(pair, (0.8, 1.6), strict=True):
             _force(ax, report, i, width)
@@ -102,7 +102,7 @@ def simulated(report: Report) -> Figure:
 
 
 def _rms(report: Report) -> str:
-    """Say the error on held-out blocks."""
+    """Return the rms error on held-out blocks as text."""
     if not np.isfinite(report.force_before):
         return "measured against simulated"
     said = f"rms error of the simulation on held-out blocks {report.force_before:.2f}"
@@ -131,7 +131,7 @@ def _force(ax: Any, report: Report, i: int, width: float) -> None:
 
 
 def _usual(report: Report) -> tuple[float, float] | None:
-    """Pick the held-out block of median gain among those where something was located: neither best nor worst."""
+    """Return the held-out block of median gain among those with located segments."""
     series, found = report.series, marks(report)
     located = np.any([mark.rows(series.t) for mark in found], axis=0) if found else series.ok
     located = located if located.any() else series.ok

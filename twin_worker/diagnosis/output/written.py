@@ -1,4 +1,4 @@
-"""Diagnoses as JSON, one object a flight, with what the accelerometer should have read as a file beside it."""
+"""Write diagnoses as JSON, one object per flight, and the predicted specific force as `.npz` files."""
 
 import json
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ _VERDICT = {Outcome.SUSPECTED: "none"}
 
 
 def write(reports: Sequence[Report], path: Path) -> None:
-    """Write the reports, and `<path>-<flight>.npz` for each that names something: t, f_base, f_model."""
+    """Write the reports, and for each named outcome `<path>-<flight>.npz` with t, f_base, f_model."""
     path.write_text(json.dumps([as_json(report, _told(report, path)) for report in reports], indent=1) + "\n")
 
 
 def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
-    """Return one report as plain values; suspicion is no name: verdict `none`, and candidates under `suspects`."""
+    """Return one report as plain values; a suspected outcome has verdict `none` and its effects under `suspects`."""
     named = report.findings if report.outcome is Outcome.NAMED else ()
     located = [_located(one.channel, one.surface, one.segments) for one in named]
     if report.outcome is Outcome.UNKNOWN:
@@ -53,7 +53,7 @@ def as_json(report: Report, predictions: Path | None = None) -> dict[str, Any]:
 
 
 def safe(name: str) -> str:
-    """Make a flight's name one of a file."""
+    """Convert a flight name to a safe file name."""
     return "".join(c if c.isalnum() or c in "-_" else "_" for c in name)[:80] or "flight"
 
 

@@ -1,4 +1,4 @@
-"""What a channel would gain if its equation were another one since some instant: every term let go, or one alone."""
+"""Test each channel for a changed equation: gain of freeing all its coefficients, or one, from an onset on."""
 
 from collections.abc import Iterator
 from copy import copy
@@ -14,25 +14,25 @@ from twin_worker.diagnosis.model import equations as eq
 from twin_worker.diagnosis.model.baseline import CHANNELS, SHOWN_BY
 from twin_worker.diagnosis.model.residual import Terms
 
-_AIR_LAG_S = 4.0  # of a pressure line that is partly blocked
-_APART_S = 25.0  # least of what is compared, before and after
-_NOBODYS = {  # terms no effect of the catalogue stands for: damping, stability, a crossed surface, loads that run about
+_AIR_LAG_S = 4.0  # time constant of a partly blocked pressure line
+_APART_S = 25.0  # least length of data before and after the onset
+_NOBODYS = {  # terms without an effect: damping, stability, cross-coupled surface, moving loads
     "L": ("beta", "p", "r", "delta_r"),
     "M": ("q", "c_x"),
     "N": ("beta", "p", "r", "delta_a"),
 }
-_SLOW, _RATE = "lagging", "rate"  # and of sensors: an airspeed that comes late, a gyro that reads a share too much
+_SLOW, _RATE = "lagging", "rate"  # sensor terms: delayed airspeed, gyro scale error
 Gain = tuple[float, float]
-"""Gain beyond its price, and since when [s]."""
+"""Gain less the parameter cost, and onset [s]."""
 
 
 class Equation:
-    """One channel's whitened terms.
+    """Whitened regressors of one channel.
 
     Args:
-        sight: what is left of the flight
+        whitened: residuals of the flight
         channel: one of `CHANNELS`
-        terms: name -> course, (n,)
+        terms: name -> time series, (n,)
     """
 
     def __init__(self, sight: Sight, channel: str, terms: dict[str, np.ndarray]) -> None:
@@ -42,19 +42,19 @@ class Equation:
         laid[:, c] = np.transpose(list(terms.values()))
         white = sight.noise.whiten(laid)[:, c] * sight.ok[:, None]
         self._J = (white / (np.linalg.norm(white, axis=0) + 1e-12))[:, None, :]
-        self._sight = copy(sight)  # of this channel alone, but what the others say of the nuisances is kept
+        self._sight = copy(sight)  # this channel alone; the nuisance information of the other channels stays
         self._sight.e, self._sight.Jn = sight.e[:, [c]], sight.Jn[:, [c]]
 
     def all_of_it(self) -> Gain:
-        """Let every term go since the best instant."""
+        """Return the gain of freeing all terms from the best onset."""
         return _since(self._sight, self._J)
 
     def in_flight(self) -> Gain:
-        """Let every term go throughout, and tell what more it gains to change: no calibration need be trusted."""
+        """Return the gain of a step at the best onset with all terms free throughout, whatever the calibration."""
         return _since(_freed(self._sight, self._J), self._J, _APART_S)
 
     def one_by_one(self) -> Iterator[tuple[str, Gain]]:
-        """Let those terms go alone that no effect stands for."""
+        """Yield the gain of freeing each single term that has no effect in the catalogue."""
         equation = next((name for name, channel in SHOWN_BY.items() if channel == self.channel), "")
         for k, name in enumerate(self.names):
             if name in (*_NOBODYS.get(equation, ()), _SLOW, _RATE):
@@ -62,7 +62,7 @@ class Equation:
 
 
 def equations_of(sight: Sight) -> Iterator[Equation]:
-    """Return every channel that was calibrated well enough, with the terms it may change by."""
+    """Yield every sufficiently calibrated channel with the terms that may change."""
     made = sight.case.terms(sight.granted)
     for equation, channel in SHOWN_BY.items():
         if sight.base.r2.get(equation, 1.0) > WELL:
@@ -78,7 +78,7 @@ def equations_of(sight: Sight) -> Iterator[Equation]:
 
 
 def _since(sight: Sight, J: np.ndarray, apart_s: float = 0.0) -> Gain:
-    """Return what terms, (n, 1, k), gain since their best instant, so far from the ends [s]."""
+    """Return gain and onset of a step in terms, (n, 1, k), at least `margin_s` from both ends [s]."""
     t = sight.case.t
     rows, whens = gates_of(t, Onset.STEP)
     gain, _ = solved(sight, *normals(sight, J, rows, Onset.STEP))
@@ -88,7 +88,7 @@ def _since(sight: Sight, J: np.ndarray, apart_s: float = 0.0) -> Gain:
 
 
 def _freed(sight: Sight, J: np.ndarray) -> Sight:
-    """Return the same with terms, (n, 1, k), free throughout the flight, as nuisances are."""
+    """Return a copy with terms, (n, 1, k), added to the nuisances, free throughout the flight."""
     out = copy(sight)
     out.Jn = np.concatenate([sight.Jn, J], axis=2)
     between = np.einsum("tci,tcj->ij", sight.Jn, J)
@@ -99,14 +99,14 @@ def _freed(sight: Sight, J: np.ndarray) -> Sight:
 
 
 def _more(channel: str, made: Terms) -> dict[str, np.ndarray]:
-    """Return what a channel may feel that no wing does: thrust, and loads that shift with the force on them."""
+    """Return non-aerodynamic terms of a channel: thrust, and loads that shift under specific force."""
     f_x, f_y, _ = made.aside["f"]
     more = {"force_x": {"thrust": made.terms["T"][0]}, "roll": {"f_y": f_y}, "pitch": {"f_x": f_x}}
     return more.get(channel, {})
 
 
 def _lagged(x: np.ndarray, tau: float) -> np.ndarray:
-    """Return x, (n,), behind a first-order lag [s]."""
+    """Filter x, (n,), by a first-order lag of time constant tau [s]."""
     kept = np.exp(-STEP_S / tau)
     out: np.ndarray = lfilter([1.0 - kept], [1.0, -kept], x, zi=[kept * x[0]])[0]
     return out

@@ -1,4 +1,4 @@
-"""Try every effect, on everything it may befall, since every onset, in one pass over one whitened Jacobian each."""
+"""Scan all effects, targets and onsets; one whitened Jacobian per effect and target serves all onsets."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,36 +10,36 @@ from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, Guess, When
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
 from twin_worker.diagnosis.model.baseline import Baseline
 
-PRICE = 9.0  # what a parameter must gain to be worth having [-]
-WELL = 0.6  # share of variance from which an equation counts as calibrated
+PRICE = 9.0  # gain that each parameter must add [-]
+WELL = 0.6  # share of variance explained from which an equation counts as calibrated
 _SURFACE = {"aileron": "L", "elevator": "M", "rudder": "N"}
 _SHOWS_IN = {"roll": "L", "pitch": "M", "yaw": "N", "thrust": "X", "drag": "X", "lift": "alpha"}
-_EDGE_S = 15.0, 20.0  # no onset is sought nearer to the start and the end [s]
-_EVERY = 5  # rows between two onsets tried, where no jump can be met to the row
+_EDGE_S = 15.0, 20.0  # no onset closer to the start and the end of the flight [s]
+_EVERY = 5  # rows between two tested onsets, unless the onset is resolved to the row
 _RAMPS_S = (20.0, 40.0, 60.0, 90.0, 130.0)
 _BUMPS_S = (3.0, 5.0, 8.0, 14.0, 25.0, 45.0)
 
 
 @dataclass(frozen=True)
 class Found:
-    """A guess and what it gains: drop of the whitened sum of squares."""
+    """A hypothesis and its gain: decrease of the whitened sum of squares."""
 
     gain: float
     guess: Guess
 
     @property
     def kind(self) -> str:
-        """Name guess and kind of onset."""
+        """Return `label|onset kind`, the key of `Baseline.chance`."""
         return f"{self.guess.label}|{self.guess.when.kind}"
 
     @property
     def worth(self) -> float:
-        """Return the gain less the price of its numbers."""
+        """Return the gain less the cost of its parameters."""
         return self.gain - PRICE * self.guess.size
 
 
 def scan(sight: Sight) -> list[Found]:
-    """Return for every effect, object and kind of onset the best found, best first."""
+    """Return the best hypothesis of every effect, target and kind of onset, best first."""
     out = []
     for effect, of in candidates(sight):
         out += _by_start(sight, effect, of) if effect.starts else _by_slope(sight, effect, of)
@@ -47,7 +47,7 @@ def scan(sight: Sight) -> list[Found]:
 
 
 def candidates(sight: Sight) -> Iterator[tuple[Effect, str]]:
-    """Return every effect and what it may befall that this calibration can judge; those of the scatter left out."""
+    """Yield every effect and target that the calibration covers, except effects on the variance alone."""
     for effect in catalogue().values():
         if not effect.variance:
             for of in effect.of or ("",):
@@ -56,9 +56,9 @@ def candidates(sight: Sight) -> Iterator[tuple[Effect, str]]:
 
 
 def covered(base: Baseline, effect: Effect, of: str) -> bool:
-    """Return whether the equation an effect shows in was calibrated well enough to judge it."""
+    """Return whether the equation that an effect acts on is sufficiently calibrated."""
     if effect.channel in ("gyro", "imu"):
-        return base.vane  # an estimator's rates and velocity have lost the fault
+        return base.vane  # an estimator's rates and velocity no longer contain the fault
     equation = _SURFACE.get(of) or _SHOWS_IN.get(effect.channel)
     return equation is None or base.r2.get(equation, 1.0) > WELL
 
@@ -72,7 +72,9 @@ def _by_slope(sight: Sight, effect: Effect, of: str) -> list[Found]:
     if not (scale > 1e-9).all():
         return []
     J = J / scale
-    sharp = sight.base.vane and Onset.STEP in effect.onsets  # a force taken from the velocity knows no first rows
+    sharp = (
+        sight.base.vane and Onset.STEP in effect.onsets
+    )  # a force derived from the velocity does not resolve the first rows
     jumps = sight.begun(plain) / scale if sharp else None
     out = []
     for kind in effect.onsets:
@@ -89,7 +91,7 @@ def _by_slope(sight: Sight, effect: Effect, of: str) -> list[Found]:
 
 
 def gates_of(t: np.ndarray, kind: Onset, every: int = _EVERY) -> tuple[np.ndarray, list[When]]:
-    """Return the courses to try: gates (m, n), and what they are; for steps, gates hold rows (m,), `every` so many."""
+    """Return the gates (m, n) to test and their onset profiles; for steps, rows (m,), `stride` apart, replace gates."""
     first, last = t[0] + _EDGE_S[0], t[-1] - _EDGE_S[1]
     if kind is Onset.ALWAYS:
         return np.ones((1, len(t))), [ALWAYS]
@@ -106,7 +108,7 @@ def gates_of(t: np.ndarray, kind: Onset, every: int = _EVERY) -> tuple[np.ndarra
 
 
 def normals(sight: Sight, J: np.ndarray, gates: np.ndarray, kind: Onset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sum the normal equations of slopes J, (n, c, k), over each course: (m, k, k), (m, k), (m, k, nuisances)."""
+    """Sum the normal equations of slopes J, (n, c, k), per onset: (m, k, k), (m, k), (m, k, nuisances)."""
     A = np.einsum("tci,tcj->tij", J, J)
     b = -np.einsum("tci,tc->ti", J, sight.e)
     C = np.einsum("tci,tcj->tij", J, sight.Jn)
@@ -120,7 +122,7 @@ def normals(sight: Sight, J: np.ndarray, gates: np.ndarray, kind: Onset) -> tupl
 def _begun(
     sight: Sight, J: np.ndarray, jumps: np.ndarray, rows: np.ndarray, sums: tuple[np.ndarray, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Put a step's first two rows, (2, n, c, k), in the place of those of what was always there."""
+    """Replace the first two rows after each step by `onset_slopes`, (2, n, c, k), which start from zero."""
     A, b, C = sums
     for late, jump in enumerate(jumps):
         at = rows + late
@@ -132,7 +134,7 @@ def _begun(
 
 
 def solved(sight: Sight, A: np.ndarray, b: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gain (m,) and parameters (m, k) of each course, the nuisances free within their spread."""
+    """Solve for the gain (m,) and the parameters (m, k) of each onset, the nuisances free within their spread."""
     inverse = np.linalg.inv(sight.Ann)
     A = A - C @ inverse @ np.swapaxes(C, 1, 2)
     b = b - C @ (inverse @ sight.bn)
@@ -144,7 +146,7 @@ def solved(sight: Sight, A: np.ndarray, b: np.ndarray, C: np.ndarray) -> tuple[n
 
 
 def _by_start(sight: Sight, effect: Effect, of: str) -> list[Found]:
-    """Try the starts of an effect whose slope at zero tells nothing; steps by the sum of what each row gains."""
+    """Scan the start values of an effect without a slope at zero; a step gains the sum over the rows after it."""
     out: dict[Onset, Found] = {}
     before = (sight.e**2).sum(axis=1)
     t = sight.case.t

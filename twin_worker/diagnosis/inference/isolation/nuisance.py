@@ -1,7 +1,7 @@
-"""What differs from flight to flight without being missing physics: turn-on biases, weather, trim, small scatter.
+"""Nuisance parameters: nominal differences between flights, such as turn-on biases, weather, trim, small scatter.
 
-Each has a spread: of the sensor's specification, or learnt from nominal flights left out. Within it a difference is
-absorbed; past it the difference is handed to the hypotheses.
+Each has a spread, from the sensor specification or estimated on left-out nominal flights. Values within the spread are
+absorbed. A nuisance beyond it is fixed at zero, so that the fault hypotheses explain the difference.
 """
 
 from collections.abc import Sequence
@@ -12,13 +12,13 @@ import numpy as np
 from fleet.effects import Effect, Parameter, Stage, catalogue
 from twin_worker.diagnosis.data.fault_hypothesis import ALWAYS, Guess
 
-_SHARE = 0.03  # least scatter of a derivative without the vane [-]
-WIDEST = 4.0  # a learnt spread over its floor
-RELEASED = 2.5  # spreads past which a difference is no nuisance any more
-SOUND = 3.3  # and of a sensor's bias, which a data sheet allows for
+_SHARE = 0.03  # least spread of a derivative without a fast accelerometer [-]
+WIDEST = 4.0  # largest estimated spread over its floor
+RELEASED = 2.5  # spreads beyond which a difference is no longer a nuisance
+SOUND = 3.3  # the same for sensor biases, which data sheets specify
 
-WAVES = 3  # slow courses a wandering nuisance may take
-_WANDERS = {  # what sensors and weather do not keep to during a flight: effect -> floor over that of its mean
+WAVES = 3  # cosine harmonics of a slow drift
+_WANDERS = {  # drift during a flight: effect -> floor of the drift over the floor of the mean
     "accel_bias": 0.4,
     "gyro_bias": 0.3,
     "heading_bias": 0.25,
@@ -52,13 +52,13 @@ DENSITY = replace(SCATTER, stage=Stage.AIR)
 
 @dataclass(frozen=True)
 class Nuisance:
-    """One number that may differ.
+    """One nuisance parameter.
 
     Attributes:
-        name: for the spreads
-        effect, of, index: what it is a parameter of
+        name: key of `Baseline.spread`
+        effect, of, index: effect, target and index of the parameter
         floor: least spread
-        step: for slopes
+        step: step for finite differences
     """
 
     name: str
@@ -69,40 +69,40 @@ class Nuisance:
     step: float
 
     def guess(self, x: float) -> Guess:
-        """Return it at work."""
+        """Return the effect with this parameter at x and the others at zero."""
         par = [0.0] * self.effect.size
         par[self.index] = x
         return Guess(self.effect, self.of, tuple(par), ALWAYS)
 
     @property
     def sensor(self) -> bool:
-        """Return whether it is a sensor's bias."""
+        """Return whether this is a sensor bias."""
         return self.effect.name in ("accel_bias", "gyro_bias", "heading_bias", "imu_misalignment")
 
     @property
     def released(self) -> float:
-        """Return the spreads past which it is no nuisance any more."""
+        """Return the number of spreads beyond which this is no longer a nuisance."""
         return SOUND if self.sensor else RELEASED
 
     @property
     def scatter(self) -> bool:
-        """Return whether no effect stands for it, so that it can be handed to none."""
+        """Return whether no effect in the catalogue can explain this difference, so that it stays a nuisance."""
         return self.of == "side" or self.name in ("baro", "lapse")
 
     @property
     def weather(self) -> bool:
-        """Return whether this is weather, of which any amount may be nominal."""
+        """Return whether this is wind, of which any amount may be nominal."""
         return self.effect.name in ("wind_steady", "wind_shear")
 
 
 @dataclass(frozen=True)
 class Wander:
-    """One nuisance's slow course: so many half waves of a cosine over the flight.
+    """Slow drift of one nuisance: a cosine with some half waves over the flight.
 
     Attributes:
-        name: for the spreads
-        of: index of the nuisance that wanders
-        wave: number of half waves
+        name: key of `Baseline.spread`
+        nuisance_index: index of the nuisance that drifts
+        half_waves: number of half waves
         floor: least spread
     """
 
@@ -113,7 +113,7 @@ class Wander:
 
 
 def wanders(known: Sequence[Nuisance], vane: bool) -> tuple[Wander, ...]:
-    """List the slow courses of those that wander; without the vane noise covers them."""
+    """List the drift modes of all drifting nuisances; none without a fast accelerometer, where noise covers them."""
     return tuple(
         Wander(f"{n.name}~{wave}", k, wave, _WANDERS[n.effect.name] * n.floor)
         for k, n in enumerate(known)
@@ -124,14 +124,14 @@ def wanders(known: Sequence[Nuisance], vane: bool) -> tuple[Wander, ...]:
 
 
 def wandering(columns: np.ndarray, several: Sequence[Wander], t: np.ndarray) -> np.ndarray:
-    """Return the slopes of slow courses, (n, c, wanders), by those of what wanders, (n, c, nuisances), at t (n,)."""
+    """Return the slopes of drift modes, (n, c, modes), from those of the nuisances, (n, c, nuisances), at t (n,)."""
     share = (t - t[0]) / max(t[-1] - t[0], 1e-9)
     waves = np.sqrt(2.0) * np.cos(np.pi * np.outer(share, [one.wave for one in several]))
     return columns[:, :, [one.of for one in several]] * waves[:, None, :]
 
 
 def nuisances(vane: bool) -> tuple[Nuisance, ...]:
-    """List them all; without the vane derivatives scatter too, for they are known less well."""
+    """List all nuisances; without a fast accelerometer also the less accurate derivatives."""
     known = catalogue()
     out = []
 

@@ -1,4 +1,4 @@
-"""Fit one guess properly: Gauss-Newton on its parameters, its onset by halving steps."""
+"""Refine one hypothesis: Gauss-Newton for the parameters, a search with halved steps for the onset."""
 
 import numpy as np
 
@@ -10,13 +10,14 @@ from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
 _ROUNDS = 5
 _ENOUGH = 0.5  # gain below which fitting stops
 _MOVES_S = (8.0, 4.0, 2.0, 1.0, 0.5, 0.2)
-_NEAR_S, _NEARER_S = np.arange(-2.0, 2.1, 0.2), np.arange(-0.16, 0.17, 0.04)  # a sensor's jump is sought
-_TURNS = {Onset.BUMP: 3}  # of moving and fitting: a bump sought beside its place is fitted too small at first
+# search steps for the onset of a sensor jump
+_NEAR_S, _NEARER_S = np.arange(-2.0, 2.1, 0.2), np.arange(-0.16, 0.17, 0.04)
+_TURNS = {Onset.BUMP: 3}  # rounds of onset search and fit: a misplaced bump is fitted too small at first
 _STRETCH = (1.5, 1.2, 1.1)
 
 
 def refine(sight: Sight, guess: Guess, rounds: int = _ROUNDS, move: bool = True) -> Found:
-    """Return the guess fitted, and its gain; `move` its onset too."""
+    """Return the fitted hypothesis with its gain; `move_onset` also fits its onset."""
     before = sight.cost(())
     now = sight.cost((guess,))
     if now > before:
@@ -48,12 +49,12 @@ def _newton(sight: Sight, guess: Guess, now: float, rounds: int) -> tuple[Guess,
 
 
 def steps(guess: Guess) -> np.ndarray:
-    """Return steps for slopes about a guess, (k,)."""
+    """Return finite-difference steps at a hypothesis, (k,)."""
     return np.array([0.3 * max(p.step, 0.1 * abs(x)) for p, x in zip(guess.effect.parameters, guess.par, strict=True)])
 
 
 def normal(sight: Sight, guess: Guess) -> tuple[np.ndarray, np.ndarray]:
-    """Return the normal equations about a guess, nuisances profiled out, (k, k) and (k,)."""
+    """Return the normal equations at a hypothesis, nuisances profiled out, (k, k) and (k,)."""
     J = sight.slopes(guess, steps(guess))
     e = sight.clipped((guess,))
     C = np.einsum("tci,tcj->ij", J, sight.Jn)
@@ -64,7 +65,7 @@ def normal(sight: Sight, guess: Guess) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _jump(sight: Sight, guess: Guess, now: float) -> tuple[Guess, float]:
-    """Search a sensor's jump around a guess: its slope shows only where it is met to the sample."""
+    """Search the onset of a sensor jump on a fine grid: its slope is visible only at the exact sample."""
     for moves in (_NEAR_S, _NEARER_S):
         trials = [guess.at(np.array(guess.par), guess.when.moved(dt)) for dt in moves]
         costs = [sight.cost((trial,)) for trial in trials]
@@ -75,7 +76,7 @@ def _jump(sight: Sight, guess: Guess, now: float) -> tuple[Guess, float]:
 
 
 def _onset(sight: Sight, guess: Guess, now: float) -> tuple[Guess, float]:
-    """Move the onset, and stretch the duration, while that gains."""
+    """Shift the onset and scale the duration while the cost decreases."""
     if guess.when.kind is Onset.ALWAYS:
         return guess, now
     best = guess

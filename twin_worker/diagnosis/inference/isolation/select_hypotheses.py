@@ -1,4 +1,4 @@
-"""Name what explains a flight: up to three effects, chosen beside each other, each with what it is not told from."""
+"""Select up to three effects that jointly explain a flight, each with its inseparable rivals."""
 
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -13,21 +13,20 @@ from twin_worker.diagnosis.inference.isolation.refine import refine
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
 from twin_worker.diagnosis.model.baseline import CHANNELS
 
-MOST = 3  # effects named together
-_TRIED = 12  # guesses fitted properly at each step
-_LEAST, _LEAST_COARSE = 150.0, 400.0  # gain of a first effect, by the accelerometer and without
-_CANCEL = 1.5  # an effect that gains this much more beside the others than all together undoes one of them
-_SECOND = 250.0  # and of every further one
-_NEAR = 0.6  # of the best one's worth, from which an onset is worth a search
-_CHANCE, _CHANCE_COARSE = 1.5, 1.2  # over what nominal flights reach by chance
-_SHARE, _SHARE_COARSE = 0.03, 0.25  # of what others gain in a channel that may be their error; of the first one's gain
-_OWN = 0.1  # share of a gain that must be of numbers which count
-_NEXT = 0.02  # tie of which the simpler is chosen
-_FINE, _COARSE = (
-    0.06,
-    0.15,
-)  # and of what is not told apart: by the accelerometer; by plain telemetry, whose baseline is wrong by about as much
-_GUSTS = 1.2, 1.5  # of the air channels' scatter over the usual: least, median
+MOST = 3  # effects per flight
+_TRIED = 12  # hypotheses refined per step
+_LEAST, _LEAST_COARSE = 150.0, 400.0  # least gain of the first effect, with and without fast accelerometer
+_CANCEL = 1.5  # limit of the relative contribution above which effects cancel each other
+_SECOND = 250.0  # least gain of every further effect
+_NEAR = 0.6  # share of the best score from which the onset is refined
+_CHANCE, _CHANCE_COARSE = 1.5, 1.2  # multiple of the gain that nominal flights reach by chance
+# share of the other effects' gain per channel that counts as their error; least share of the first effect's gain
+_SHARE, _SHARE_COARSE = 0.03, 0.25
+_OWN = 0.1  # least share of the gain without nuisances
+_NEXT = 0.02  # score tie within which the simpler hypothesis wins
+# score tie within which hypotheses are inseparable: with fast accelerometer; without, where model errors are larger
+_FINE, _COARSE = 0.06, 0.15
+_GUSTS = 1.2, 1.5  # variance ratio of the air channels: least, median
 _LEAST_TIE, _WIDEST_TIE = 20.0, 300.0
 
 Say = Callable[[str], None]
@@ -35,11 +34,11 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Named:
-    """One effect found.
+    """One selected effect.
 
     Attributes:
-        found: the guess and its gain
-        rivals: guesses that explain as much, best first
+        scored: the hypothesis and its gain
+        rivals: hypotheses with equal explanatory power, best first
     """
 
     found: Found
@@ -47,12 +46,12 @@ class Named:
 
 
 def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: None) -> tuple[list[Named], list[Found]]:
-    """Find what explains the flight, and the first ranking; what `sight` takes for granted changes.
+    """Select the effects that explain the flight; return them and the first ranking. Modifies `whitened`.
 
     Args:
-        sight: the flight with nothing but its weather granted
-        weather: granted throughout
-        say: takes words of progress
+        whitened: residuals conditioned on the weather alone
+        weather: hypotheses included throughout
+        progress: callback for progress messages
     """
     named: list[Named] = []
     ranking: list[Found] = []
@@ -76,22 +75,22 @@ def decide(sight: Sight, weather: tuple[Guess, ...], say: Say = lambda word: Non
 
 
 class Joint:
-    """What several effects gain together, all reckoned alike."""
+    """Joint gain of several effects, under the same initial conditions."""
 
     def __init__(self, sight: Sight) -> None:
         self._sight = copy(sight)
         self._none, self._bare = self._sight.cost(()), self._sight.powers(())
 
     def gain(self, named: list[Named]) -> float:
-        """Return the gain of all."""
+        """Return the joint gain."""
         return self._none - self._sight.cost([one.found.guess for one in named])
 
     def borne(self, named: list[Named]) -> np.ndarray:
-        """Return what all gain by channel, (c,)."""
+        """Return the joint gain by channel, (c,)."""
         return self._bare - self._sight.powers([one.found.guess for one in named])
 
     def better(self, more: list[Named], fewer: list[Named]) -> bool:
-        """Return whether one more is worth it: together they gain enough, and do not merely cancel each other."""
+        """Return whether a further effect adds enough gain, without effects that cancel each other."""
         gain = self.gain(more)
         without = min(self.gain([one for one in more if one is not left]) for left in more)
         cancelling = gain - without > _CANCEL * gain
@@ -101,12 +100,12 @@ class Joint:
 
 
 class Beside:
-    """What a further guess must gain beside those named.
+    """Test whether a further hypothesis adds enough gain to the selected effects.
 
     Args:
-        sight: with the named granted
-        named: so far
-        borne: what they gain by channel, (c,)
+        whitened: residuals conditioned on the selected effects
+        named: effects selected so far
+        channel_gain: their joint gain by channel, (c,)
     """
 
     def __init__(self, sight: Sight, named: list[Named], borne: np.ndarray) -> None:
@@ -114,7 +113,7 @@ class Beside:
         self._before = sight.powers(())
 
     def earned(self, found: Found) -> bool:
-        """Return whether a guess gains what it must, and where the named are not merely wrong."""
+        """Return whether a hypothesis exceeds the required gain beyond the model errors of the selected effects."""
         least = needed(self._sight, self._named, found)
         if not self._named or found.gain <= least:
             return found.gain > least
@@ -123,17 +122,17 @@ class Beside:
 
 
 def beyond(sight: Sight, own: np.ndarray, borne: np.ndarray) -> float:
-    """Return what a guess gains beyond errors of those beside it, which are a share of what they gain there.
+    """Return the gain of a hypothesis beyond the errors of the others, which are a share of their gain per channel.
 
     Args:
-        own, borne: gain of the guess and of the others by channel, (c,)
+        own, others_gain: gain of the hypothesis and of the others by channel, (c,)
     """
     share = _SHARE if sight.base.vane else 0.0
     return float(np.maximum(own - share * np.maximum(borne, 0.0), 0.0).sum())
 
 
 def best(sight: Sight, beside: Sequence[Guess]) -> list[Found]:
-    """Scan, and fit the most promising properly; best first."""
+    """Scan all hypotheses and refine the most promising; best first."""
     taken = {guess.label for guess in beside}
     tried: list[Found] = []
     for found in scan(sight):
@@ -147,28 +146,28 @@ def best(sight: Sight, beside: Sequence[Guess]) -> list[Found]:
     if not fitted:
         return []
     least = _NEAR * max(rank(sight, one) for one in fitted)
-    # a bump a little early gains next to nothing before it is moved: the scan's word counts too
+    # a slightly misplaced bump gains little before its onset is fitted: the score of the scan counts too
     near = [max(rank(sight, one), found.worth) > least for one, found in zip(fitted, tried, strict=True)]
     moved = [refine(sight, one.guess) if good else one for one, good in zip(fitted, near, strict=True)]
     return sorted(moved, key=lambda one: -rank(sight, one))
 
 
 def rank(sight: Sight, found: Found) -> float:
-    """Return what a guess is worth: each number beyond the first must earn its price, and its share."""
+    """Return the gain less the parameter costs; without fast accelerometer, less a share per extra parameter too."""
     extra = found.guess.effect.price - 1
     share = 0.0 if sight.base.vane else _COARSE * extra
     return found.gain * (1.0 - share) - PRICE * found.guess.size
 
 
 def tie(sight: Sight, found: Found) -> float:
-    """Return how much less another guess may be worth and still not be told apart."""
+    """Return the score difference within which two hypotheses are inseparable."""
     if not sight.base.vane:
         return max(_LEAST_TIE, _COARSE * found.gain)
     return max(_LEAST_TIE, _NEXT * found.gain, min(_FINE * found.gain, _WIDEST_TIE))
 
 
 def choose(sight: Sight, found: list[Found]) -> Named:
-    """Choose the guess of fewest numbers among the best that tie; the others are its rivals."""
+    """Select the hypothesis with the fewest parameters among the best ties; the others become its rivals."""
     first = found[0]
     near = [one for one in found if rank(sight, one) > rank(sight, first) - max(_LEAST_TIE, _NEXT * first.gain)]
     chosen = min(near, key=lambda one: (one.guess.size, -rank(sight, one)))
@@ -182,7 +181,7 @@ def choose(sight: Sight, found: list[Found]) -> Named:
 
 
 def needed(sight: Sight, named: list[Named], found: Found) -> float:
-    """Return the gain a guess must reach: more than chance, and a share of the first one's."""
+    """Return the least gain of a hypothesis, from the chance gain and a share of the first effect's gain."""
     known = sight.base.chance
     chance = _CHANCE_COARSE * known.get(found.kind, 0.0)
     if sight.base.vane:
@@ -194,13 +193,13 @@ def needed(sight: Sight, named: list[Named], found: Found) -> float:
 
 
 def _akin(kind: str, guess: Guess) -> bool:
-    """Return whether chance of this kind speaks of a guess too: the same effect, or the same surface."""
+    """Return whether a chance gain applies to a hypothesis: same effect, or same surface."""
     label = kind.partition("|")[0]
     return label == guess.label or (guess.effect.stage is Stage.DELTA and label.endswith(f":{guess.of}"))
 
 
 def believable(sight: Sight, guess: Guess) -> bool:
-    """Return whether a guess is more than data sheets allow a sensor, by numbers of its own that are not absurd."""
+    """Return whether a hypothesis exceeds sensor tolerances and minimum values, not by nuisances alone."""
     bounds = {
         n.index: n.released * max(sight.base.spread.get(n.name, n.floor), n.floor)
         for n in sight.nuisances
@@ -214,7 +213,7 @@ def believable(sight: Sight, guess: Guess) -> bool:
 
 
 def _own(sight: Sight, guess: Guess) -> float:
-    """Return the share of a guess's gain that is not of numbers that only come along."""
+    """Return the share of the gain that is due to parameters other than nuisances."""
     aside = np.array([p.aside for p in guess.effect.parameters])
     if not aside.any():
         return 1.0
@@ -224,7 +223,7 @@ def _own(sight: Sight, guess: Guess) -> float:
 
 
 def _again(sight: Sight, named: list[Named], weather: tuple[Guess, ...]) -> list[Named]:
-    """Choose each effect anew with the others granted, for the first choice was made alone."""
+    """Reselect each effect given the others, because the first selection ignored later effects."""
     for i in range(len(named)):
         others = [one.found.guess for k, one in enumerate(named) if k != i]
         sight.grant((*weather, *others))
@@ -236,7 +235,7 @@ def _again(sight: Sight, named: list[Named], weather: tuple[Guess, ...]) -> list
 
 
 def turbulent(sight: Sight) -> tuple[float, float]:
-    """Return gain and share of variance of gusts: sideslip, lift and airspeed scatter together, two sensors agree."""
+    """Return gain and variance ratio of gusts: sideslip, lift and airspeed scatter more, the sensor channels do not."""
     kept = [CHANNELS.index(name) for name in ("side", "lift", "airspeed")]
     calm = [CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z", "gyro_roll", "gyro_pitch", "gyro_yaw")]
     left = sight.left() / sight.base.usual

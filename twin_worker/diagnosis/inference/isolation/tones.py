@@ -1,6 +1,6 @@
-"""Does a channel hum: is much of what is left of it on one single frequency, as of flutter, surge or a limit cycle?
+"""Detect a single tone in the residuals of a channel, as caused by flutter, surge or a limit cycle.
 
-Noise and gusts are spread over the whole band, so that no frequency holds more than a few hundredths of them.
+Noise and gusts spread over the whole band: no frequency contains more than a few percent of their power.
 """
 
 from collections.abc import Iterator
@@ -12,13 +12,13 @@ from twin_worker.diagnosis.inference.isolation.isolate import WELL
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
 from twin_worker.diagnosis.model.baseline import CHANNELS, SHOWN_BY
 
-_BAND_HZ = 0.1, 1.45  # slower is the mission, faster is filtered away
-_FINE = 2.0  # frequencies tried for each that the length of the flight tells apart
-_BLOCKS, _AFTER = 12, 4  # starts tried; blocks that must follow
+_BAND_HZ = 0.1, 1.45  # the mission is slower, the filter removes what is faster
+_FINE = 2.0  # oversampling of the frequency resolution
+_BLOCKS, _AFTER = 12, 4  # tested starts; least blocks after a start
 
 
 class Tone(NamedTuple):
-    """Periodogram's peak over the mean power, in which channel, since when [s]; as much as rows for one pure tone."""
+    """Peak of the periodogram over the mean power, channel, onset [s]; for a pure tone the ratio is the row count."""
 
     worth: float
     channel: str
@@ -26,7 +26,7 @@ class Tone(NamedTuple):
 
 
 def tones(sight: Sight) -> Iterator[Tone]:
-    """Return each calibrated equation's clearest tone in what is left, the nuisances taken off."""
+    """Yield the strongest tone of each calibrated channel, with the nuisances profiled out."""
     t, left = sight.case.t, (sight.e + np.einsum("tck,k->tc", sight.Jn, sight.xn)) * sight.ok[:, None]
     hertz = np.arange(*_BAND_HZ, 1.0 / (_FINE * (t[-1] - t[0])))
     starts = np.linspace(0, len(t), _BLOCKS, endpoint=False).astype(int)

@@ -1,9 +1,8 @@
-"""Is anything left that no effect of the catalogue explains: has an equation itself changed, or does it hum?
+"""Detect anomalies that no effect in the catalogue explains: a changed equation or a tone.
 
-For each channel every coefficient of its equation is let go at once, and the channel's own slow and fast terms beside
-it: since any instant, and since any instant against what they were before it. A named effect that is right leaves
-nothing to gain; one that only resembles what happened leaves much. And what no effect stands for is tried against the
-names themselves: a single coefficient that explains as much as they do is the better word.
+For each channel all coefficients of its equation are freed, from any onset on, and from any onset relative to the time
+before it. A correctly named effect leaves no gain; a wrong one that only resembles the cause leaves much. Single
+coefficients without an effect in the catalogue compete with the named effects directly.
 """
 
 from collections.abc import Sequence
@@ -16,13 +15,13 @@ from twin_worker.diagnosis.model.baseline import Baseline
 
 
 class Rule(NamedTuple):
-    """When one kind of evidence counts.
+    """Thresholds of one kind of evidence.
 
     Attributes:
-        least: gain
-        chance: over what nominal flights reach by chance
-        against: so many limits, to be held against names; and
-        beside, loud: so much of what they gained, the latter where some channel stays loud
+        min_gain: least gain
+        chance_factor: multiple of the gain that nominal flights reach by chance
+        limit_factor: multiple of the limit if effects are named
+        gain_share, gain_share_high: least share of the gain of the named effects; the latter if a channel stays high
     """
 
     least: float
@@ -33,15 +32,15 @@ class Rule(NamedTuple):
 
 
 RULES = {
-    "odd": Rule(450.0, 3.0, 2.0, 0.5, 0.25),  # the whole equation is another, beside the names
-    "shift": Rule(240.0, 2.4, 1.5, 0.05, 0.05),  # it changed in flight, beside the names
-    "one": Rule(165.0, 3.0, 1.0, 0.9, 0.9),  # one coefficient changed, instead of the names
-    "tone": Rule(200.0, 2.0, 1.0, 0.0, 0.0),  # it hums, beside the names
+    "odd": Rule(450.0, 3.0, 2.0, 0.5, 0.25),  # the whole equation changed, given the named effects
+    "shift": Rule(240.0, 2.4, 1.5, 0.05, 0.05),  # the equation changed in flight, given the named effects
+    "one": Rule(165.0, 3.0, 1.0, 0.9, 0.9),  # one coefficient changed, without the named effects
+    "tone": Rule(200.0, 2.0, 1.0, 0.0, 0.0),  # a tone, given the named effects
 }
 
 
 class Odd(NamedTuple):
-    """What a changed equation would gain beyond its price, in which channel, since when [s]; or how loud it hums."""
+    """Gain of a changed equation less its cost, or power ratio of a tone, with channel, onset [s], rule and term."""
 
     worth: float
     channel: str
@@ -51,33 +50,33 @@ class Odd(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """Name it beside what nominal flights reach by chance."""
+        """Return `rule:channel:term`, the key of `Baseline.chance`."""
         return ":".join(filter(None, (self.rule, self.channel, self.term)))
 
     def limit(self, base: Baseline) -> float:
-        """Return what it must gain to be more than chance."""
+        """Return the least gain that exceeds chance."""
         rule = RULES[self.rule]
         return max(rule.least, rule.chance * base.chance.get(self.kind, 0.0))
 
     def counts(self, base: Baseline, gained: float, loud: bool) -> bool:
-        """Return whether names that gained so much in all, 0 without any, do not explain it."""
+        """Return whether the named effects, with total gain `named_gain` (0: none), do not explain the anomaly."""
         rule = RULES[self.rule]
         least = (rule.loud if loud else rule.beside) * gained
         return self.worth > max((rule.against if gained else 1.0) * self.limit(base), least)
 
 
 def oddities(sight: Sight, plain: Sight) -> list[Odd]:
-    """Return what every channel would gain by changing since its best instant, and how it hums; best first.
+    """Return the gain of a changed equation and the tone of every channel, best first.
 
-    Plain telemetry knows its equations too loosely to tell.
+    Without a fast accelerometer the equations are too uncertain: the list is empty.
 
     Args:
-        sight: with the names granted
-        plain: the same with none of them
+        whitened: residuals conditioned on the named effects
+        unconditioned: residuals without the named effects
     """
     if not sight.base.vane:
         return []
-    held = sight.held()  # no nuisance handed over
+    held = sight.held()  # no nuisance released
     out = [Odd(*tone, "tone") for tone in tones(held)]
     for one in equations_of(held):
         for rule, (worth, t0) in (("odd", one.all_of_it()), ("shift", one.in_flight())):
@@ -88,5 +87,5 @@ def oddities(sight: Sight, plain: Sight) -> list[Odd]:
 
 
 def strange(odds: Sequence[Odd], base: Baseline, gained: float, loud: bool) -> Odd | None:
-    """Return first that names do not explain; `gained` by them in all, 0 without any; `loud`: a channel stays so."""
+    """Return the first anomaly that the named effects do not explain; `still_high`: a channel stays above its limit."""
     return next((odd for odd in odds if odd.counts(base, gained, loud)), None)

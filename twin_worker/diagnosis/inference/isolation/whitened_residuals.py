@@ -1,4 +1,4 @@
-"""Whitened residuals of one flight, the nuisances profiled out: what every hypothesis is measured by."""
+"""Whitened residuals of one flight with the nuisances profiled out: the cost function of all hypotheses."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -17,23 +17,23 @@ from twin_worker.diagnosis.inference.isolation.nuisance import (
 from twin_worker.diagnosis.model.baseline import CHANNELS, is_weather
 from twin_worker.diagnosis.model.residual import Case
 
-CLIP = 6.0  # whitened residuals beyond count as much [-];
-_JUMPS = 100.0  # by the barometer, whose noise wanders so that a lasting jump is a single large residual; or
-_WIDE = 3.0  # beyond so many times the scatter a channel has on this flight
-_TIGHT = 1e14  # precision of a nuisance that was handed to the hypotheses
-_QUIETEST = 0.45  # a flight may be quieter than the nominal ones by this much
-_SURGE = 1.3
-_LOUDEST = 3.0  # and, where weather is nominal, louder in the air's channels by this
+CLIP = 6.0  # clipping limit of whitened residuals [-]
+_JUMPS = 100.0  # for the barometer: its noise drifts, so that a lasting jump is one large whitened residual
+_WIDE = 3.0  # the limit is at least this multiple of the channel's scatter on this flight
+_TIGHT = 1e14  # precision of a nuisance that is fixed at zero
+_QUIETEST = 0.45  # least scatter relative to nominal flights
+_SURGE = 1.3  # largest scatter of the axial force where wind is nominal
+_LOUDEST = 3.0  # largest scatter of the air channels where wind is nominal
 _AIR = [CHANNELS.index(name) for name in ("force_x", "side", "lift", "roll", "pitch", "yaw", "airspeed")]
 _AIR += [CHANNELS.index(name) for name in ("gps_x", "gps_y", "gps_z")]
 
 
 class Sight:
-    """One case with some guesses taken for granted.
+    """Whitened residuals of one flight, conditioned on hypotheses.
 
     Args:
-        case: the flight
-        granted: guesses at work in everything that follows
+        modelled: the flight with its baseline
+        conditions: hypotheses included in all residuals
     """
 
     def __init__(self, case: Case, granted: tuple[Guess, ...] = ()) -> None:
@@ -56,7 +56,7 @@ class Sight:
         self._lay()
 
     def part(self, span: np.ndarray) -> "Sight":
-        """Return the same with only the rows of `span`, (n,) bool, counting."""
+        """Return a copy restricted to the rows of `span`, (n,) bool."""
         out = copy(self)
         out.ok = self.ok & span
         out.raw, out.e = self.raw * out.ok[:, None], self.e * out.ok[:, None]
@@ -65,7 +65,7 @@ class Sight:
         return out
 
     def _scaled(self):  # type: ignore[no-untyped-def]
-        """Scale the noise to this flight's own: quieter always, louder only where weather is nominal."""
+        """Scale the noise to the scatter of this flight: down for all channels, up only where wind is nominal."""
         noise = self.base.noise
         e = noise.whiten(self.case.residuals())[self.ok]
         if not len(e):
@@ -74,12 +74,12 @@ class Sight:
         highest = np.ones(len(CHANNELS))
         if is_weather(self.base):
             highest[_AIR] = _LOUDEST
-            if self.base.vane:  # gusts hardly reach the axial force; surges of the engine do
+            if self.base.vane:  # gusts hardly affect the axial force; engine surges do
                 highest[CHANNELS.index("force_x")] = _SURGE
         return replace(noise, sigma=noise.sigma * np.clip(scatter, _QUIETEST, highest))
 
     def whitened(self, guesses: Sequence[Guess]) -> np.ndarray:
-        """Return whitened residuals with these beside the granted guesses, zero where not trusted, (n, c)."""
+        """Return whitened residuals with the conditions and these hypotheses, zero on invalid rows, (n, c)."""
         return self._white(self.case, guesses)
 
     def _white(self, case: Case, guesses: Sequence[Guess]) -> np.ndarray:
@@ -88,17 +88,17 @@ class Sight:
         return e
 
     def clipped(self, guesses: Sequence[Guess]) -> np.ndarray:
-        """Return the same, no row counting more than `clip`."""
+        """Return `residuals` limited to `clip`, (n, c)."""
         return np.clip(self.whitened(guesses), -self.clip, self.clip)
 
     def grant(self, granted: tuple[Guess, ...]) -> None:
-        """Take guesses for granted from now on."""
+        """Set the hypotheses that all following residuals include."""
         if granted != self.granted:
             self.granted = granted
             self._lay()
 
     def _lay(self) -> None:
-        """Reckon residuals and nuisances with what is granted."""
+        """Compute residuals and nuisance slopes under the current conditions."""
         self.raw = self.whitened(())
         self.e = np.clip(self.raw, -self.clip, self.clip)
         steps = [self.whitened((n.guess(n.step),)) for n in self.nuisances]
@@ -108,11 +108,11 @@ class Sight:
         self._profile()
 
     def _varied(self, k: int) -> np.ndarray:
-        """Return the whitened residuals under coefficients of fewer flights."""
+        """Return the whitened residuals under the k-th varied coefficients, (n, c)."""
         return self._white(Case(self.case.flight, self.base.varied(k), like=self.case), ())
 
     def _profile(self) -> None:
-        """Find the nuisances, and hand those that leave their spread to the hypotheses."""
+        """Estimate the nuisances; fix those beyond their spread at zero, so that hypotheses explain them."""
         more = np.ones(len(self.base.others))
         slow = np.array([self.base.spread.get(one.name, one.floor) for one in self.wanders])
         self.precision = np.array([*(1.0 / self._spread(n) ** 2 for n in self.nuisances), *slow**-2.0, *more])
@@ -132,14 +132,14 @@ class Sight:
             self.precision[worst] = _TIGHT
 
     def held(self) -> "Sight":
-        """Return the same with every nuisance held to its spread, none handed to the hypotheses."""
+        """Return a copy in which every nuisance has its prior spread and none is fixed at zero."""
         out = copy(self)
         out.Ann = self.Ann - np.diag(self.precision) + np.diag(self.usual)
         out.xn = np.linalg.solve(out.Ann, self.bn)
         return out
 
     def _bounds(self, more: int) -> np.ndarray:
-        """Return how many spreads each nuisance may be off before it is handed over, (nuisances + wanders + more,)."""
+        """Return the number of spreads at which each nuisance is released, (nuisances + drift modes + n_extra,)."""
         own = [n.released for n in self.nuisances]
         return np.array([*own, *(own[one.of] for one in self.wanders), *more * [RELEASED]])
 
@@ -148,7 +148,7 @@ class Sight:
         return max(spread, 2.5) if self.weather and n.effect.name == "wind_steady" else spread
 
     def cost(self, guesses: Sequence[Guess]) -> float:
-        """Return the sum of squares with these guesses, the nuisances profiled out."""
+        """Return the sum of squares with these hypotheses, the nuisances profiled out."""
         return self.cost_of(self.clipped(guesses))
 
     def cost_of(self, e: np.ndarray) -> float:
@@ -157,13 +157,13 @@ class Sight:
         return float((e * e).sum() - b @ np.linalg.solve(self.Ann, b))
 
     def powers(self, guesses: Sequence[Guess]) -> np.ndarray:
-        """Return each channel's sum of squares with these guesses, the nuisances profiled out, (c,)."""
+        """Return the sum of squares of each channel with these hypotheses, the nuisances profiled out, (c,)."""
         e = self.clipped(guesses)
         left = e - self.Jn @ np.linalg.solve(self.Ann, np.einsum("tci,tc->i", self.Jn, e))
         return np.asarray((left * left).sum(axis=0))
 
     def slopes(self, guess: Guess, step: np.ndarray) -> np.ndarray:
-        """Return how the whitened residuals change with each parameter about a guess, (n, c, k)."""
+        """Return the derivative of the whitened residuals with respect to the parameters of a hypothesis, (n, c, k)."""
         return self.whole(self.plain_slopes(guess, step))
 
     def whole(self, J: np.ndarray) -> np.ndarray:
@@ -171,9 +171,9 @@ class Sight:
         return self.noise.whiten(J) * self.ok[:, None, None]
 
     def begun(self, J: np.ndarray) -> np.ndarray:
-        """Whiten slopes of the residuals, (n, c, k), as if what shows began at each row: its first two, (2, n, c, k).
+        """Whiten slopes, (n, c, k), as if the effect started at each row; return its first two rows, (2, n, c, k).
 
-        Noise that wanders slowly hides what lasts: a step then shows by its first rows alone.
+        Slowly drifting noise hides lasting changes: a step is then visible only in its first rows.
         """
         ar, sigma = self.noise.ar, self.noise.sigma[:, None]
         first, second = J / sigma, J / sigma
@@ -181,7 +181,7 @@ class Sight:
         return np.stack([first, second]) * self.ok[None, :, None, None]
 
     def plain_slopes(self, guess: Guess, step: np.ndarray) -> np.ndarray:
-        """Return how the residuals change with each parameter about a guess, (n, c, k)."""
+        """Return the derivative of the raw residuals with respect to the parameters of a hypothesis, (n, c, k)."""
         here = self.case.residuals((*self.granted, guess))
         out = []
         for k, h in enumerate(step):
@@ -195,6 +195,6 @@ class Sight:
         return np.stack(out, axis=2)
 
     def left(self) -> np.ndarray:
-        """Return the mean square of each channel's whitened residual, nuisances taken off, (c,)."""
+        """Return the mean square of each whitened channel, the nuisances profiled out, (c,)."""
         e = self.e + self.Jn @ self.xn
         return (e[self.ok] ** 2).mean(axis=0) if self.ok.any() else np.zeros(len(CHANNELS))

@@ -1,4 +1,4 @@
-"""Proof: fitted on even blocks of 10 s, judged on odd ones."""
+"""Cross-validation: fit effects on even blocks of 10 s, evaluate them on odd blocks."""
 
 from dataclasses import dataclass
 
@@ -10,11 +10,11 @@ from twin_worker.diagnosis.inference.isolation.refine import refine
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
 from twin_worker.diagnosis.inference.validation.force_prediction import blocks
 
-HELD = 0.03  # share of the residual that must go on held-out data for a name
-_JUMP_S = 2.0  # a sensor's jump is seen so near to it
-_SHORT_S, _PASSES = 2.0, 0.01  # blocks of what passes by; share of it from which it passes
-SHOWS = 1.15  # a channel's residual over its usual, from which it takes part in the proof
-_TAKEN = 0.95  # or the share of it that the effects leave in the half they are fitted on
+HELD = 0.03  # least relative drop of the held-out rms residual for a named effect
+_JUMP_S = 2.0  # a sensor jump is visible within this time of its onset
+_SHORT_S, _PASSES = 2.0, 0.01  # block length for transient effects; least gate value at which they act
+SHOWS = 1.15  # least ratio of mean square to usual of a channel that takes part
+_TAKEN = 0.95  # or largest share of the mean square that remains on the blocks of the fit
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class Proof:
     """Held-out evidence.
 
     Attributes:
-        before, after: whitened rms on odd blocks without and with the effects, in channels that show something
+        before, after: whitened rms on odd blocks without and with the effects, in the affected channels
         fitted: the effects as fitted on even blocks
-        kept: what each gains on odd blocks beside the others, doubled to compare with the whole flight
+        held_out_gains: gain of each effect on odd blocks given the others, doubled to compare with the whole flight
     """
 
     before: float
@@ -34,17 +34,17 @@ class Proof:
 
     @property
     def gain(self) -> float:
-        """Return the share of the residual that went."""
+        """Return the relative drop of the rms residual."""
         return 1.0 - self.after / self.before if self.before > 0 else 0.0
 
 
 def held_out(sight: Sight, guesses: tuple[Guess, ...], shows: np.ndarray) -> Proof:
-    """Fit on even blocks, judge on odd ones.
+    """Fit the effects on even blocks and evaluate them on odd blocks.
 
     Args:
-        sight: the flight with nothing but its weather granted; it is left as it is
-        guesses: as fitted on the whole flight
-        shows: each channel's residual over its usual, (c,)
+        whitened: residuals conditioned on the weather alone; not modified
+        hypotheses: as fitted on the whole flight
+        channel_ratio: mean square of each channel over its usual, (c,)
     """
     weather = sight.granted
     even, odd = (sight.part(_half(sight, guesses, odd=side)) for side in (False, True))
@@ -66,10 +66,10 @@ def held_out(sight: Sight, guesses: tuple[Guess, ...], shows: np.ndarray) -> Pro
 
 
 def _half(sight: Sight, guesses: tuple[Guess, ...], odd: bool) -> np.ndarray:
-    """Tell which rows are of this half, (n,) bool.
+    """Return the rows of one half, (n,) bool.
 
-    What only passes is judged while it passes, by shorter blocks; a sensor's jump, which slow noise hides before and
-    after, by every second row around it.
+    Transient effects use shorter blocks while they act. Sensor jumps use every second row around the onset, because
+    slow noise hides them elsewhere.
     """
     t = sight.case.t
     if all(guess.when.kind is Onset.BUMP for guess in guesses):
@@ -81,7 +81,7 @@ def _half(sight: Sight, guesses: tuple[Guess, ...], odd: bool) -> np.ndarray:
 
 
 def _powers(sight: Sight) -> np.ndarray:
-    """Return the mean square of what each channel leaves, (c,)."""
+    """Return the mean square of each channel, the nuisances profiled out, (c,)."""
     e = (sight.e + sight.Jn @ sight.xn)[sight.ok]
     return (e**2).mean(axis=0) if e.size else np.zeros(e.shape[1])
 

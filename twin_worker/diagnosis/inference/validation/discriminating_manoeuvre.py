@@ -1,4 +1,4 @@
-"""Which manoeuvre would tell two explanations apart: where on this flight they differ most for each second flown."""
+"""Recommend the manoeuvre that separates two hypotheses: the one in which they differ most per second."""
 
 from collections.abc import Iterator
 
@@ -11,37 +11,37 @@ from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
 
 _BANK, _SLOPE = np.radians(20.0), np.radians(3.0)
 _FAST, _SLOW = 1.06, 0.94  # of the usual airspeed
-_RATE_S = 1.0  # over which commands change
+_RATE_S = 1.0  # interval of command changes
 _BUSY = 85  # percentile of those changes
-_LEAST_S = 6.0  # flown of a manoeuvre, to be judged by
-_TELLING = 1.3  # times as dense as on the whole flight, from which a manoeuvre is worth a word
-_ENOUGH = 150.0  # gain that settles it
+_LEAST_S = 6.0  # least duration of a manoeuvre on this flight
+_TELLING = 1.3  # least ratio to the mean of the flight for a recommendation
+_ENOUGH = 150.0  # squared whitened difference that separates two hypotheses
 _LONGEST_S = 600.0
 
 
 def manoeuvre(sight: Sight, one: Guess, other: Guess) -> str:
-    """Say what to fly so that the next diagnosis tells `one` from `other`."""
+    """Describe the manoeuvre with which the next diagnosis separates two hypotheses."""
     power = _power(sight, one, other)
     density = {name: float(power[rows].mean()) / STEP_S for name, rows in _flown(sight)}
     usual = float(power[sight.ok].mean()) / STEP_S
     best = max(density, key=lambda name: density[name], default="")
     if not best or _ENOUGH / max(density[best], 1e-9) > _LONGEST_S:
-        return "nothing flown here tells them apart: fly what this flight did not, at other speeds, throttles and banks"
+        return "no manoeuvre of this flight separates them: vary speed, throttle and bank beyond this flight"
     seconds = _ENOUGH / density[best]
     if density[best] < _TELLING * usual:
-        return f"no manoeuvre of this flight tells them apart better than another: fly on, {seconds:.0f} s more"
-    return f"{best}: {density[best] / usual:.1f} times as telling as this flight was; {seconds:.0f} s of it should do"
+        return f"no manoeuvre of this flight separates them better than the others: record {seconds:.0f} s more"
+    return f"{best}: {density[best] / usual:.1f} times the mean information of this flight; fly {seconds:.0f} s of it"
 
 
 def _power(sight: Sight, one: Guess, other: Guess) -> np.ndarray:
-    """Return the squared whitened difference of two explanations, what nuisances can hide taken off, (n,)."""
+    """Return the squared whitened difference of two hypotheses, the nuisances profiled out, (n,)."""
     d = sight.whitened((one,)) - sight.whitened((other,))
     hidden = np.linalg.solve(sight.Ann, np.einsum("tci,tc->i", sight.Jn, d))
     return ((d - sight.Jn @ hidden) ** 2).sum(axis=1)
 
 
 def _flown(sight: Sight) -> Iterator[tuple[str, np.ndarray]]:
-    """Return each manoeuvre flown long enough, and its rows, (n,) bool."""
+    """Yield each manoeuvre of sufficient duration with its rows, (n,) bool."""
     for name, rows in _manoeuvres(sight.case.flight):
         rows = thinned(rows) & sight.ok
         if rows.sum() * STEP_S >= _LEAST_S:
@@ -49,7 +49,7 @@ def _flown(sight: Sight) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _manoeuvres(flight: Flight) -> Iterator[tuple[str, np.ndarray]]:
-    """Return rows of each manoeuvre on the flight's own grid."""
+    """Yield each manoeuvre with its rows on the grid of the flight, (n,) bool."""
     r = flight.readings
     speed = np.hypot(np.hypot(r["v_n"], r["v_e"]), r["v_d"])
     air = r.get("Va", speed)

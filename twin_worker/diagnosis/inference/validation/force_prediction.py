@@ -1,8 +1,8 @@
-"""What the accelerometer should read, told from the other instruments: the simulation's word on held-out data.
+"""Predict the accelerometer from the other sensors and compare on held-out blocks.
 
-Lift can be told from velocity and attitude, or from the balance of pitch; side force from sideslip over the ground, or
-from the balance of roll or of yaw; dynamic pressure from velocity, or from the airspeed sensor. An effect shows where
-it acts, so the way is chosen on the blocks the effect was fitted on, and judged on the others.
+Lift follows from velocity and attitude, or from the pitching moment; side force from sideslip over the ground, or from
+the rolling or yawing moment; dynamic pressure from velocity, or from the airspeed sensor. An effect is visible where it
+acts: the combination of sources is selected on the blocks of the fit and evaluated on the others.
 """
 
 from dataclasses import dataclass
@@ -19,18 +19,18 @@ LIFT = ("velocity", "pitch")
 SIDE = ("velocity", "roll", "yaw")
 PRESSURE = ("velocity", "airspeed")
 BLOCK_S = 10.0
-_ROUNDS = 4  # of the pitch balance, whose drag depends on its lift
-_STEEP = 0.35  # sideslip told is kept within [rad]
+_ROUNDS = 4  # of the pitching moment equation, whose drag depends on lift
+_STEEP = 0.35  # limit of the predicted sideslip [rad]
 
 
 def blocks(t: np.ndarray, odd: bool) -> np.ndarray:
-    """Tell which times lie in odd, or in even, blocks of 10 s."""
+    """Return which times lie in odd, or in even, blocks of 10 s, (n,) bool."""
     return (np.floor(t / BLOCK_S) % 2 == 1) == odd
 
 
 @dataclass(frozen=True)
 class Forces:
-    """Specific force on the thinned grid, (n, 3) each [m/s2]: recorded, and told without and with the effects."""
+    """Specific force on the decimated grid, (n, 3) each [m/s2]: measured, predicted without and with the effects."""
 
     measured: np.ndarray
     base: np.ndarray
@@ -38,7 +38,7 @@ class Forces:
 
 
 def forces(case: Case, weather: tuple[Guess, ...], fitted: tuple[Guess, ...]) -> Forces:
-    """Tell forces without and with effects, in the way that shows them most on even blocks."""
+    """Predict forces without and with effects, from the sources with the largest error drop on even blocks."""
     before, after = case.terms(weather), case.terms((*weather, *fitted))
     measured = before.aside["f"].T
     ways = [w for w in product(LIFT, SIDE, PRESSURE) if w[2] == "velocity" or "Va" in case.flight.readings]
@@ -56,13 +56,13 @@ def forces(case: Case, weather: tuple[Guess, ...], fitted: tuple[Guess, ...]) ->
 
 
 def rms(case: Case, error: np.ndarray) -> float:
-    """Return the rms of an error, (n, 3), on trusted rows held out."""
+    """Return the rms of an error, (n, 3), on valid held-out rows."""
     rows = case.ok & blocks(case.t, odd=True) & np.isfinite(error).all(axis=1)
     return float(np.sqrt((error[rows] ** 2).mean())) if rows.any() else float("nan")
 
 
 def tell(case: Case, made: Terms, way: tuple[str, str, str]) -> np.ndarray:
-    """Tell specific force, (n, 3) [m/s2]; `made` is used for everything but its accelerometer."""
+    """Predict specific force, (n, 3) [m/s2], from `eq_terms` without its accelerometer."""
     base, body, flow, add = case.base, case.base.card.body, made.flow, made.add
     q_bar = flow.q_bar
     if way[2] == "airspeed":

@@ -1,4 +1,4 @@
-"""Free flights of the simulation beside the recording: how far it strays on its own, by the recorded commands."""
+"""Free-run error: simulate from measured states with the recorded commands and compare the attitude."""
 
 import numpy as np
 
@@ -9,16 +9,16 @@ from twin_worker.diagnosis.inference.validation.force_prediction import blocks
 from twin_worker.diagnosis.model.residual import Case
 from twin_worker.diagnosis.model.simulate import STATE, Simulation
 
-FREE_S = 5.0  # a free flight lasts
-_MOST = np.pi  # attitude error that counts [rad]
+FREE_S = 5.0  # length of a free run
+_MOST = np.pi  # limit of the attitude error [rad]
 
 
 def stray(case: Case, guesses: tuple[Guess, ...]) -> float:
-    """Return the rms attitude error of free flights from measured starts, on blocks held out [rad].
+    """Return the rms attitude error of free runs from measured states, on held-out blocks [rad].
 
     Args:
-        case: the flight
-        guesses: effects at work in the simulation, and sensor faults undone in the recording
+        modelled: the flight with its baseline
+        hypotheses: effects active in the simulation, and sensor faults corrected in the recording
     """
     s, t = case.sensed(guesses), case.flight.t
     n = int(FREE_S / DT)

@@ -1,4 +1,4 @@
-"""Honest standard deviations: what the residuals leave open, and how far parts of the flight disagree."""
+"""Standard deviations of fitted effects, from the residuals and from the variation between parts of the flight."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -11,17 +11,17 @@ from twin_worker.diagnosis.inference.isolation.refine import refine, steps
 from twin_worker.diagnosis.inference.isolation.whitened_residuals import Sight
 
 _BLOCK = 50  # rows of a block of the sandwich, 10 s
-_PARTS = 4  # of the flight, each left out in turn
-_WORKS = 0.01  # of an effect's course, from which it is at work
-_FORM = 0.02  # the simulation's form is no better known, as a share of a number
-_CLOCK_S = 0.01  # clocks of messages agree no better [s]
+_PARTS = 4  # parts of the jackknife
+_WORKS = 0.01  # least gate value at which an effect is active
+_FORM = 0.02  # relative model error of a parameter
+_CLOCK_S = 0.01  # uncertainty of message time stamps [s]
 
 
 def covariances(sight: Sight, weather: tuple[Guess, ...], guesses: Sequence[Guess]) -> list[np.ndarray]:
-    """Return the covariance of each fitted guess's parameters, (k, k).
+    """Return the parameter covariance of each fitted hypothesis, (k, k).
 
-    A sandwich over blocks of 10 s, the effects joint and the nuisances profiled out, plus the spread between fits that
-    leave a quarter of the time at work out; and a floor.
+    Sum of a sandwich estimate over blocks of 10 s (effects joint, nuisances profiled out), a jackknife that leaves out
+    each quarter of the active time, and a floor.
     Source: White 1982 (sandwich); Efron & Tibshirani 1993, section 11.5.
     """
     sight.grant(weather)
@@ -37,9 +37,9 @@ def covariances(sight: Sight, weather: tuple[Guess, ...], guesses: Sequence[Gues
 
 
 def _floor(sight: Sight, guess: Guess) -> np.ndarray:
-    """Return the variance no flight can undercut, (k,): clocks, the simulation's form, what is usual of the aircraft.
+    """Return the least variance, (k,): time stamps, model error, and the nominal spread of the aircraft.
 
-    What was always there cannot be told from what this aircraft has by itself.
+    An effect that is always present is not separable from the nominal spread.
     """
     times = np.array([p.unit == "s" for p in guess.effect.parameters])
     usual = np.zeros(len(times))
@@ -50,7 +50,7 @@ def _floor(sight: Sight, guess: Guess) -> np.ndarray:
 
 
 def told_sigma(guess: Guess, covariance: np.ndarray, body: object) -> dict[str, float]:
-    """Carry a covariance over to the numbers people want."""
+    """Propagate a parameter covariance to the standard deviations of the reported values."""
     effect, par = guess.effect, np.array(guess.par)
     here = effect.told(effect, par, body)  # type: ignore[arg-type]
     h = steps(guess) * 1e-2
@@ -88,7 +88,7 @@ def _sandwich(sight: Sight, guesses: Sequence[Guess]) -> np.ndarray:
 
 
 def _jackknife(sight: Sight, granted: tuple[Guess, ...], guess: Guess) -> np.ndarray:
-    """Return the covariance that fits without each quarter of the time at work show, (k, k)."""
+    """Return the jackknife covariance over the quarters of the active time, (k, k)."""
     sight.grant(granted)
     t = sight.case.t
     at_work = t[(guess.when.gate(t) > _WORKS) & sight.ok]

@@ -1,17 +1,17 @@
-"""What no effect explains: where it lives, and a sparse free-form term that fits it but names no physics."""
+"""Describe an unknown mismatch: its time segments, and a sparse free-form fit without physical meaning."""
 
 import numpy as np
 
 from twin_worker.diagnosis.data.fault_hypothesis import Guess
 from twin_worker.diagnosis.model.residual import Case
 
-_LOUD = 2.0  # rms over 5 s, in standard deviations, from which a stretch is listed
+_LOUD = 2.0  # rms over 5 s from which a segment is listed [standard deviations]
 _WINDOW = 25  # rows of 5 s
 _TERMS = 2  # of the free-form fit
 
 
 def stretches(t: np.ndarray, e: np.ndarray, ok: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """Return the stretches where a whitened residual, (n,), is loud [s]."""
+    """Return the segments where the rms of a whitened residual, (n,), is high [s]."""
     power = np.where(ok, np.nan_to_num(e) ** 2, 0.0)
     weight = np.convolve(ok.astype(float), np.ones(_WINDOW), "same")
     level = np.sqrt(np.convolve(power, np.ones(_WINDOW), "same") / np.maximum(weight, 1.0))
@@ -21,7 +21,7 @@ def stretches(t: np.ndarray, e: np.ndarray, ok: np.ndarray) -> tuple[tuple[float
 
 
 def free_form(case: Case, weather: tuple[Guess, ...], channel: int) -> dict[str, float]:
-    """Fit a channel's residual by the few library terms that explain most, (term -> coefficient).
+    """Fit the residual of a channel by the library terms that explain most, `term -> coefficient`.
 
     Source: Brunton, Proctor & Kutz 2016 (sparse regression), here by orthogonal matching pursuit.
     """
