@@ -32,7 +32,7 @@ KNOWN_S = 30.0  # an aircraft received for this long is only removed for a new a
 
 News = Sample | Status | Mission | Params | Alert
 EARLY = MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # sent once, therefore buffered; rows are repeated
-SINGLE = np.zeros(len(EXTRA), bool)  # by message id: processed individually; all others are table rows or only counted
+SINGLE = np.zeros(len(EXTRA), bool)  # by message id: processed individually, not as table rows
 SINGLE[[IDS[name] for name in (*EARLY, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
 SINGLE[IDS["MISSION_CURRENT"]] = True  # also a table row
 Claims = dict[int, Craft]
@@ -69,7 +69,7 @@ class Intake:
         self._rivals: set[int] = set()  # systems whose UAV id another link owns
         self._early: dict[int, list[tuple[float, Any]]] = {}  # messages before the first heartbeat, by system id
         self._early_n = 0  # number of these messages
-        self._numbered: list[Craft] = []  # by number in the arrays, removed ones included: a system keeps its number
+        self._numbered: list[Craft] = []  # by number in the arrays, including removed aircraft
         self._met: dict[int, float] = {}  # registration time by system id [s since 1970]
 
     def hear(self, arrival: float, data: bytes, source: Hashable = None) -> None:
@@ -305,7 +305,7 @@ class Intake:
     def _alarm(self, craft: Craft, arrival: float, source: Hashable, count: int = 1) -> None:
         self.refused[SECOND] += count
         self._collisions.setdefault(craft.uav, Collision(craft.uav)).note(arrival, craft.source, source)
-        words = "a second sender uses this id and was refused; give every aircraft its own MAVLink system id"
+        words = "a second sender uses this id and is rejected; give every aircraft its own MAVLink system id"
         craft.queue(arrival, partial(craft.say, words))
 
     def _overhear(self, arrival: float, message: Any) -> None:

@@ -53,4 +53,5 @@ class Steps:
             now = self._first + (self._number + 1) * STEP_S
             yield now, self._take(now)
             settled = self._take(now + SETTLE_S)
-            yield now + SETTLE_S, [news for news in settled if not isinstance(news, Status)]  # the link is not silent
+            # without status: the end of the recording is no link loss
+            yield now + SETTLE_S, [news for news in settled if not isinstance(news, Status)]

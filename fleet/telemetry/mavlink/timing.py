@@ -107,7 +107,8 @@ def time(frames: Frames, owner: np.ndarray, timings: Sequence[Timing]) -> None:
     """
     which = np.flatnonzero((frames.at[:, ID] == IDS["SYSTEM_TIME"]) & (owner >= 0))
     if len(which):
-        last = which[len(which) - 1 - np.unique(owner[which][::-1], return_index=True)[1]]  # last of each aircraft
+        # last frame of each aircraft
+        last = which[len(which) - 1 - np.unique(owner[which][::-1], return_index=True)[1]]
         fields = frames.fields(last, "SYSTEM_TIME")
         unix_s, boot_s = fields.time_unix_usec * 1e-6, fields.time_boot_ms * 1e-3
         for number, unix, boot in zip(owner[last].tolist(), unix_s.tolist(), boot_s.tolist(), strict=True):

@@ -48,7 +48,7 @@ def _leg_said_again(chunk: Chunk, leg: np.ndarray | None) -> tuple[Chunk, np.nda
 
     Args:
         chunk: time range of a log
-        current_item: item before the chunk, (1,); None if unknown
+        item: item before the chunk, (1,); None if unknown
     Returns:
         chunk with added `leg` rows, item at its end
     """

@@ -28,7 +28,7 @@ class Aside:
         self._north = (there[:, 0] - origin.lat_e7)[:, None]
         self._east = (there[:, 1] - origin.lon_e7)[:, None]
         here, moved = np.cos(np.radians([origin.lat_e7 * 1e-7])), np.cos(np.radians(there[:, 0] * 1e-7))
-        self._wider = (here / np.maximum(moved, 1e-3))[:, None]  # longitude per metre grows with latitude
+        self._wider = (here / np.maximum(moved, 1e-3))[:, None]  # wider at high latitude
 
     def move(self, lat: np.ndarray, lon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Offset positions, (m,) [1e-7 deg], to (n, m), one row per copy; unset positions 0, 0 are unchanged."""

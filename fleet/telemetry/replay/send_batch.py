@@ -48,7 +48,8 @@ class Volley:
         while at < len(start):
             where = messages.ctypes.data + at * _MESSAGE.itemsize
             took = self._call(self._out.fileno(), where, min(MOST, len(start) - at), 0)
-            at, sent = at + max(took, 1), sent + max(took, 0)  # without receiver or buffer space the datagram is lost
+            # without receiver or buffer space the datagram is lost
+            at, sent = at + max(took, 1), sent + max(took, 0)
         return sent
 
     def _one(self, datagram: bytes) -> int:

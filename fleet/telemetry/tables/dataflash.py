@@ -115,7 +115,7 @@ TABLE: tuple[Row, ...] = (
     Row("IMU", "attitude: rates", _gyro, rank=3),
     Row("GYR", "attitude: rates", _gyro, rank=2, when=lambda m: m.I == 0),
     Row("RATE", "attitude: rates", lambda m: _rate(m, DEG + 0.0 * m.AOutSlew), rank=1),
-    Row("RATE", "attitude: rates", lambda m: _rate(m, DEG / 100 + 0.0 * m.TimeMS), rank=1),  # logs in either unit
+    Row("RATE", "attitude: rates", lambda m: _rate(m, DEG / 100 + 0.0 * m.TimeMS), rank=1),  # either unit
     Row("IMU", "imu", _imu, rank=2, when=lambda m: m.I == 0),
     Row("IMU", "imu", _imu, rank=1),
     Row("POS", "position", _place, rank=4, when=_somewhere),

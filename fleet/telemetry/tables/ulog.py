@@ -107,7 +107,7 @@ def _driven(m: Any) -> Any:
 
 # --- command: set points of a fixed wing; errors are commanded minus actual ---------------------------------------
 
-_WANTED: tuple[tuple[Columns, str, Columns], ...] = (  # roll and pitch, path topic, altitude and airspeed error
+_WANTED: tuple[tuple[Columns, str, Columns], ...] = (  # roll and pitch, path topic, errors
     (
         lambda m: euler(m.q_d)[:2],  # 1.16 has no roll_body
         "position_controller_status",

@@ -13,7 +13,8 @@ YIELD_S = 3.0  # silence of a source after which a lower-ranked source is used [
 SLOWER = 1.5  # a source with a longer relative period is skipped in favour of a faster one
 SMOOTH = 0.1  # weight of the newest interval in the mean period of a source
 RANKS = 4  # number of ranks
-LAST, HEARD, EVERY = 0, 1, 1 + RANKS  # state columns: newest accepted time; by rank: newest time, mean period
+# state columns: newest accepted time; by rank: newest time, mean period
+LAST, HEARD, EVERY = 0, 1, 1 + RANKS
 NO_FIELD = -1
 KEPT, PASSED_OVER, REFUSED = range(3)
 
