@@ -89,7 +89,7 @@ def test_a_quadrotor_on_its_route_is_predicted_as_the_twin_does():
 
 def test_a_wing_that_cannot_be_identified_is_still_predicted_on_its_route():
     can, why = judged(known(flights.turn(60)))["predict on the route"]
-    assert can and "by the kinematics of a wing, since neither axis can be identified" in why
+    assert can and "kinematic fixed-wing model, since neither axis can be identified" in why
 
 
 @pytest.mark.parametrize(
@@ -129,29 +129,30 @@ def test_a_past_that_is_a_little_too_short_is_not_said_to_be_enough():
 def test_a_plane_with_everything_can_everything():
     told = judged(known(lively()))
     assert [name for name, (can, _) in told.items() if not can] == []
-    assert "53 s in the air without gaps, against a model of `fleet calibrate` or its own past" in told["diagnose"][1]
+    why = "53 s in flight without gaps, compared with a model of `fleet calibrate` or earlier flight data"
+    assert why in told["diagnose"][1]
 
 
 @pytest.mark.parametrize(
     ("laid", "more", "name", "words"),
     [
-        (lively(20), {}, "identify lateral", "20 s of whole data in the air, 30 s are needed"),
+        (lively(20), {}, "identify lateral", "20 s of complete data in flight, 30 s are required"),
         (lively(), {"vehicle": "multirotor"}, "identify longitudinal", "multirotor is not modelled"),
-        (slower(lively(), "attitude", 14), {}, "identify lateral", "attitude at 1.8 Hz is unbroken for 0 of"),
-        (flights.turn(60), {}, "identify longitudinal", "elevator and throttle never move"),
+        (slower(lively(), "attitude", 14), {}, "identify lateral", "attitude at 1.8 Hz is continuous for 0 of"),
+        (flights.turn(60), {}, "identify longitudinal", "elevator and throttle constant"),
         (
             lively() | {"attitude": flights.turn(60)["attitude"]},
             {},
             "verify",
-            "steady flight shows nothing: bank varies",
+            "steady flight, too little excitation: bank varies",
         ),
-        (lively(), {"mode": "FBWA"}, "predict on the route", "0 s in a mode that follows a mission, 5 s are needed"),
+        (lively(), {"mode": "FBWA"}, "predict on the route", "0 s in a mode that follows a mission, 5 s are required"),
         (lively(), {"items": 0}, "predict on the route", "no mission list"),
         ({k: v for k, v in lively().items() if k != "leg"}, {}, "predict on the route", "MISSION_CURRENT"),
         ({k: v for k, v in lively().items() if k != "servo"}, {}, "predict by turn rate", "no servo rows"),
         ({k: v for k, v in lively().items() if k != "air"}, {}, "estimate wind", "no air rows"),
         (flights.turn(60, Va=2.0), {}, "estimate wind", "airspeed reaches 2.0 m/s"),
-        (flights.turn(60, Va=2.0), {}, "identify lateral", "never in the air"),
+        (flights.turn(60, Va=2.0), {}, "identify lateral", "never in flight"),
     ],
 )
 def test_what_is_missing_is_said_with_figures(laid, more, name, words):

@@ -94,7 +94,7 @@ def test_a_mission_with_nan_keeps_its_numbering(lost):
     assert [i.seq for i in mission.items] == [0, 1, 2]
     assert mission.items[1].command == 0  # nobody flies to a place that was made up
     assert mission.items[1].lat_e7 == mission.items[1].lon_e7 == mission.items[1].alt_m == 0
-    assert "item 1 has a coordinate that is no number" in mission.sentence
+    assert "item 1 has an invalid coordinate" in mission.sentence
     assert of(Status, air.hear(b"", 1.0), 7)[0].rejected == 1
 
 
@@ -103,7 +103,7 @@ def test_a_mission_parameter_that_is_nan():
     bad = mav.MAVLink_mission_item_int_message(255, 190, 1, 3, 18, 0, 1, NAN, 0, NAN, NAN, 1, 2, 3.0)
     mission = mission_of(air, air.bad.mission(air.bad.item(0), air.bad.pack(bad)))
     assert (mission.items[1].param1, mission.items[1].param3, mission.items[1].command) == (0, 0, 18)
-    assert "item 1 has a parameter that is no number" in mission.sentence
+    assert "item 1 has a non-finite parameter" in mission.sentence
 
 
 @pytest.mark.parametrize("targets", [(1, 1), (2, 1), (9, 9), (-3, 1)])

@@ -261,7 +261,10 @@ def test_hostile_bytes_and_missions_leave_the_others_flying(router: str) -> None
             wait(lambda: heard.account.bad_bytes > 500_000, gateway)
             for frames in hostile():
                 attacker.send(frames)
-            wait(lambda: heard.told("no items", "no number", "never reaches", "no length", "not a number"), gateway)
+            wait(
+                lambda: heard.told("no items", "invalid coordinate", "never reaches", "no length", "not a number"),
+                gateway,
+            )
             _wild_clock(attacker, heard, gateway)
         before = dict(heard.samples)
         wait(lambda: all(heard.samples[uav] > before[uav] + 20 for uav in (0, 1)), gateway)

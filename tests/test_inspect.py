@@ -93,7 +93,7 @@ def test_events_are_told_once_and_in_time():
         Status(uav=1, t=T0 + 2, mode="AUTO", armed=True),
         Params(uav=1, t=T0 + 3, values={"A": 2.0, "B": 5.0, "STAT_RUNTIME": 2.0}),
         *flights.messages(flights.turn(1.0)),
-        Status(uav=1, t=T0 + 9, mode="AUTO", armed=True, link=Link.LOST, sentence="uav-1: nothing heard for 8 s"),
+        Status(uav=1, t=T0 + 9, mode="AUTO", armed=True, link=Link.LOST, sentence="uav-1: no message for 8 s"),
         Status(uav=1, t=T0 + 10, mode="AUTO", armed=True, clock_jumps=1, sentence="uav-1: PreArm: no GPS"),
         flights.sample(1, T0 + 11, leg=(np.array([T0 + 11]), np.array([[2.0]]))),
         Status(uav=1, t=T0 + 12, mode="AUTO", armed=False),

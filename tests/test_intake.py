@@ -81,7 +81,7 @@ def test_a_lost_link_is_told_and_comes_back():
     assert 30 <= lost[0] <= 32
     assert 50 <= lost[-1] <= 59
     assert links[-1][1] is Link.LIVE
-    assert "nothing heard for" in next(sentence for step, _, sentence in links if step == lost[-1])
+    assert "no message for" in next(sentence for step, _, sentence in links if step == lost[-1])
 
 
 def test_a_second_sender_for_a_live_id_is_refused_until_the_first_is_silent():

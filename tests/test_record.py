@@ -126,13 +126,13 @@ def test_two_joined_recordings_play_without_the_days_between(tmp_path):
     ("message", "words"),
     [
         (msgspec.structs.replace(EXAMPLES[Status], uav=-1), "id out of range"),
-        (msgspec.structs.replace(EXAMPLES[Status], t=float("nan")), "a time there is not"),
-        (msgspec.structs.replace(EXAMPLES[Mission], items=EXAMPLES[Mission].items * 2000), "items that cannot be"),
+        (msgspec.structs.replace(EXAMPLES[Status], t=float("nan")), "an invalid time"),
+        (msgspec.structs.replace(EXAMPLES[Mission], items=EXAMPLES[Mission].items * 2000), "invalid items"),
         (
             msgspec.structs.replace(
                 EXAMPLES[Sample], air=msgspec.structs.replace(EXAMPLES[Sample].air, x=EXAMPLES[Sample].servo.x)
             ),
-            "rows of air that do not fit",
+            "invalid rows of air",
         ),
     ],
 )

@@ -84,7 +84,7 @@ def test_a_hole_and_a_run_of_garbage_are_stepped_over_and_their_place_is_said():
     t = rows(log)["imu"][0] - START_US * 1e-6
     assert t[-1] > 19.9
     assert len(t) > 0.9 * 2000
-    assert any("stepped over" in sentence and f"to {middle + 30_000}"[:6] in sentence for sentence in log.skipped)
+    assert any("were skipped" in sentence and f"to {middle + 30_000}"[:6] in sentence for sentence in log.skipped)
 
 
 def test_data_appended_after_a_crash_are_read():
@@ -122,7 +122,7 @@ def test_after_much_noise_the_rest_is_left_unread(monkeypatch):
     monkeypatch.setattr(sieve, "HOPELESS", 3 << 20)
     stream = Endless(ulog(flight((1, 11))), bytes(1000))
     log = UlogLog(lambda: stream, "endless.ulg")
-    assert any("the rest was left unread" in sentence for sentence in log.skipped)
+    assert any("the rest was not read" in sentence for sentence in log.skipped)
 
 
 @pytest.mark.parametrize("error", [OSError("gone"), EOFError("cut")])
@@ -172,5 +172,5 @@ def test_a_jump_of_the_clock_costs_twenty_rows_whatever_is_logged_between():
     between = {"unwanted": {"timestamp": imu["timestamp"] + np.uint64(1), "x": np.zeros(len(imu["timestamp"]), "f4")}}
     assert not set(between) & TOPICS
     log = read(ulog({"sensor_combined": imu} | between))
-    assert "20 rows of sensor_combined with a stamp far off left out" in log.skipped
+    assert "20 rows of sensor_combined with an implausible stamp skipped" in log.skipped
     assert len(rows(log)["imu"][0]) == len(imu["timestamp"]) - sieve.COMPANY

@@ -39,8 +39,8 @@ def test_a_mission_file_becomes_a_question(tmp_path):
         ("QGC WPL 110\n", "found 0 items"),
         (WPL + "3\t0\t3\n", "line 5"),
         (WPL.replace("47.41", "north"), "line 3"),
-        (WPL.replace("47.41", "147.41"), "a place on earth"),
-        (WPL.replace("8.51", "nan"), "a place on earth"),
+        (WPL.replace("47.41", "147.41"), "a position on earth"),
+        (WPL.replace("8.51", "nan"), "a position on earth"),
         ("QGC WPL 110\n" + "\n".join(WPL.splitlines()[2:3] * (MAX_ITEMS + 1)), "1,001 items"),
     ],
 )

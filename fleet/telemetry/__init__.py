@@ -1,1 +1,1 @@
-"""Bytes to Samples, the same for a live link and a recording."""
+"""Conversion of bytes to samples, identical for live links and recordings."""

@@ -1,1 +1,1 @@
-"""What a recording contains: rows, rates, gaps, and what can be done with it."""
+"""Contents of a recording: rows, rates, gaps, and the twin functions it supports."""

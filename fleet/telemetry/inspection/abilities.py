@@ -1,6 +1,6 @@
-"""What a twin can do with a recording, and why not: what it needs, held against what is there.
+"""Compare the data of a recording with the requirements of each function of the twin.
 
-The figures are those the twin itself works by; a test holds both equal.
+The limits equal those of the twin; a test compares both.
 """
 
 from typing import NamedTuple
@@ -16,34 +16,34 @@ from fleet.telemetry.inspection.thinned import Span, inside, overlap, seconds
 from fleet.window import INPUTS
 
 NEEDED = tuple(LONGEST_S)
-LEAST_S = 30.0  # shortest stretch worth identifying [s]
-WINDOW_S = 140.0  # longest stretch one identification uses [s]
-UNBROKEN_S = 4.0  # shortest unbroken stretch a model is tested on [s]
-RECENT_S = 2.0  # what a turn-rate prediction starts from [s]
-ROUTE_S = 5.0  # on one route before it is predicted [s]
-QUIET = {"phi": 0.04, "theta": 0.04, "q": 0.05}  # if all move less it is steady flight [rad, rad, rad/s]
-LEAST_VA, PAIRED_S = 3.0, 0.5  # airspeed, and age of the rows that go with a ground velocity [m/s, s]
-PAIRS = 50  # wind triangles before the estimate is guarded
+LEAST_S = 30.0  # minimum data for an identification [s]
+WINDOW_S = 140.0  # window of one identification [s]
+UNBROKEN_S = 4.0  # shortest continuous stretch for model verification [s]
+RECENT_S = 2.0  # recent data that a turn-rate prediction requires [s]
+ROUTE_S = 5.0  # time on a route that a route prediction requires [s]
+QUIET = {"phi": 0.04, "theta": 0.04, "q": 0.05}  # standard deviations [rad, rad, rad/s]
+LEAST_VA, PAIRED_S = 3.0, 0.5  # airspeed [m/s], age of rows paired with a ground velocity [s]
+PAIRS = 50  # wind triangles that a wind estimate requires
 ROUTE_MODES = ("AUTO", "MISSION", "AUTO.MISSION")
 NO_WINGS = ("multirotor", "helicopter")
 WINGS = ("fixed_wing", "quadplane")
-DIAGNOSE_S, DIAGNOSE_ROWS = 25.0, 50  # trusted flight, and rows of each needed kind, a diagnosis needs
-OWN_PAST_S = 50.0  # trusted flight where an aircraft is compared with its own past [s]
-VANE_HZ = 18.0  # accelerometer rows by which gusts are seen
-_BEGIN_S, _END_S = 5.0, 1.5  # of a recording, left out by a diagnosis [s]
-_ITEMS_IN = {  # where a recording has its mission items, by its kind
+DIAGNOSE_S, DIAGNOSE_ROWS = 25.0, 50  # gap-free flight, and rows of each required field, for a diagnosis
+OWN_PAST_S = 50.0  # gap-free flight for a comparison with earlier flight data [s]
+VANE_HZ = 18.0  # accelerometer rate for gust estimation [Hz]
+_BEGIN_S, _END_S = 5.0, 1.5  # start and end of a recording excluded from a diagnosis [s]
+_ITEMS_IN = {  # how to record mission items, by kind of recording
     "ULog": "PX4 logs no mission items; record telemetry instead (.tlog), with the mission downloaded while recording",
     "DataFlash log": "the autopilot logs them as CMD messages (ArduPilot); keep the log from its beginning",
     "DataFlash text log": "the autopilot logs them as CMD messages (ArduPilot); keep the log from its beginning",
     "fleet recording": "the gateway downloads it unless --listen-only is set; record with it connected",
 }
-_GOOD_HZ = 10.0  # below this the twin works, but sees fast motion badly
-_STILL = 0.005  # an input that varies less never moves, share of its throw [-]
+_GOOD_HZ = 10.0  # below this rate fast motion is poorly resolved [Hz]
+_STILL = 0.005  # standard deviation below which an input is constant, fraction of its range [-]
 _WORD = {"delta_a": "aileron", "delta_e": "elevator", "delta_r": "rudder", "delta_t": "throttle"}
 
 
 class Ability(NamedTuple):
-    """One thing a twin does: whether it can with this recording, and why, with figures found and needed."""
+    """One function of the twin, whether this recording supports it, and the reason with values found and required."""
 
     name: str
     can: bool
@@ -51,7 +51,7 @@ class Ability(NamedTuple):
 
 
 def abilities(known: Survey) -> list[Ability]:
-    """Judge everything a twin does, in the order it does them."""
+    """Check all functions of the twin in processing order."""
     flown = airborne(known)
     whole = whole_spans(known)
     starved = _wings(known) or _starved(known, flown, whole)
@@ -74,7 +74,7 @@ def abilities(known: Survey) -> list[Ability]:
 
 
 def _unidentified(axes: tuple[Ability, Ability]) -> str:
-    """Say which axis cannot be identified, or nothing."""
+    """Return which axis cannot be identified, or an empty string."""
     broken = [axis.name.split()[-1] for axis in axes if not axis.can]
     if not broken:
         return ""
@@ -82,7 +82,7 @@ def _unidentified(axes: tuple[Ability, Ability]) -> str:
 
 
 def whole_spans(known: Survey) -> list[Span]:
-    """Return the stretches in which no needed kind of row has an interval too wide to fill."""
+    """Return the stretches in which all required fields are continuous."""
     whole = [Span(-np.inf, np.inf)]
     for name in NEEDED:
         whole = overlap(whole, known.rows[name].stretches())
@@ -90,7 +90,7 @@ def whole_spans(known: Survey) -> list[Span]:
 
 
 def swings(known: Survey, spans: list[Span]) -> dict[str, float]:
-    """Return how much each input varies there, one standard deviation, share of its throw [-]."""
+    """Return the standard deviation of each input in the intervals, fraction of its range [-]."""
     t, pulses = known.rows["servo"].rows()
     there = inside(t, spans)
     if there.sum() < 2:
@@ -100,7 +100,7 @@ def swings(known: Survey, spans: list[Span]) -> dict[str, float]:
 
 
 def most_within(spans: list[Span], length: float) -> float:
-    """Return the most that any `length` seconds hold of the spans [s]."""
+    """Return the maximum coverage by the intervals of any window of `window_s` [s]."""
     best = 0.0
     for last in spans:
         start = last.stop - length
@@ -109,35 +109,35 @@ def most_within(spans: list[Span], length: float) -> float:
 
 
 def _wings(known: Survey) -> str:
-    return f"a {known.vehicle} is not modelled, turn rate only" if known.vehicle in NO_WINGS else ""
+    return f"a {known.vehicle} is not modelled, turn-rate prediction only" if known.vehicle in NO_WINGS else ""
 
 
 def _starved(known: Survey, flown: list[Span], whole: list[Span]) -> str:
-    """Say what the data lack for an identification, or nothing."""
+    """Return what prevents an identification, or an empty string."""
     if lack := _lacking(known):
         return lack
     if not flown:
         fast = ROTORS_FAST if known.vehicle in ROTORS else FAST
-        return f"never in the air: no 5 s faster than {fast:.0f} m/s"
+        return f"never in flight: no 5 s faster than {fast:.0f} m/s"
     for name in NEEDED:
         covered = seconds(overlap(known.rows[name].stretches(), flown))
         if covered < 0.5 * seconds(flown):
             return (
-                f"{name} at {known.rows[name].rate_hz:.1f} Hz is unbroken for {covered:.0f} of {seconds(flown):.0f} s "
-                f"in the air; no interval over {LONGEST_S[name]:g} s is needed, {_GOOD_HZ:.0f} Hz or more is good"
+                f"{name} at {known.rows[name].rate_hz:.1f} Hz is continuous for {covered:.0f} of {seconds(flown):.0f}"
+                f" s in flight; required: no interval over {LONGEST_S[name]:g} s, recommended: {_GOOD_HZ:.0f} Hz"
             )
     parts = overlap(whole, flown)
     have = most_within(parts, WINDOW_S)
     if have < LEAST_S:
-        return f"{below(have, LEAST_S)} s of whole data in the air, {LEAST_S:.0f} s are needed"
+        return f"{below(have, LEAST_S)} s of complete data in flight, {LEAST_S:.0f} s are required"
     longest = max(part.seconds for part in parts)
     if longest < UNBROKEN_S:
-        return f"the longest unbroken stretch is {longest:.1f} s, {UNBROKEN_S:.0f} s are needed"
+        return f"the longest continuous stretch is {longest:.1f} s, {UNBROKEN_S:.0f} s are required"
     return ""
 
 
 def _lacking(known: Survey) -> str:
-    """Name the needed kinds of row that are not there at all."""
+    """Return which required fields have no rows, or an empty string."""
     none = [name for name in NEEDED if known.rows[name].count < 8]
     return f"no {', '.join(none)} rows in the recording" if none else ""
 
@@ -148,16 +148,16 @@ def _identify(name: str, known: Survey, starved: str, swing: dict[str, float], n
     still = [_WORD[each] for each in needed if swing[each] < _STILL]
     servos = servo_map(known.values)
     if len(still) == len(needed):
-        return Ability(name, False, f"{' and '.join(still)} never move in the air{_assumed(servos)}")
+        return Ability(name, False, f"{' and '.join(still)} constant in flight{_assumed(servos)}")
     said = ", ".join(
-        f"{_WORD[each]} varies by {swing[each]:.0%} of its throw" for each in needed if swing[each] >= _STILL
+        f"{_WORD[each]} varies by {swing[each]:.0%} of its range" for each in needed if swing[each] >= _STILL
     )
-    said += f"; {still[0]} never moves" if still else ""
+    said += f"; {still[0]} constant" if still else ""
     slow = [f"{kind} at {hz:.1f} Hz" for kind in ("attitude", "servo") if (hz := known.rows[kind].rate_hz) < _GOOD_HZ]
     if slow:
-        said += f"; but {' and '.join(slow)} show fast motion badly, {_GOOD_HZ:.0f} Hz or more is good"
+        said += f"; {' and '.join(slow)} resolves fast motion poorly, {_GOOD_HZ:.0f} Hz or more is recommended"
     if known.rows["air"].count == 0:
-        said += "; no airspeed rows: wind is taken as none"
+        said += "; no airspeed rows: zero wind assumed"
     return Ability(name, True, said + _assumed(servos))
 
 
@@ -175,13 +175,13 @@ def _verify(known: Survey, unidentified: str, spans: list[Span]) -> Ability:
     phi, theta, q = np.degrees(list(moved.values()))
     found = f"bank varies by {phi:.1f} deg, pitch by {theta:.1f} deg, pitch rate by {q:.1f} deg/s"
     if all(moved[name] < least for name, least in QUIET.items()):
-        need = "{:.1f} deg, {:.1f} deg or {:.1f} deg/s are needed".format(*np.degrees(list(QUIET.values())))
-        return Ability("verify", False, f"steady flight shows nothing: {found}, {need}")
+        need = "{:.1f} deg, {:.1f} deg or {:.1f} deg/s are required".format(*np.degrees(list(QUIET.values())))
+        return Ability("verify", False, f"steady flight, too little excitation: {found}, {need}")
     return Ability("verify", True, found)
 
 
 def _on_route(known: Survey, unidentified: str, flown: list[Span]) -> Ability:
-    """Judge what the twin flies ahead by: an identified model, else the kinematics of its kind of aircraft."""
+    """Check route prediction with an identified model, else with the kinematic model of the vehicle type."""
     name = "predict on the route"
     if unidentified and known.vehicle not in (*WINGS, *NO_WINGS):
         return Ability(name, False, f"{unidentified}, and a vehicle of kind {known.vehicle} has no kinematic model")
@@ -194,7 +194,7 @@ def _on_route(known: Survey, unidentified: str, flown: list[Span]) -> Ability:
         return Ability(
             name,
             False,
-            f"{below(flew, ROUTE_S)} s in a mode that follows a mission, {ROUTE_S:.0f} s are needed ({modes})",
+            f"{below(flew, ROUTE_S)} s in a mode that follows a mission, {ROUTE_S:.0f} s are required ({modes})",
         )
     origin = known.origin()
     if not known.items or origin is None:
@@ -203,15 +203,15 @@ def _on_route(known: Survey, unidentified: str, flown: list[Span]) -> Ability:
     autopilot = known.status.autopilot if known.status else "unknown"
     first = FIRST.get(autopilot, 1)
     if not len(route(known.items, seq=first, origin=origin, params=known.values, first=first).legs):
-        return Ability(name, False, f"the mission of {len(known.items)} items has no legs to fly")
+        return Ability(name, False, f"the mission of {len(known.items)} items has no legs")
     if not known.rows["leg"].count:
-        return Ability(name, False, "the mission item in force is not in the recording (MISSION_CURRENT)")
+        return Ability(name, False, "the current mission item is not in the recording (MISSION_CURRENT)")
     told = autopilot in ("ardupilot", "px4")
-    law = "" if told else f"; autopilot {autopilot} is flown by the law that asks for the banks it asks for, if any"
+    law = "" if told else f"; guidance law of autopilot {autopilot} is identified from its bank commands, if any"
     items = f"{len(known.items)} mission items" + ("" if known.mission and known.mission.complete else ", not all")
     if known.vehicle in NO_WINGS:
-        return Ability(name, True, f"{flew:.0f} s on the route, {items}; by its speed and acceleration limits")
-    how = f"by the kinematics of a wing, since {unidentified}" if unidentified else "take-off and landing not modelled"
+        return Ability(name, True, f"{flew:.0f} s on the route, {items}; from speed and acceleration limits")
+    how = f"kinematic fixed-wing model, since {unidentified}" if unidentified else "take-off and landing not modelled"
     return Ability(name, True, f"{flew:.0f} s on the route, {items}; {how}{law}")
 
 
@@ -222,8 +222,8 @@ def _by_turn_rate(known: Survey, whole: list[Span]) -> Ability:
     longest = max((span.seconds for span in whole), default=0.0)
     if longest < RECENT_S:
         rates = ", ".join(f"{kind} {known.rows[kind].rate_hz:.1f} Hz" for kind in NEEDED)
-        return Ability(name, False, f"never {RECENT_S:.0f} s of whole data: {rates}; 2 Hz without gaps are the least")
-    return Ability(name, True, f"{seconds([s for s in whole if s.seconds >= RECENT_S]):.0f} s of whole data")
+        return Ability(name, False, f"never {RECENT_S:.0f} s of complete data: {rates}; 2 Hz without gaps is required")
+    return Ability(name, True, f"{seconds([s for s in whole if s.seconds >= RECENT_S]):.0f} s of complete data")
 
 
 def _wind(known: Survey) -> Ability:
@@ -243,30 +243,30 @@ def _wind(known: Survey) -> Ability:
     pairs = int((fresh[0] & fresh[1] & fast).sum())
     if pairs < PAIRS:
         most = float(air[:, 0].max())
-        return Ability(name, False, f"{pairs} wind triangles, {PAIRS} are needed; airspeed reaches {most:.1f} m/s")
+        return Ability(name, False, f"{pairs} wind triangles, {PAIRS} are required; airspeed reaches {most:.1f} m/s")
     return Ability(name, True, f"{pairs} wind triangles of ground velocity, airspeed and heading")
 
 
 def _diagnose(known: Survey, flown: list[Span]) -> Ability:
-    """Judge by what `fleet diagnose` demands of a flight."""
+    """Check the requirements of `fleet diagnose`."""
     name = "diagnose"
     if known.vehicle in NO_WINGS:
-        return Ability(name, False, f"a {known.vehicle} is not diagnosed: the simulation it is compared with has wings")
+        return Ability(name, False, f"no diagnosis of a {known.vehicle}: the reference simulation is a fixed wing")
     if few := [kind for kind in NEEDED if known.rows[kind].count < DIAGNOSE_ROWS]:
         return Ability(name, False, f"fewer than {DIAGNOSE_ROWS} {', '.join(few)} rows in the recording")
     trusted = seconds(_without_gaps(known, flown))
     if trusted < DIAGNOSE_S:
         found = below(trusted, DIAGNOSE_S)
-        return Ability(name, False, f"{found} s in the air without gaps, {DIAGNOSE_S:.0f} s are needed")
-    said = f"{trusted:.0f} s in the air without gaps, against a model of `fleet calibrate`"
-    said += " or its own past" if trusted >= OWN_PAST_S else f"; its own past would need {OWN_PAST_S:.0f} s"
+        return Ability(name, False, f"{found} s in flight without gaps, {DIAGNOSE_S:.0f} s are required")
+    said = f"{trusted:.0f} s in flight without gaps, compared with a model of `fleet calibrate`"
+    said += " or earlier flight data" if trusted >= OWN_PAST_S else f"; {OWN_PAST_S:.0f} s for earlier flight data"
     lacks = [] if known.rows["imu"].rate_hz >= VANE_HZ else [f"accelerometer at {VANE_HZ:.0f} Hz"]
     lacks += [word for kind, word in (("air", "airspeed"), ("pressure", "pressure")) if not known.rows[kind].count]
-    return Ability(name, True, said + (f"; less is seen without {', '.join(lacks)}" if lacks else ""))
+    return Ability(name, True, said + (f"; reduced sensitivity without {', '.join(lacks)}" if lacks else ""))
 
 
 def _without_gaps(known: Survey, flown: list[Span]) -> list[Span]:
-    """Return the stretches in the air, without gaps of any needed kind, and without what begins and ends the rows."""
+    """Return the flight intervals without gaps in required fields, start and end of the rows excluded."""
     ends = [known.rows[kind].rows()[0][[0, -1]] for kind in NEEDED]
     parts = overlap(flown, [Span(max(a for a, _ in ends) + _BEGIN_S, min(b for _, b in ends) - _END_S)])
     for kind in NEEDED:

@@ -1,4 +1,4 @@
-"""What `fleet inspect` says of one aircraft, as plain figures: the keys of its JSON, each with its unit."""
+"""Figures that `fleet inspect` reports for each aircraft: the keys of its JSON with their units."""
 
 from collections import Counter
 from typing import Annotated, Any, NamedTuple
@@ -16,147 +16,147 @@ from fleet.telemetry.inspection.thinned import inside, seconds
 
 _SURFACES = {4: "aileron", 19: "elevator", 21: "rudder", 70: "throttle", 77: "left elevon", 78: "right elevon"}
 _ASSUMED = {1: "aileron", 2: "elevator", 3: "throttle", 4: "rudder"}
-_MOVES_US = 5.0  # a pulse width that varies less is still [us]
-_AT_END_US = 1.0  # so near its limit it is saturated [us]
-_CONSTANT = 0.05  # airspeed that varies less is constant [m/s]
-_SEVERE = 3  # MAV_SEVERITY ERROR; lower is worse
-_SENSOR = ("ARSPD_TYPE", "ARSPD_ENABLE", "SYS_HAS_NUM_ASPD")  # parameters that name an airspeed sensor
-_SPOKEN = ("AIRSPEED", "AIRSPEED_AUTOCAL")  # messages that only a sensor makes an autopilot send
+_MOVES_US = 5.0  # standard deviation below which a channel is constant [us]
+_AT_END_US = 1.0  # distance from SERVOn_MIN or _MAX below which a channel is saturated [us]
+_CONSTANT = 0.05  # standard deviation below which airspeed is constant [m/s]
+_SEVERE = 3  # MAV_SEVERITY_ERROR; a lower number is more severe
+_SENSOR = ("ARSPD_TYPE", "ARSPD_ENABLE", "SYS_HAS_NUM_ASPD")  # parameters that configure an airspeed sensor
+_SPOKEN = ("AIRSPEED", "AIRSPEED_AUTOCAL")  # messages that an autopilot sends only with an airspeed sensor
 
 
 class Facts(NamedTuple):
-    """What messages lack: firmware, and every text with its time [s since 1970] and severity."""
+    """Data outside contract messages: firmware, and texts with time [s since 1970] and severity."""
 
     firmware: str = ""
     texts: tuple[tuple[float, int, str], ...] = ()
 
 
 class Mode(msgspec.Struct, frozen=True):
-    """One flight mode and when it was in force."""
+    """One interval of one flight mode."""
 
     mode: str
-    start_s: Annotated[float, Meta(description="since the recording began [s]")]
-    seconds: Annotated[float, Meta(description="how long [s]")]
+    start_s: Annotated[float, Meta(description="start, since the start of the recording [s]")]
+    seconds: Annotated[float, Meta(description="duration [s]")]
 
 
 class Gap(msgspec.Struct, frozen=True):
-    """One stretch without rows."""
+    """One interval without rows."""
 
-    start_s: Annotated[float, Meta(description="since the recording began [s]")]
-    seconds: Annotated[float, Meta(description="how long [s]")]
+    start_s: Annotated[float, Meta(description="start, since the start of the recording [s]")]
+    seconds: Annotated[float, Meta(description="duration [s]")]
 
 
 class Kind(msgspec.Struct, frozen=True):
-    """Rows of one kind."""
+    """Statistics of the rows of one field."""
 
-    rows: Annotated[int, Meta(description="how many")]
-    rate_hz: Annotated[float, Meta(description="outside gaps [Hz]")]
-    gaps: Annotated[int, Meta(description="intervals three times the usual and too wide to fill, 1,000 at most")]
-    gap_s: Annotated[float, Meta(description="time in gaps [s]")]
+    rows: Annotated[int, Meta(description="number of rows")]
+    rate_hz: Annotated[float, Meta(description="mean rate outside gaps [Hz]")]
+    gaps: Annotated[int, Meta(description="intervals over 3 times the median, too long to interpolate; at most 1,000")]
+    gap_s: Annotated[float, Meta(description="total duration of the gaps [s]")]
     longest: Annotated[Gap | None, Meta(description="the longest gap")] = None
 
 
 class Servo(msgspec.Struct, frozen=True):
-    """One output channel, in the air where it was."""
+    """One output channel, in flight if the aircraft flew, else over the whole recording."""
 
     channel: int
-    surface: Annotated[str, Meta(description="what it moves by the servo map, or empty")]
-    low_us: Annotated[float, Meta(description="least pulse width [us]")]
-    high_us: Annotated[float, Meta(description="largest pulse width [us]")]
-    moves: Annotated[bool, Meta(description="varies by more than 5 us (one standard deviation)")]
-    saturated: Annotated[float, Meta(description="share of the time at SERVOn_MIN or _MAX, 0..1")]
+    surface: Annotated[str, Meta(description="control surface by the servo map, or empty")]
+    low_us: Annotated[float, Meta(description="minimum pulse width [us]")]
+    high_us: Annotated[float, Meta(description="maximum pulse width [us]")]
+    moves: Annotated[bool, Meta(description="standard deviation above 5 us")]
+    saturated: Annotated[float, Meta(description="fraction of the time at SERVOn_MIN or _MAX, 0..1")]
 
 
 class Airspeed(msgspec.Struct, frozen=True):
-    """Airspeed as the autopilot reports it, in the air where it was."""
+    """Airspeed reported by the autopilot, in flight if the aircraft flew."""
 
     sensor: Annotated[str, Meta(description="yes, no or unknown")]
-    how: Annotated[str, Meta(description="what tells so")]
-    low: Annotated[float | None, Meta(description="5 % are below [m/s]; null without rows")] = None
+    how: Annotated[str, Meta(description="evidence for `sensor`")]
+    low: Annotated[float | None, Meta(description="5th percentile [m/s]; null without rows")] = None
     median: Annotated[float | None, Meta(description="[m/s]")] = None
-    high: Annotated[float | None, Meta(description="5 % are above [m/s]")] = None
-    constant: Annotated[bool, Meta(description="varies by less than 0.05 m/s")] = False
+    high: Annotated[float | None, Meta(description="95th percentile [m/s]")] = None
+    constant: Annotated[bool, Meta(description="standard deviation below 0.05 m/s")] = False
 
 
 class Wind(msgspec.Struct, frozen=True):
-    """Wind as the autopilot says, in the air where it was."""
+    """Wind reported by the autopilot, in flight if the aircraft flew."""
 
-    speed: Annotated[float, Meta(description="of the mean wind [m/s]")]
-    from_deg: Annotated[float, Meta(description="where the mean wind blows from [deg]")]
-    low: Annotated[float, Meta(description="5 % are below [m/s]")]
-    high: Annotated[float, Meta(description="5 % are above [m/s]")]
+    speed: Annotated[float, Meta(description="speed of the mean wind [m/s]")]
+    from_deg: Annotated[float, Meta(description="direction the mean wind comes from [deg]")]
+    low: Annotated[float, Meta(description="5th percentile of the speed [m/s]")]
+    high: Annotated[float, Meta(description="95th percentile of the speed [m/s]")]
 
 
 class Route(msgspec.Struct, frozen=True):
-    """The mission last on board."""
+    """The last mission of the recording."""
 
     items: int = 0
     complete: bool = False
-    uploads: Annotated[int, Meta(description="item lists that differed")] = 0
-    flown: Annotated[tuple[int, ...], Meta(description="items that were in force, as they followed each other")] = ()
-    sentence: Annotated[str, Meta(description="what is wrong with it, or empty")] = ""
+    uploads: Annotated[int, Meta(description="number of different item lists")] = 0
+    flown: Annotated[tuple[int, ...], Meta(description="active items in order of time")] = ()
+    sentence: Annotated[str, Meta(description="problem with the mission, or empty")] = ""
 
 
 class Happened(msgspec.Struct, frozen=True):
     """One event."""
 
-    t_s: Annotated[float, Meta(description="since the recording began [s]")]
+    t_s: Annotated[float, Meta(description="time since the start of the recording [s]")]
     kind: Annotated[str, Meta(description="mode, armed, disarmed, item, mission, parameter, text, clock, link or gap")]
     text: str
 
 
 class Can(msgspec.Struct, frozen=True):
-    """One thing the twin does."""
+    """One function of the twin and whether this recording supports it."""
 
     name: str
     can: bool
-    why: Annotated[str, Meta(description="what was found and what is needed")]
+    why: Annotated[str, Meta(description="values found and required")]
 
 
 class Findings(msgspec.Struct, frozen=True, kw_only=True):
-    """One aircraft of one recording; fields may be added, none changes its meaning."""
+    """One aircraft of one recording; fields may be added, existing fields keep their meaning."""
 
     uav: Annotated[int, Meta(description="UAV id")]
     vehicle: Annotated[str, Meta(description="fixed_wing, quadplane, multirotor, helicopter or unknown")]
     autopilot: Annotated[str, Meta(description="ardupilot, px4 or generic")]
-    firmware: Annotated[str, Meta(description="as it names itself, or empty")]
-    begun: Annotated[float, Meta(description="when the recording begins [s since 1970]")]
-    seconds: Annotated[float, Meta(description="length of the recording [s]")]
-    airborne_s: Annotated[float, Meta(description="time in the air, by speed and height [s]")]
-    distance_m: Annotated[float, Meta(description="ground track flown in the air [m]")]
+    firmware: Annotated[str, Meta(description="firmware as the autopilot reports it, or empty")]
+    begun: Annotated[float, Meta(description="start of the recording [s since 1970]")]
+    seconds: Annotated[float, Meta(description="duration of the recording [s]")]
+    airborne_s: Annotated[float, Meta(description="time in flight, from speed and height [s]")]
+    distance_m: Annotated[float, Meta(description="length of the ground track in flight [m]")]
     altitude_m: Annotated[
-        tuple[float, float] | None, Meta(description="lowest and highest in the air, above mean sea level [m]")
+        tuple[float, float] | None, Meta(description="minimum and maximum in flight, above mean sea level [m]")
     ] = None
     received: Annotated[int, Meta(description="messages received")] = 0
-    missed: Annotated[int, Meta(description="messages missed, from gaps in the sequence number")] = 0
-    rejected: Annotated[int, Meta(description="messages or fields refused")] = 0
+    missed: Annotated[int, Meta(description="messages lost, from gaps in the sequence number")] = 0
+    rejected: Annotated[int, Meta(description="messages or fields rejected")] = 0
     clock_jumps: int = 0
     modes: tuple[Mode, ...] = ()
-    rows: Annotated[dict[str, Kind], Meta(description="by kind, as in `fleet schema sample`")] = {}
+    rows: Annotated[dict[str, Kind], Meta(description="by field, as in `fleet schema sample`")] = {}
     mission: Route = Route()
     params: Annotated[int, Meta(description="parameters received")] = 0
     params_complete: bool = False
-    servo_map: Annotated[str, Meta(description="how pulses become inputs")] = ""
+    servo_map: Annotated[str, Meta(description="assignment of output channels to control surfaces")] = ""
     servos: tuple[Servo, ...] = ()
     airspeed: Airspeed = Airspeed("unknown", "")
-    wind: Annotated[Wind | None, Meta(description="null where the autopilot says nothing of it")] = None
+    wind: Annotated[Wind | None, Meta(description="null if the autopilot reports no wind")] = None
     events: tuple[Happened, ...] = ()
-    events_lost: Annotated[int, Meta(description="events beyond the most that are kept")] = 0
+    events_lost: Annotated[int, Meta(description="events beyond the maximum number")] = 0
     abilities: tuple[Can, ...] = ()
 
 
 class File(msgspec.Struct, frozen=True, kw_only=True):
-    """One recording; `fleet inspect --json` gives a list of these under the key `files`."""
+    """One recording; `fleet inspect --json` writes a list of these under the key `files`."""
 
     file: str
     bytes: int = 0
-    sentences: Annotated[tuple[str, ...], Meta(description="what was skipped, damaged or not to be read")] = ()
+    sentences: Annotated[tuple[str, ...], Meta(description="data that was skipped, damaged or unreadable")] = ()
     aircraft: tuple[Findings, ...] = ()
-    twin: Annotated[dict[str, Any] | None, Meta(description="with --twin: what a twin made of it, by UAV id")] = None
+    twin: Annotated[dict[str, Any] | None, Meta(description="with --twin: results of a twin, by UAV id")] = None
 
 
 def findings(known: Survey, facts: Facts) -> Findings:
-    """Turn a survey into figures."""
+    """Compute the figures of one aircraft from its survey."""
     status, flown = known.status, airborne(known)
     return Findings(
         uav=known.uav,
@@ -188,7 +188,7 @@ def findings(known: Survey, facts: Facts) -> Findings:
 
 
 def happened(known: Survey, facts: Facts) -> list[Event]:
-    """Return the events in time order, the severe texts among them; a text that was also a sentence comes once."""
+    """Return the events and severe texts in time order, without duplicate texts."""
     texts = {text.strip(): t for t, severity, text in reversed(facts.texts) if severity <= _SEVERE}
     kept = [event for event in known.events if event.kind != "text" or event.text.strip() not in texts]
     severe = [Event(t, "text", text.strip()) for t, severity, text in facts.texts if severity <= _SEVERE]
@@ -200,7 +200,7 @@ def _since(known: Survey, t: float) -> float:
 
 
 def _in_air(known: Survey, name: str) -> np.ndarray:
-    """Return the rows of one kind flown in the air; all of them where it never was."""
+    """Return the rows of one field in flight, or all rows if the aircraft never flew."""
     t, x = known.rows[name].rows()
     there = inside(t, airborne(known))
     return x[there] if there.any() else x
@@ -258,7 +258,7 @@ def _servos(known: Survey) -> tuple[Servo, ...]:
     found = []
     for n in range(1, pulses.shape[1] + 1 if len(pulses) else 1):
         us = pulses[:, n - 1]
-        if us.max() < 500:  # no pulse a servo could follow
+        if us.max() < 500:  # not a servo pulse
             continue
         low, high = (known.values.get(f"SERVO{n}_{end}", np.nan) for end in ("MIN", "MAX"))
         at_end = (us <= low + _AT_END_US) | (us >= high - _AT_END_US)
@@ -269,12 +269,12 @@ def _servos(known: Survey) -> tuple[Servo, ...]:
 
 
 def _sensor(known: Survey) -> tuple[str, str]:
-    """Return whether there is an airspeed sensor, and what tells so."""
+    """Return whether there is an airspeed sensor, and the evidence."""
     for name in _SENSOR:
         if name in known.values:
             return "yes" if known.values[name] > 0 else "no", f"{name} is {known.values[name]:g}"
     spoken = [name for name in _SPOKEN if known.status and name in known.status.rates_hz]
-    return ("yes", f"{spoken[0]} is sent") if spoken else ("unknown", "neither parameters nor messages tell")
+    return ("yes", f"{spoken[0]} is sent") if spoken else ("unknown", "no evidence in parameters or messages")
 
 
 def _airspeed(known: Survey) -> Airspeed:
@@ -297,7 +297,7 @@ def _wind(known: Survey) -> Wind | None:
 
 
 def mode_seconds(told: Findings) -> dict[str, float]:
-    """Add up how long each mode was in force [s], the longest first."""
+    """Return the total duration of each mode [s], the longest first."""
     total: Counter[str] = Counter()
     for mode in told.modes:
         total[mode.mode] += mode.seconds  # type: ignore[assignment]

@@ -1,4 +1,4 @@
-"""What one recording says of one aircraft: its messages laid up in bounded memory, and what happened when."""
+"""Survey of one recording: rows and events of each aircraft, collected in bounded memory."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -15,20 +15,20 @@ LONGEST_S = {
     "velocity": 1.0,
     "servo": 0.5,
     "position": 1.0,
-}  # wider intervals the twin never fills [s]
-SILENT_S = 3.0  # no row of any kind for so long is a gap of the link [s]
+}  # longest interval that the twin interpolates [s]
+SILENT_S = 3.0  # interval without any row that counts as a link gap [s]
 MOST_EVENTS = 2_000
-BUDGET = 5_000_000  # rows kept over all aircraft and kinds
-FAST = 6.0  # no small fixed wing is on the ground at this speed [m/s]
-_HIGH = 5.0  # above the lowest of the recording: in the air, where armed [m]
+BUDGET = 5_000_000  # rows stored for all aircraft and fields
+FAST = 6.0  # a small fixed wing above this speed is in flight [m/s]
+_HIGH = 5.0  # an armed aircraft this far above the lowest point is in flight [m]
 ROTORS = ("multirotor", "helicopter", "quadplane")
-ROTORS_FAST, ROTORS_HIGH = 2.0, 1.5  # the same of aircraft that take off vertically [m/s, m]
-_BRIDGE_S, _HOP_S = 10.0, 5.0  # shorter landings and flights are none [s]
-_BY_ITSELF = ("STAT_", "BARO1_GND_", "BARO2_GND_", "BARO3_GND_", "GND_ABS_")  # parameters nobody set
+ROTORS_FAST, ROTORS_HIGH = 2.0, 1.5  # the same for aircraft that take off vertically [m/s, m]
+_BRIDGE_S, _HOP_S = 10.0, 5.0  # shorter landings and flights are ignored [s]
+_BY_ITSELF = ("STAT_", "BARO1_GND_", "BARO2_GND_", "BARO3_GND_", "GND_ABS_")  # set by the autopilot
 
 
 class Event(NamedTuple):
-    """Something that happened: when [s since 1970], of which kind, in words."""
+    """One event: time [s since 1970], kind, text."""
 
     t: float
     kind: str  # mode, armed, disarmed, item, mission, parameter, text, clock, link or gap
@@ -41,18 +41,18 @@ def _thinned(name: str) -> Thinned:
 
 @dataclass
 class Survey:
-    """One aircraft: fill it with `hear`.
+    """Rows and events of one aircraft; `update` adds messages.
 
     Attributes:
         uav: UAV id
-        begun: when the recording begins [s since 1970]
-        kind: of the recording, as in `recordings.KINDS`; empty: not known
-        rows: measurements by kind, as in `contract.COLUMNS`
-        refused: kinds of a message that did not fit the contract
-        modes: (since when [s since 1970], mode), as they followed each other
-        armings: the same for armed or not
+        start_t: start of the recording [s since 1970]
+        kind: kind of recording, as in `recordings.KINDS`; empty if unknown
+        rows: measurements by field, as in `contract.COLUMNS`
+        rejected_fields: number of message fields that violate the contract
+        mode_changes: (start [s since 1970], mode) in order of time
+        arming_changes: (start [s since 1970], armed) in order of time
         status, mission, params: the newest of each
-        missions: item lists that were not the same as the one before
+        mission_count: number of item lists that differ from the previous one
     """
 
     uav: int
@@ -68,10 +68,10 @@ class Survey:
     missions: int = 0
     params: Params | None = None
     events: list[Event] = field(default_factory=list)
-    lost_events: int = 0  # beyond `MOST_EVENTS`
+    lost_events: int = 0  # beyond `MAX_EVENTS`
     _seq: int = -1
     _sentence: str = ""
-    _heard: float = np.nan  # newest sample
+    _heard: float = np.nan  # time of the newest sample [s since 1970]
 
     @property
     def vehicle(self) -> str:
@@ -80,7 +80,7 @@ class Survey:
 
     @property
     def items(self) -> tuple[Item, ...]:
-        """Return the mission items last on board."""
+        """Return the items of the last mission."""
         return self.mission.items if self.mission else ()
 
     @property
@@ -89,12 +89,12 @@ class Survey:
         return self.params.values if self.params else {}
 
     def origin(self) -> Origin | None:
-        """Return the first place it was, as the origin of a local frame; None before any."""
+        """Return the first position as the origin of a local frame; None without positions."""
         _, x = self.rows["position"].rows()
         return Origin(*(int(v) for v in x[0])) if len(x) else None
 
     def note(self, t: float, kind: str, text: str) -> None:
-        """Remember an event, unless there are too many."""
+        """Append an event, or count it as dropped beyond `MAX_EVENTS`."""
         if len(self.events) < MOST_EVENTS:
             self.events.append(Event(t, kind, text))
         else:
@@ -102,13 +102,13 @@ class Survey:
 
 
 def survey(messages: Iterable[Message], kind: str = "") -> dict[int, Survey]:
-    """Take a whole recording.
+    """Survey a complete recording.
 
     Args:
-        messages: Sample, Status, Mission, Params in the order they were heard
-        kind: of the recording, as in `recordings.KINDS`
+        messages: Sample, Status, Mission, Params in order of reception
+        kind: kind of recording, as in `recordings.KINDS`
     Returns:
-        what it says of each aircraft, by UAV id
+        survey of each aircraft, by UAV id
     """
     found: dict[int, Survey] = {}
     begun = np.nan
@@ -126,7 +126,7 @@ def survey(messages: Iterable[Message], kind: str = "") -> dict[int, Survey]:
 
 
 def hear(known: Survey, message: Message) -> None:
-    """Take one message of this aircraft."""
+    """Add one message of this aircraft."""
     known.newest = max(known.newest, message.t)
     if isinstance(message, Sample):
         _hear_sample(known, message)
@@ -142,12 +142,12 @@ def hear(known: Survey, message: Message) -> None:
 
 
 def _course(mission: Mission | None) -> list[tuple[int, int, int, float]]:
-    """Return what is flown: not home, which moves, nor frames and spare numbers, which autopilots send back changed."""
+    """Return command and position of all items but home; autopilots may change home, frames and unused parameters."""
     return [(i.command, i.lat_e7, i.lon_e7, i.alt_m) for i in (mission.items[1:] if mission else ())]
 
 
 def _share(found: dict[int, Survey]) -> None:
-    """Return every aircraft its share of the rows kept."""
+    """Distribute the row budget equally over the aircraft."""
     most = max(min(MOST, BUDGET // (len(COLUMNS) * len(found))), 1_000)
     for each in found.values():
         for kind in each.rows.values():
@@ -212,7 +212,7 @@ def _hear_params(known: Survey, params: Params) -> None:
 
 
 def armed_spans(known: Survey) -> list[Span]:
-    """Return the stretches it was armed; the whole recording where nothing is said of it."""
+    """Return the armed intervals, or the complete recording if the arming state is unknown."""
     if not any(armed for _, armed in known.armings):
         return [Span(known.begun, known.newest)]
     ends = [*(t for t, _ in known.armings[1:]), known.newest]
@@ -220,7 +220,7 @@ def armed_spans(known: Survey) -> list[Span]:
 
 
 def airborne(known: Survey) -> list[Span]:
-    """Return the stretches it was in the air, as speed and height tell."""
+    """Return the flight intervals, derived from speed and height."""
     t_v, v = known.rows["velocity"].rows()
     t_p, p = known.rows["position"].rows()
     if not len(t_v) or not len(t_p):
@@ -233,13 +233,13 @@ def airborne(known: Survey) -> list[Span]:
         height = np.interp(t_v, t_p, p[:, 2]) * 1e-3
         flying |= armed & (height - np.percentile(height[armed], 1) > high)
         t_h, above_home = known.rows["height"].rows()
-        if rotors and len(t_h):  # it may hover from the first row to the last
+        if rotors and len(t_h):  # covers a recording that is one long hover
             flying |= armed & (np.interp(t_v, t_h, above_home[:, 0]) > high)
     return _bridged(t_v, flying)
 
 
 def _bridged(t: np.ndarray, on: np.ndarray) -> list[Span]:
-    """Join stretches with a short pause between them, and drop short ones."""
+    """Merge intervals separated by short pauses, and drop short intervals."""
     spans: list[Span] = []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int)))
     for start, stop in zip(t[edges[::2]].tolist(), t[edges[1::2] - 1].tolist(), strict=True):
@@ -251,7 +251,7 @@ def _bridged(t: np.ndarray, on: np.ndarray) -> list[Span]:
 
 
 def spells(known: Survey) -> list[tuple[Span, str]]:
-    """Return the modes with the stretch each was in force."""
+    """Return each mode with its interval."""
     if not known.modes:
         return []
     ends = [*(t for t, _ in known.modes[1:]), known.newest]

@@ -1,19 +1,19 @@
-"""Rows of one kind over a whole flight in bounded memory: thinned rows, but every interval looked at."""
+"""Rows of one field in bounded memory: decimated rows, and statistics of all intervals."""
 
 from heapq import nlargest
 from typing import NamedTuple
 
 import numpy as np
 
-MOST = 200_000  # rows of one kind kept [-]
-_BLOCK = 4_096  # rows looked at together
-_WIDEST = 1_000  # intervals remembered with their place
-_SHORTEST_S = 1.0  # an unbroken stretch shorter than this is not remembered [s]
-_BINS, _PER_DECADE, _LOWEST = 180, 20, -5  # of the intervals: 10 us to 10,000 s
+MOST = 200_000  # stored rows of one field [-]
+_BLOCK = 4_096  # rows processed at once
+_WIDEST = 1_000  # wide intervals stored with their start
+_SHORTEST_S = 1.0  # shorter continuous stretches are ignored [s]
+_BINS, _PER_DECADE, _LOWEST = 180, 20, -5  # interval histogram: 10 us to 10,000 s
 
 
 class Span(NamedTuple):
-    """A stretch of time [s since 1970]."""
+    """A time interval [s since 1970]."""
 
     start: float
     stop: float
@@ -25,12 +25,12 @@ class Span(NamedTuple):
 
 
 class Thinned:
-    """Take rows as they come; when `most` are kept, every second one is let go and only every second one taken.
+    """Store rows in order; beyond `max_rows`, halve the stored rows and double the stride.
 
     Args:
-        longest: an interval wider than this breaks a stretch [s]
-        most: rows kept
-        dtype: of the kept values; positions need all digits of a double
+        max_interval_s: an interval longer than this ends a stretch [s]
+        max_rows: maximum number of stored rows
+        dtype: type of the stored values; positions need double precision
     """
 
     def __init__(self, longest: float, most: int = MOST, dtype: str = "<f4") -> None:
@@ -45,14 +45,14 @@ class Thinned:
         self._stretches: list[Span] = []
 
     def add(self, t: np.ndarray, x: np.ndarray) -> None:
-        """Take rows: times (n,) [s since 1970] and values (n, k)."""
+        """Add rows: times (n,) [s since 1970] and values (n, k)."""
         self._pending.append((t, x))
         self._waiting += len(t)
         if self._waiting >= _BLOCK:
             self._settle()
 
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the kept rows, (m,) and (m, k)."""
+        """Return times and values of the stored rows, (m,) and (m, k)."""
         self._settle()
         if not self._kept:
             return np.zeros(0), np.zeros((0, 0), self.dtype)
@@ -62,41 +62,41 @@ class Thinned:
 
     @property
     def count(self) -> int:
-        """Return how many rows came, kept or not."""
+        """Return the number of rows added."""
         self._settle()
         return self._count
 
     @property
     def stride(self) -> int:
-        """Return of how many rows one is kept."""
+        """Return the decimation stride: one row in `stride` is stored."""
         self._settle()
         return self._stride
 
     @property
     def rate_hz(self) -> float:
-        """Return rows per second outside gaps; 0 while there are fewer than two."""
+        """Return rows per second outside gaps; 0 with fewer than two rows."""
         self._settle()
         usual = _edges() <= self._gap_s()
         seconds = float(self._seconds[usual].sum())
         return float(self._intervals[usual].sum()) / seconds if seconds else 0.0
 
     def gaps(self) -> list[Span]:
-        """Return intervals that are gaps in time order, at most 1,000: wide for this kind, and three times the usual.
+        """Return at most 1,000 gaps in time order.
 
-        Wide for a kind is what breaks its stretches.
+        A gap is longer than `max_interval_s` and than three times the median interval.
         """
         self._settle()
         limit = self._gap_s()
         return sorted(Span(start, start + length) for length, start in self._wide if length > limit)
 
     def stretches(self) -> list[Span]:
-        """Return the stretches of at least a second that no interval wider than `longest` breaks."""
+        """Return the stretches of at least 1 s without an interval longer than `max_interval_s`."""
         self._settle()
         last = Span(float(self._open), float(self._last))
         return [*self._stretches, last] if last.seconds >= _SHORTEST_S else list(self._stretches)
 
     def _gap_s(self) -> float:
-        """Return the interval above which one is a gap [s]."""
+        """Return the interval above which there is a gap [s]."""
         n = self._intervals.sum()
         usual = _edges()[np.searchsorted(np.cumsum(self._intervals), 0.5 * n)] if n else 0.0
         return float(max(self.longest, 3 * usual))
@@ -118,7 +118,7 @@ class Thinned:
         self._last = t[-1]
 
     def _look(self, t: np.ndarray) -> None:
-        """Account for every interval up to the last of these times."""
+        """Add all intervals up to the last of these times to the statistics."""
         before = np.concatenate([[self._last], t[:-1]])
         dt = t - before
         real = dt[dt > 0]
@@ -137,7 +137,7 @@ class Thinned:
 
     def _keep(self, t: np.ndarray, x: np.ndarray) -> None:
         taken = slice(-self._count % self._stride, None, self._stride)
-        self._kept.append((t[taken].copy(), x[taken].copy()))  # a view would keep what is let go
+        self._kept.append((t[taken].copy(), x[taken].copy()))  # a view would hold the full array in memory
         self._count += len(t)
         while sum(len(kept) for kept, _ in self._kept) > self.most:
             whole_t, whole_x = (np.concatenate([pair[i] for pair in self._kept]) for i in (0, 1))
@@ -146,12 +146,12 @@ class Thinned:
 
 
 def _edges() -> np.ndarray:
-    """Return the upper edge of each bin of intervals, (n,) [s]."""
+    """Return the upper edge of each histogram bin, (n,) [s]."""
     return 10.0 ** (_LOWEST + (np.arange(_BINS) + 1) / _PER_DECADE)
 
 
 def overlap(one: list[Span], other: list[Span]) -> list[Span]:
-    """Return the stretches that lie in both, each list in time order."""
+    """Return the intersection of two lists of intervals, each in time order."""
     out, i, j = [], 0, 0
     while i < len(one) and j < len(other):
         both = Span(max(one[i].start, other[j].start), min(one[i].stop, other[j].stop))
@@ -165,7 +165,7 @@ def overlap(one: list[Span], other: list[Span]) -> list[Span]:
 
 
 def inside(t: np.ndarray, spans: list[Span]) -> np.ndarray:
-    """Tell which times lie in any of the spans, (n,) bool."""
+    """Return a mask of the times inside any interval, (n,) bool."""
     out = np.zeros(len(t), bool)
     for span in spans:
         out |= (t >= span.start) & (t <= span.stop)
@@ -173,5 +173,5 @@ def inside(t: np.ndarray, spans: list[Span]) -> np.ndarray:
 
 
 def seconds(spans: list[Span]) -> float:
-    """Add up the lengths [s]."""
+    """Return the total length [s]."""
     return float(sum(span.seconds for span in spans))

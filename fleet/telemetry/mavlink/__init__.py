@@ -1,1 +1,1 @@
-"""MAVLink frames to samples, status, mission and parameters of each aircraft."""
+"""Conversion of MAVLink frames to samples, status, mission and parameters of each aircraft."""

@@ -1,4 +1,4 @@
-"""One aircraft as it speaks: rows, mode, losses, parameters, route; heard in batches, handed over in small steps."""
+"""MAVLink state of one aircraft: rows, mode, losses, parameters, mission; received in batches, returned in steps."""
 
 from collections import deque
 from collections.abc import Callable, Hashable
@@ -14,22 +14,22 @@ from fleet.telemetry.mavlink.onboard_log import Said
 from fleet.telemetry.mavlink.timing import Timing
 from fleet.telemetry.tables import clock
 
-LOST_S = 3.0  # silence after which the link is called lost [s]
-STATUS_S = 0.95  # between two messages; a little under the second, for it is asked every 0.1 s [s]
-REMEMBER_S = 30.0  # how long a sentence stands [s]
-SEVERE = 3  # texts up to this severity are an operator's business (MAV_SEVERITY_ERROR)
+LOST_S = 3.0  # silence after which the link is lost [s]
+STATUS_S = 0.95  # period of status messages; below 1 s because it is checked every 0.1 s [s]
+REMEMBER_S = 30.0  # display time of an operator text [s]
+SEVERE = 3  # texts up to this severity are shown to the operator (MAV_SEVERITY_ERROR)
 MOST_TEXTS = 2_000
 
 
 class Craft:
-    """Everything known of one aircraft; what comes by the thousand is in its flock, the rest comes by `queue`.
+    """State of one aircraft; frequent data are in the shared arrays, all other messages pass through `queue`.
 
     Args:
-        flock: the aircraft it is one of
+        arrays: shared arrays of all aircraft
         uav: UAV id
         system, component: MAVLink ids
-        source: who sends what it says
-        number: in the flock, of one that was forgotten; None: a new one
+        source: sender of its messages
+        number: number in the arrays of a removed aircraft; None: a new number
     """
 
     def __init__(
@@ -47,15 +47,15 @@ class Craft:
         self.number = flock.add(uav) if number is None else number
         self.link = Link.LIVE
         self.autopilot, self.mode, self.armed = "generic", "", False
-        self.kind = heartbeat.UNKNOWN  # of vehicle, as its heartbeat tells
+        self.kind = heartbeat.UNKNOWN  # vehicle type from the heartbeat
         self.firmware = ""
-        self.board = ""  # the autopilot's own number and version; empty: not told
-        self.texts: deque[tuple[float, int, str]] = deque(maxlen=MOST_TEXTS)  # fleet time, severity, words
+        self.board = ""  # hardware id and firmware version of the autopilot, or empty
+        self.texts: deque[tuple[float, int, str]] = deque(maxlen=MOST_TEXTS)  # fleet time, severity, text
         self.params, self.route = ParamBook(uav), RouteBook(uav)
         self.rates: dict[str, float] = {}
         self.timing = Timing(lambda: flock.clocks[self.number])
         self._waiting: list[tuple[float, Callable[..., None], tuple[Any, ...]]] = []
-        self._done = 0  # of those waiting
+        self._done = 0  # processed entries of the queue
         self._refused = 0
         self._sentence, self._said = "", float("-inf")
         self._jumps, self._advance_s = 0, 0.0
@@ -64,29 +64,29 @@ class Craft:
 
     @property
     def vehicle(self) -> str:
-        """Name the kind of vehicle; ArduPlane calls itself a fixed wing also where it can hover."""
+        """Return the vehicle type; an ArduPlane quadplane also sends MAV_TYPE_FIXED_WING."""
         hovers = self.kind == heartbeat.FIXED_WING and self.params.values.get("Q_ENABLE", 0.0) > 0
         return heartbeat.QUADPLANE if hovers else self.kind
 
     @property
     def heard(self) -> float:
-        """Tell when the last message arrived, fleet time [s since 1970]."""
+        """Return the arrival of the last message, fleet time [s since 1970]."""
         return float(self.flock.counts.state[self.number, HEARD])
 
     def jumped(self, arrival: float) -> None:
-        """Take note that the aircraft's clock jumped."""
+        """Queue a jump of the aircraft's clock."""
         self.queue(arrival, self._jump, clock.jumps(self.flock.clocks[self.number]))
 
     def reanchored(self, arrival: float, step_s: float) -> None:
-        """Take note that telemetry times were moved forward by `step_s`, because they fell behind their arrival."""
+        """Queue a forward re-anchoring of the telemetry times by `step_s`."""
         self.queue(arrival, self._advance, step_s)
 
     def doubted(self, arrival: float, count: int) -> None:
-        """Take note that so many rows were refused."""
+        """Queue a number of rejected rows."""
         self.queue(arrival, self._count_refused, count)
 
     def queue(self, arrival: float, what: Callable[..., None], *arguments: Any) -> None:
-        """Have `what` called with `arrival` as its last argument once time has come so far."""
+        """Call `callback` with `arrival` as its last argument when `collect` reaches that time."""
         if self._done:
             del self._waiting[: self._done]
             self._done = 0
@@ -97,12 +97,12 @@ class Craft:
         self.flock.look[self.number] = min(arrival, self.flock.look[self.number])
 
     def take(self, now: float) -> list[Status | Mission | Params]:
-        """Hand over what is new at `now` [s since 1970] and no row: route, parameters, status."""
+        """Return the new mission, parameters and status at `now` [s since 1970]."""
         while self._done < len(self._waiting) and self._waiting[self._done][0] <= now:
             arrival, what, arguments = self._waiting[self._done]
             self._done += 1
             what(*arguments, arrival)
-        if self._done == len(self._waiting):  # what was heard is not kept
+        if self._done == len(self._waiting):  # free the processed messages
             self._waiting.clear()
             self._done = 0
         found = (self.route.take(now), self.params.take(now), self._status(now))
@@ -110,22 +110,22 @@ class Craft:
         return [message for message in found if message is not None]
 
     def _next(self, now: float) -> float:
-        """Tell when to look again at the latest, `now` where the link is lost [s since 1970]."""
+        """Return the latest time of the next `collect`, `now` if the link is lost [s since 1970]."""
         if self.link is Link.LOST:
             return now
         queued = self._waiting[self._done][0] if self._done < len(self._waiting) else float("inf")
         return min(queued, self._told_at + STATUS_S, float(self.flock.counts.state[self.number, SPOKE]) + LOST_S)
 
     def say(self, sentence: str, now: float) -> None:
-        """Leave a sentence for the operator; it stands for half a minute."""
+        """Set the operator text; it expires after `TEXT_LIFETIME_S`."""
         self._sentence, self._said = f"uav-{self.uav}: {sentence}", now
 
     def meet(self, message: Any) -> None:
-        """Learn from a heartbeat what speaks here."""
+        """Set autopilot and vehicle type from a heartbeat."""
         self.autopilot, self.kind = heartbeat.autopilot(message), heartbeat.vehicle(message)
 
     def hear(self, message: Any, now: float) -> None:
-        """Take one MAVLink message that is no row."""
+        """Process one MAVLink message that is not a table row."""
         name = message.get_type()
         if name == "HEARTBEAT":
             self.meet(message)
@@ -144,11 +144,11 @@ class Craft:
                 self.firmware = self.firmware or heartbeat.firmware(message)
 
     def overhear(self, message: Any, now: float) -> None:
-        """Take one message of the mission protocol that a ground station sent to this aircraft."""
+        """Process one mission protocol message from a ground station to this aircraft."""
         self.route.hear(message, up=True, now=now)
 
     def told(self, said: Said, now: float) -> None:
-        """Take what an onboard log says that is no row."""
+        """Process one event of an onboard log."""
         if said.what == "mode":
             self.mode = said.value
         elif said.what == "armed":
@@ -162,9 +162,9 @@ class Craft:
             self._read(severity, words, now)
 
     def refuse(self, name: str, count: int, now: float) -> None:
-        """Count rows whose values cannot be."""
+        """Count rows with implausible values."""
         self._refused += count
-        self.say(f"{name} with a value that is not finite or out of range was refused; check the sensor", now)
+        self.say(f"{name} with a value that is not finite or out of range was rejected; check the sensor", now)
 
     def _read(self, severity: int, words: str, now: float) -> None:
         self.texts.append((now, severity, words))
@@ -174,14 +174,14 @@ class Craft:
 
     def _jump(self, count: int, now: float) -> None:
         self._jumps = count
-        self.route.stale = True  # after a restart there may be another mission on board
-        self.say(f"the aircraft's clock jumped ({count} times so far), time was anchored anew", now)
+        self.route.stale = True  # the mission may differ after a restart
+        self.say(f"the aircraft's clock jumped ({count} times so far), time was re-anchored", now)
 
     def _advance(self, step_s: float, now: float) -> None:
         self._advance_s += step_s
         self.say(
-            f"telemetry times were {step_s:.1f} s behind their arrival for half a minute and were re-anchored; "
-            "expected real time: a slow or paused simulator falls behind",
+            f"telemetry times were {step_s:.1f} s behind arrival for 15 to 30 s and were re-anchored; "
+            "expected real time; check for a slow or paused simulator",
             now,
         )
 
@@ -224,5 +224,5 @@ class Craft:
     def _words(self, now: float) -> str:
         if self.link is Link.LOST:
             silent_s = now - self.flock.counts.state[self.number, SPOKE]
-            return f"uav-{self.uav}: nothing heard for {silent_s:.0f} s; check the radio link"
+            return f"uav-{self.uav}: no message for {silent_s:.0f} s; check the radio link"
         return self._sentence if now - self._said < REMEMBER_S else ""

@@ -1,4 +1,4 @@
-"""A batch of MAVLink frames through THE TABLE: all frames of one message at once, for all aircraft at once."""
+"""Convert a batch of MAVLink frames by the MAVLink table: all frames of one message, all aircraft at once."""
 
 from collections.abc import Sequence
 
@@ -20,13 +20,13 @@ _GIVEN = np.array([FIELDS.index(row.given) if row.given else NO_FIELD for row in
 
 
 def lay(frames: Frames, owner: np.ndarray, crafts: Sequence[Craft], flock: Flock) -> None:
-    """Return every aircraft its rows.
+    """Convert frames to telemetry rows and add them to the arrays.
 
     Args:
-        frames: what was heard
-        owner: number in `crafts` of each frame's aircraft, -1 for nobody's, (n,)
-        crafts: the aircraft on this link
-        flock: what is remembered of them
+        frames: received frames
+        owner: number in `aircraft` of each frame's aircraft, -1 without owner, (n,)
+        aircraft: the aircraft on this link
+        arrays: their state
     """
     dealt, said = Dealt(frames), Said(frames, owner, crafts)
     names = set(dealt.names())
@@ -48,19 +48,19 @@ def lay(frames: Frames, owner: np.ndarray, crafts: Sequence[Craft], flock: Flock
 
 
 class Said:
-    """What a batch of frames says, by the rows of the table."""
+    """Read a batch of frames by the rows of the table."""
 
     def __init__(self, frames: Frames, owner: np.ndarray, crafts: Sequence[Craft]) -> None:
         self._frames, self._owner, self._crafts = frames, owner, crafts
         self._autopilot = np.array([craft.autopilot for craft in crafts])
 
     def rows(self, row: Row, which: np.ndarray, fields: Fields) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Read one row of the table: frame numbers (n,), own times (n,) [s], values (n, 8); None where there is none.
+        """Apply one table row: frame numbers (n,), time stamps (n,) [s], values (n, 8); None without valid frames.
 
         Args:
-            row: of the table
-            which: numbers of the frames of its message, (m,)
-            fields: of those frames
+            row: table row
+            frame_numbers: frames of its message, (m,)
+            fields: fields of these frames
         """
         meant = self._owner[which] >= 0
         if row.autopilots and meant.any():
@@ -73,7 +73,7 @@ class Said:
         if not len(which):
             return None
         values = np.zeros((len(which), WIDEST))
-        with np.errstate(all="ignore"):  # not a number in, not a number out: refused below
+        with np.errstate(all="ignore"):  # NaN propagates and is rejected below
             for k, column in enumerate(row.columns(fields)):
                 values[:, k] = column
             good = believable(row.field, values[:, : len(COLUMNS[row.field])])
@@ -84,7 +84,7 @@ class Said:
         return which[good], raw_s[good], values[good]
 
     def _refuse(self, message: str, which: np.ndarray) -> None:
-        """Tell aircraft that frames of theirs hold what cannot be."""
+        """Report frames with implausible values to their aircraft."""
         owner = self._owner[which]
         for number in np.unique(owner).tolist():
             mine, craft = which[owner == number], self._crafts[number]

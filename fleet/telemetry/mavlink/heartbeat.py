@@ -1,4 +1,4 @@
-"""What a HEARTBEAT tells: aircraft or not, which autopilot, which kind of vehicle, which mode."""
+"""Evaluate HEARTBEAT: aircraft or not, autopilot, vehicle type, mode."""
 
 from typing import Any
 
@@ -30,46 +30,46 @@ _VEHICLE = {
     dialect.MAV_TYPE_KITE: UNKNOWN,
     dialect.MAV_TYPE_PARAFOIL: UNKNOWN,
 }
-"""MAV_TYPE of everything that flies; any other type (ground station, gimbal, camera, ADS-B, rover) is no UAV."""
+"""MAV_TYPE of all aircraft; any other type (ground station, gimbal, camera, ADS-B, rover) is not a UAV."""
 
 
 def is_aircraft(heartbeat: Any) -> bool:
-    """Return whether this heartbeat comes from the autopilot of an aircraft."""
+    """Return whether the sender is the autopilot of an aircraft."""
     return heartbeat.type in _VEHICLE and heartbeat.autopilot != dialect.MAV_AUTOPILOT_INVALID
 
 
 def vehicle(heartbeat: Any) -> str:
-    """Name the kind of vehicle as `Status.vehicle` does."""
+    """Return the vehicle type as in `Status.vehicle`."""
     return _VEHICLE.get(heartbeat.type, UNKNOWN)
 
 
 def autopilot(heartbeat: Any) -> str:
-    """Name the autopilot as `Status.autopilot` does."""
+    """Return the autopilot as in `Status.autopilot`."""
     return _AUTOPILOT.get(heartbeat.autopilot, "generic")
 
 
 def mode(heartbeat: Any) -> str:
-    """Name the flight mode as the autopilot does, e.g. AUTO (ArduPilot) or MISSION (PX4)."""
+    """Return the autopilot's name of the flight mode, e.g. AUTO (ArduPilot) or MISSION (PX4)."""
     return str(mavutil.mode_string_v10(heartbeat))
 
 
 def armed(heartbeat: Any) -> bool:
-    """Return whether the motors may turn."""
+    """Return whether the aircraft is armed."""
     return bool(heartbeat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
 
 
 def firmware(version: Any) -> str:
-    """Read AUTOPILOT_VERSION, e.g. 4.7.0."""
+    """Return the firmware version of AUTOPILOT_VERSION, e.g. 4.7.0."""
     number = version.flight_sw_version
     return f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}"
 
 
 def board(version: Any) -> str:
-    """Read which board with which firmware AUTOPILOT_VERSION comes from; empty where it does not say."""
+    """Return hardware id and firmware version of AUTOPILOT_VERSION, or an empty string."""
     number = bytes(version.uid2).hex().strip("0") or (f"{version.uid:x}" if version.uid else "")
     return f"{number}-{version.flight_sw_version:08x}" if number else ""
 
 
 def names_firmware(words: str) -> bool:
-    """Return whether a text names autopilot and version, e.g. ArduPlane V4.7.0-dev (d55cb382)."""
+    """Return whether a text contains autopilot and version, e.g. ArduPlane V4.7.0-dev (d55cb382)."""
     return words.startswith(("ArduPlane V", "ArduCopter V", "APM:", "PX4 v", "Blimp V", "ArduRover V"))

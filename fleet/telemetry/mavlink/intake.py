@@ -1,4 +1,4 @@
-"""Everything between the bytes of one link and contract messages: no sockets, no wall clock."""
+"""Convert the bytes of one link to contract messages, without sockets or wall clock."""
 
 from collections import Counter
 from collections.abc import Callable, Hashable
@@ -24,83 +24,83 @@ from fleet.telemetry.mavlink.timing import time
 MOST_UAVS = 2_000  # over all links
 SECOND = "second sender for a live id"
 NOT_YET = "no aircraft heartbeat yet"
-MOST_EARLY = 4096  # messages of one system kept until its first heartbeat; a recording may begin anywhere
-MOST_EARLY_ALL = 32_768  # the same of all systems of a link, some 25 MB
-EARLY_S = 15.0  # how long they are kept: heartbeats come every second [s]
-FORGET_S = 30.0  # silence after which an aircraft that was not heard for `KNOWN_S` is forgotten [s]
-KNOWN_S = 30.0  # an aircraft heard for so long stays, lost, until its place is needed [s]
+MOST_EARLY = 4096  # messages of one system buffered until its first heartbeat
+MOST_EARLY_ALL = 32_768  # the same for all systems of a link, about 25 MB
+EARLY_S = 15.0  # maximum age of buffered messages; heartbeats arrive every second [s]
+FORGET_S = 30.0  # silence after which an aircraft may be removed [s]
+KNOWN_S = 30.0  # an aircraft received for this long is only removed for a new aircraft [s]
 
 News = Sample | Status | Mission | Params | Alert
-EARLY = MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # said once, so worth keeping; rows come again
-SINGLE = np.zeros(len(EXTRA), bool)  # by message id: heard one by one; all others are rows, or only counted
+EARLY = MESSAGES | {"PARAM_VALUE", "HOME_POSITION"}  # sent once, therefore buffered; rows are repeated
+SINGLE = np.zeros(len(EXTRA), bool)  # by message id: processed individually, not as table rows
 SINGLE[[IDS[name] for name in (*EARLY, "HEARTBEAT", "STATUSTEXT", "AUTOPILOT_VERSION")]] = True
-SINGLE[IDS["MISSION_CURRENT"]] = True  # a row too
+SINGLE[IDS["MISSION_CURRENT"]] = True  # also a table row
 Claims = dict[int, Craft]
-"""Which aircraft holds a UAV id, over all links of a gateway."""
+"""Aircraft that owns a UAV id, over all links of a gateway."""
 Admit = Callable[[Frames, Counter[str]], Frames]
-"""Leaves out frames that may not come in, and counts them by reason."""
+"""Remove frames that are not admitted, and count them by reason."""
 
 
 class Intake:
-    """Turn what one link heard into messages of the contract.
+    """Convert the bytes received on one link to contract messages.
 
     Args:
         offset: UAV id = MAVLink system id + offset
-        claims: shared by the links of one gateway, so that an id heard on two of them is noticed
-        most: UAVs over all those links
-        admit: what may come in; None: everything
+        id_owners: shared by the links of one gateway, to detect an id used on two links
+        max_uavs: maximum number of UAVs over all these links
+        admit: admission filter; None: no filter
     """
 
     def __init__(
         self, offset: int = 0, claims: Claims | None = None, most: int = MOST_UAVS, admit: Admit | None = None
     ) -> None:
         self.offset = offset
-        self.refused: Counter[str] = Counter()  # good frames refused, by reason
+        self.refused: Counter[str] = Counter()  # valid frames rejected, by reason
         self.crafts: dict[int, Craft] = {}  # by MAVLink system id
         self.decoder = Decoder()
         self.flock = Flock(KINDS)
         self._claims: Claims = {} if claims is None else claims
-        self._speakers = np.full(1 << 16, -1)  # number of the aircraft by system and component
+        self._speakers = np.full(1 << 16, -1)  # aircraft number by system and component
         self._most, self._admit = most, admit
         self._heard: list[Heard] = []
-        self._sorted: list[Frames] = []  # admitted, not yet digested
+        self._sorted: list[Frames] = []  # admitted, not yet processed
         self._collisions: dict[int, Collision] = {}  # by UAV id
-        self._born: dict[int, int] = {}  # in this batch: by system, the frame of its first heartbeat
-        self._rivals: set[int] = set()  # systems whose UAV id another link holds
-        self._early: dict[int, list[tuple[float, Any]]] = {}  # before the first heartbeat, by system id
-        self._early_n = 0  # of all of them
-        self._numbered: list[Craft] = []  # by number in the flock, forgotten ones too: a system keeps its number
-        self._met: dict[int, float] = {}  # when each was met, by system id [s since 1970]
+        self._born: dict[int, int] = {}  # in this batch: frame number of the first heartbeat, by system
+        self._rivals: set[int] = set()  # systems whose UAV id another link owns
+        self._early: dict[int, list[tuple[float, Any]]] = {}  # messages before the first heartbeat, by system id
+        self._early_n = 0  # number of these messages
+        self._numbered: list[Craft] = []  # by number in the arrays, including removed aircraft
+        self._met: dict[int, float] = {}  # registration time by system id [s since 1970]
 
     def hear(self, arrival: float, data: bytes, source: Hashable = None) -> None:
-        """Take bytes that arrived together; they are worked through at the next `flush`.
+        """Receive bytes that arrived together; the next `flush` processes them.
 
         Args:
             arrival: fleet time of arrival [s since 1970]
             data: any bytes
-            source: who sent them, e.g. the UDP address; None on a stream with a single far end
+            source: the sender, e.g. its UDP address; None on a stream with a single remote end
         """
         self.listen(Heard.of([(arrival, source, data)]))
 
     def listen(self, heard: Heard) -> None:
-        """Take many pieces of bytes; they are worked through at the next `flush`."""
+        """Receive many pieces of bytes; the next `flush` processes them."""
         self._heard.append(heard)
 
     def flush(self, now: float) -> list[News]:
-        """Hand over what is new; `now` is fleet time [s since 1970]."""
+        """Return the new messages; `now` is fleet time [s since 1970]."""
         return unpacked(self.pack(now))
 
     def pack(self, now: float) -> list[News | Wire]:
-        """Hand over what is new, samples packed as they go out; `now` is fleet time [s since 1970]."""
+        """Return the new messages with encoded samples; `now` is fleet time [s since 1970]."""
         self.sort()
         self._digest_sorted()
         return self._take(now)
 
     def sort(self, keep: bool = True) -> Frames | None:
-        """Find the frames in what was heard since the last time and return those admitted; None where there are none.
+        """Decode the bytes received since the last call and return the admitted frames; None if there are none.
 
         Args:
-            keep: digest them at the next `flush`
+            process_later: process them at the next `flush`
         """
         if not self._heard:
             return None
@@ -115,10 +115,10 @@ class Intake:
         return frames
 
     def overhear(self, frames: Frames) -> None:
-        """Take what ground stations said to the aircraft of this link; nobody is met here, and nobody taken over."""
+        """Process frames from ground stations to the aircraft of this link, without registering aircraft or senders."""
         which = np.flatnonzero(SINGLE[frames.at[:, ID]])
         if len(which):
-            self._digest_sorted()  # who is spoken to may just have been heard for the first time
+            self._digest_sorted()  # the target may be registered by a pending frame
         for i, message in zip(which.tolist(), frames.messages(which), strict=True):
             craft, arrival = self.crafts.get(message.get_srcSystem()), float(frames.arrival[i])
             if craft is not None and craft.component == message.get_srcComponent():
@@ -129,7 +129,7 @@ class Intake:
                     target.queue(arrival, target.overhear, message)
 
     def part(self, source: Hashable) -> None:
-        """Learn that a sender took its leave: whoever speaks next for its aircraft has its place."""
+        """Release the aircraft of a sender that disconnected: the next sender of their ids takes over."""
         self.sort()
         self._digest_sorted()
         for craft in self.crafts.values():
@@ -142,10 +142,10 @@ class Intake:
             self._sorted.clear()
 
     def forget(self, now: float) -> list[int]:
-        """Forget who is silent at `now` [s since 1970]; gives their UAV ids.
+        """Remove silent aircraft at `now` [s since 1970]; return their UAV ids.
 
-        An aircraft heard for less than `KNOWN_S` is forgotten after `FORGET_S` of silence, any other once its place is
-        needed.
+        An aircraft received for less than `PROBATION_S` is removed after `SILENCE_LIMIT_S` of silence, any other when a
+        new aircraft replaces it.
         """
         for system in [system for system, kept in self._early.items() if now - kept[0][0] > EARLY_S]:
             self.refused[NOT_YET] += len(self._pop_early(system))
@@ -158,7 +158,7 @@ class Intake:
         return gone
 
     def _drop(self, system: int, craft: Craft) -> None:
-        """Forget one aircraft; its number is kept for whoever next uses its system id."""
+        """Remove one aircraft; its number stays reserved for its system id."""
         del self.crafts[system], self._met[system]
         if self._claims.get(craft.uav) is craft:
             del self._claims[craft.uav]
@@ -169,7 +169,7 @@ class Intake:
         self._numbered[craft.number] = Craft(self.flock, craft.uav, system, craft.component, number=craft.number)
 
     def take(self, now: float) -> list[News]:
-        """Hand over what had arrived up to `now` of what was digested; `now` is fleet time [s since 1970]."""
+        """Return the messages of processed frames that arrived up to `now` [s since 1970]."""
         return unpacked(self._take(now))
 
     def _take(self, now: float) -> list[News | Wire]:
@@ -185,7 +185,7 @@ class Intake:
         return news
 
     def digest(self, frames: Frames) -> None:
-        """Work through a batch of frames; what they say is handed over by `take`."""
+        """Process a batch of frames; `collect` returns the resulting messages."""
         if not len(frames.at):
             return
         which = np.flatnonzero(SINGLE[frames.at[:, ID]])
@@ -201,7 +201,7 @@ class Intake:
             time(frames, owner, [craft.timing for craft in self._numbered])
 
     def _owners(self, frames: Frames) -> np.ndarray:
-        """Tell whose each frame is: number of the aircraft, -1: nobody's, (n,)."""
+        """Return the aircraft number of each frame, -1 without owner, (n,)."""
         crafts = self._numbered
         number = {sender: k for k, sender in enumerate(frames.senders)}
         rightful = [self._claims.get(craft.uav, craft) is craft for craft in crafts]
@@ -225,7 +225,7 @@ class Intake:
         return self.decoder.counters()
 
     def _speaker(self, frames: Frames, which: np.ndarray) -> Craft | None:
-        """Tell whose frames these are, all from one component of one sender; count them where they are nobody's."""
+        """Return the owner of frames from one component of one sender; count them as rejected without owner."""
         system, component = frames.at[which[0], (SYSTEM, COMPONENT)].tolist()
         source, arrival = frames.senders[frames.sender[which[0]]], float(frames.arrival[which[-1]])
         craft = self.crafts.get(system)
@@ -272,7 +272,7 @@ class Intake:
             craft.queue(arrival, craft.hear, message)
 
     def _take_in(self, uav: int, system: int, component: int, source: Hashable) -> Craft:
-        """Make an aircraft, with the number its system id had before, if any."""
+        """Create an aircraft; reuse the previous number of its system id, if any."""
         number = next((one.number for one in self._numbered if one.system == system), None)
         craft = Craft(self.flock, uav, system, component, source, number=number)
         if number is None:
@@ -283,19 +283,19 @@ class Intake:
         return craft
 
     def _make_room(self, arrival: float) -> bool:
-        """Take the place of the aircraft silent for longest, on whatever link, if that is longer than `FORGET_S`."""
+        """Evict the aircraft silent for longest on any link, if silent for more than `SILENCE_LIMIT_S`."""
         longest = min(self._claims.values(), key=lambda craft: craft.heard)
         if arrival - longest.heard <= FORGET_S:
             return False
-        del self._claims[longest.uav]  # its own intake forgets it
+        del self._claims[longest.uav]  # the receiver of its link removes it
         return True
 
     def _may_speak(self, craft: Craft, source: Hashable, arrival: float, count: int = 1) -> bool:
-        """Return whether this is the one sender of its id; another takes over once that one is silent."""
+        """Return whether this sender owns its id; a second sender takes over when the first is silent."""
         holder = self._claims.get(craft.uav, craft)
         if holder is craft and craft.source == source:
             return True
-        freed = holder is craft and craft.source is None  # its sender took its leave
+        freed = holder is craft and craft.source is None  # its sender disconnected
         if arrival - holder.heard < LOST_S and not freed:
             self._alarm(holder, arrival, source, count)
             return False
@@ -305,7 +305,7 @@ class Intake:
     def _alarm(self, craft: Craft, arrival: float, source: Hashable, count: int = 1) -> None:
         self.refused[SECOND] += count
         self._collisions.setdefault(craft.uav, Collision(craft.uav)).note(arrival, craft.source, source)
-        words = "a second sender uses this id and was refused; give every aircraft its own MAVLink system id"
+        words = "a second sender uses this id and is rejected; give every aircraft its own MAVLink system id"
         craft.queue(arrival, partial(craft.say, words))
 
     def _overhear(self, arrival: float, message: Any) -> None:
@@ -324,7 +324,7 @@ class Intake:
             self._keep_early(arrival, message)
 
     def _keep_early(self, arrival: float, message: Any) -> None:
-        """Keep what a system says before it says what it is, in case it turns out to be an aircraft."""
+        """Buffer messages of a system until its heartbeat identifies it."""
         system = message.get_srcSystem()
         room = len(self._early.get(system, ())) < MOST_EARLY and self._early_n < MOST_EARLY_ALL
         if room and message.get_type() in EARLY:
@@ -340,12 +340,12 @@ class Intake:
 
 
 def unpacked(news: list[News | Wire]) -> list[News]:
-    """Return what was packed as messages again."""
+    """Decode the encoded messages."""
     return [one.message() if isinstance(one, Wire) else one for one in news]
 
 
 def _by_speaker(frames: Frames, which: np.ndarray) -> list[np.ndarray]:
-    """Sort frames by sender, system and component: the numbers of each one's frames, in order."""
+    """Group frame numbers by sender, system and component, in order."""
     if not len(which):
         return []
     at = frames.at[which]

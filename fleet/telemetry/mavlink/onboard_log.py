@@ -1,4 +1,4 @@
-"""What an onboard log (DataFlash, ULog) says, whoever wrote it: the form both readers deliver."""
+"""Common output format of the onboard log readers (DataFlash, ULog)."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
@@ -10,7 +10,7 @@ Table = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 class Said(NamedTuple):
-    """Something a log says that is no row."""
+    """Log entry that is not a telemetry row."""
 
     t: float  # log time [s]
     what: str  # mode: name · armed: bool · param: (name, value) · mission: tuple[Item, ...] · text: (severity, text)
@@ -18,23 +18,23 @@ class Said(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """A stretch of a log; chunks follow each other in time, return or take a second."""
+    """A time range of a log; consecutive chunks may overlap by about 1 s."""
 
     rows: Table
-    said: list[Said]  # rising in time
+    said: list[Said]  # in time order
     counts: dict[str, int]  # messages of each name
 
 
 class OnboardLog(Protocol):
-    """One aircraft's own log, opened: who it is, and what it says in log time."""
+    """Opened log of one aircraft: its identity, and its content in log time."""
 
-    name: str  # of the file, for sentences
-    system: int  # MAVLink system id, 1 where the log does not say
+    name: str  # file name for texts
+    system: int  # MAVLink system id, 1 if not in the log
     autopilot: str  # as `Status.autopilot`
     vehicle: str  # as `Status.vehicle`
-    firmware: str  # as the log words it, or empty
-    epoch_s: float | None  # fleet time minus log time [s]; None where no satellite ever told
-    skipped: list[str]  # what could not be read and where, filled while reading
+    firmware: str  # as in the log, or empty
+    epoch_s: float | None  # fleet time minus log time [s]; None without GNSS time
+    skipped: list[str]  # unreadable parts and their positions, filled while reading
 
     def chunks(self) -> Iterator[Chunk]:
         """Return the log from its beginning; may be called again."""

@@ -1,4 +1,4 @@
-"""How an aircraft's clock and its link are: drift, delay, round trip, and what the satellites say the time is."""
+"""Clock and link timing of one aircraft: drift, delay, round trip, offset to GPS time."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -12,34 +12,34 @@ from fleet.telemetry.mavlink.parsing.decode import IDS, Frames
 from fleet.telemetry.mavlink.parsing.scan import ID
 from fleet.telemetry.tables import clock as c
 
-EVERY_S = 10.0  # between two looks at the offset [s]
-OFFSET_SIGMA_S = 3e-3  # of the offset, as the filter of least delay leaves it [s]
-DRIFT_SIGMA = 1e-4  # of clocks in general [s/s]
-WANDER = 1e-7  # of a drift in a second [1/s]
-KNOWN = 3e-5  # a drift is told once it is known so well [s/s]
-_EARLIEST_S = 1e9  # a satellite time before that is none [s since 1970]
+EVERY_S = 10.0  # update period of the drift filter [s]
+OFFSET_SIGMA_S = 3e-3  # standard deviation of the offset after the minimum-delay filter [s]
+DRIFT_SIGMA = 1e-4  # prior standard deviation of a clock drift [s/s]
+WANDER = 1e-7  # process noise of the drift [1/s]
+KNOWN = 3e-5  # maximum standard deviation of a published drift [s/s]
+_EARLIEST_S = 1e9  # earlier GPS times are invalid [s since 1970]
 _LONGEST_TRIP_S = 10.0
 _SMOOTH = 0.1
-_TRIPS = 10  # of which the quickest counts
+_TRIPS = 10  # the published round trip is the minimum of these
 
 
 class Timing:
-    """What is known of one aircraft's time.
+    """Clock and link timing of one aircraft.
 
     Args:
-        clocks: gives its clocks, (3, LENGTH), read here and changed elsewhere; but for the worst delay, which is taken
+        clocks: returns its clocks, (3, STATE_SIZE); read only, except the worst delay, which is reset
     """
 
     def __init__(self, clocks: Callable[[], np.ndarray]) -> None:
         self._clocks = clocks
         self._filter: KalmanFilter | None = None
         self._looked = float("-inf")
-        self._steps = 0.0  # jumps, and the sum of what was re-anchored
+        self._steps = 0.0  # clock jumps plus total re-anchoring
         self._satellites: float | None = None
         self._trips: deque[float] = deque(maxlen=_TRIPS)
 
     def satellites(self, unix_s: float, boot_s: float) -> None:
-        """Take satellite time `unix_s` [s since 1970] at the aircraft's time `boot_s` [s]."""
+        """Add GPS time `unix_s` [s since 1970] at boot time `boot_s` [s]."""
         boot = self._clocks()[c.BOOT]
         if unix_s > _EARLIEST_S and not np.isnan(boot[c.NEWEST]):
             offset = float(c.unwrap(boot, boot_s) + boot[c.OFFSET]) - unix_s
@@ -47,12 +47,12 @@ class Timing:
             self._satellites = before + _SMOOTH * (offset - before)
 
     def trip(self, sent: float, back: float) -> None:
-        """Take the way of a question, sent and answered at fleet times [s since 1970]."""
+        """Add a round trip: fleet times of request and reply [s since 1970]."""
         if 0.0 <= back - sent < _LONGEST_TRIP_S:
             self._trips.append(back - sent)
 
     def told(self, now: float) -> dict[str, Any]:
-        """Return the fields of `Status` that tell of time; `now` is fleet time [s since 1970]."""
+        """Return the timing fields of `Status`; `now` is fleet time [s since 1970]."""
         boot = self._clocks()[c.BOOT]
         self._look(boot, now)
         worst, boot[c.WORST] = float(boot[c.WORST]), 0.0
@@ -67,13 +67,13 @@ class Timing:
 
     @property
     def drift(self) -> float | None:
-        """Return what the clock loses on the fleet's [s/s]; None as long as that is not known well."""
+        """Return the drift against fleet time [s/s]; None while its uncertainty is too large."""
         if self._filter is None or sqrt(self._filter.P[1, 1]) > KNOWN:
             return None
         return float(self._filter.x[1, 0])
 
     def _look(self, boot: np.ndarray, now: float) -> None:
-        """Filter offset and drift: x = (offset, drift), x' = F x, z = offset."""
+        """Update the Kalman filter of offset and drift: x = (offset, drift), x' = F x, z = offset."""
         passed = now - self._looked
         if 0 <= passed < EVERY_S or np.isnan(boot[c.NEWEST]):
             return
@@ -98,16 +98,17 @@ def _anchored(offset_s: float) -> KalmanFilter:
 
 
 def time(frames: Frames, owner: np.ndarray, timings: Sequence[Timing]) -> None:
-    """Return every aircraft what SYSTEM_TIME and the answers to TIMESYNC say.
+    """Update the timing of all aircraft from SYSTEM_TIME and TIMESYNC replies.
 
     Args:
-        frames: what was heard
-        owner: number in `timings` of each frame's aircraft, -1 for nobody's, (n,)
-        timings: of the aircraft on this link
+        frames: received frames
+        owner: number in `timings` of each frame's aircraft, -1 without owner, (n,)
+        timings: timing of the aircraft on this link
     """
     which = np.flatnonzero((frames.at[:, ID] == IDS["SYSTEM_TIME"]) & (owner >= 0))
     if len(which):
-        last = which[len(which) - 1 - np.unique(owner[which][::-1], return_index=True)[1]]  # of each aircraft
+        # last frame of each aircraft
+        last = which[len(which) - 1 - np.unique(owner[which][::-1], return_index=True)[1]]
         fields = frames.fields(last, "SYSTEM_TIME")
         unix_s, boot_s = fields.time_unix_usec * 1e-6, fields.time_boot_ms * 1e-3
         for number, unix, boot in zip(owner[last].tolist(), unix_s.tolist(), boot_s.tolist(), strict=True):

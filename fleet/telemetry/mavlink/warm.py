@@ -1,4 +1,4 @@
-"""Compile, or load, what hears aircraft before any has to be heard: what arrives meanwhile would be lost."""
+"""Compile or load the receiver before the first data arrive; data during compilation would be lost."""
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -6,7 +6,7 @@ from fleet.telemetry.mavlink.intake import Intake
 
 
 def warm_up() -> None:
-    """Hear two messages and some junk, each way the decoder has."""
+    """Receive whole and split messages, so that all decoder paths are compiled."""
     voice, intake = dialect.MAVLink(None, srcSystem=1, srcComponent=1), Intake()
     beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_GENERIC, 0, 0, 0, 3)
     told = bytes(beat.pack(voice)) + bytes(dialect.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0).pack(voice))

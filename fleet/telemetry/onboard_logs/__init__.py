@@ -1,1 +1,1 @@
-"""Readers of the logs that autopilots write on board."""
+"""Readers of onboard logs of autopilots."""

@@ -1,4 +1,4 @@
-"""An onboard log as news of its aircraft, in the same steps as a telemetry recording."""
+"""Replay an onboard log as messages of its aircraft, in the same steps as a telemetry recording."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -11,23 +11,23 @@ from fleet.telemetry.mavlink.intake import News
 from fleet.telemetry.mavlink.onboard_log import Chunk, OnboardLog
 from fleet.telemetry.mavlink.steps import Steps
 
-LEG_S = 1.0  # between two reports of the mission item in force [s]
-UNDATED_S = 946_684_800.0  # 2000-01-01, where a log never heard of the date [s since 1970]
+LEG_S = 1.0  # period of the current mission item [s]
+UNDATED_S = 946_684_800.0  # 2000-01-01, for logs without date [s since 1970]
 
 
 def craft_of(log: OnboardLog, offset: int) -> Craft:
-    """Make the aircraft that wrote this log; UAV id = its MAVLink system id + `offset`."""
+    """Create the aircraft of a log; UAV id = its MAVLink system id + `offset`."""
     craft = Craft(Flock(), log.system + offset, log.system, 1)
     craft.autopilot, craft.kind, craft.firmware = log.autopilot, log.vehicle, log.firmware
     return craft
 
 
 def log_steps(log: OnboardLog, craft: Craft) -> Iterator[tuple[float, list[News]]]:
-    """Read a log in steps of 0.1 s: (end of the step [s since 1970], news)."""
+    """Read a log in steps of 0.1 s: (end of the step [s since 1970], messages)."""
     epoch_s = UNDATED_S if log.epoch_s is None else log.epoch_s
     steps = Steps(partial(_take, craft))
     newest: dict[str, float] = {}
-    leg: np.ndarray | None = None  # the mission item in force, (1,)
+    leg: np.ndarray | None = None  # current mission item, (1,)
     for chunk in log.chunks():
         chunk, leg = _leg_said_again(chunk, leg)
         times = [said.t for said in chunk.said] + [edge for t, _ in chunk.rows.values() for edge in t]
@@ -38,19 +38,19 @@ def log_steps(log: OnboardLog, craft: Craft) -> Iterator[tuple[float, list[News]
 
 
 def _take(craft: Craft, now: float) -> list[News]:
-    """Hand over what was heard up to `now` [s since 1970]."""
+    """Return the messages up to `now` [s since 1970]."""
     samples = [wire.message() for wire in craft.flock.take(now).values()]
     return [*samples, *craft.take(now)]
 
 
 def _leg_said_again(chunk: Chunk, leg: np.ndarray | None) -> tuple[Chunk, np.ndarray | None]:
-    """Say once a second which item is in force, as an aircraft does; a log tells it only when it changes.
+    """Repeat the current item every second, as in telemetry; a log contains only changes.
 
     Args:
-        chunk: a stretch of a log
-        leg: in force before it, (1,); None before any was told
+        chunk: time range of a log
+        item: item before the chunk, (1,); None if unknown
     Returns:
-        the stretch with `leg` rows filled in, what is in force at its end
+        chunk with added `leg` rows, item at its end
     """
     t, x = chunk.rows.get("leg", (np.empty(0), np.empty((0, 1))))
     edges = [edge for times, _ in chunk.rows.values() for edge in times[[0, -1]]]
@@ -80,7 +80,7 @@ def _digest(chunk: Chunk, craft: Craft, epoch_s: float, newest: dict[str, float]
 
 
 def _note(chunk: Chunk, craft: Craft, epoch_s: float) -> None:
-    """Count the messages of the chunk as if each kind had come evenly."""
+    """Count the messages of a chunk, each kind at evenly spaced times."""
     edges = [t[k] for t, _ in chunk.rows.values() if len(t) for k in (0, -1)] or [said.t for said in chunk.said]
     if not edges:
         return

@@ -1,1 +1,1 @@
-"""Readers of recordings: `.tlog` files, fleet logs, and what kind of recording a file is."""
+"""Readers of recordings: `.tlog` files, fleet logs, and detection of the kind of recording."""

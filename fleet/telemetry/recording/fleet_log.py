@@ -1,6 +1,6 @@
-r"""The `.parauav` file: what a fleet said on its bus, byte for byte. `fleet record` writes it.
+r"""The `.parauav` file: the unmodified bus messages of a fleet. `fleet record` writes it.
 
-A file is records and nothing else, so it may be cut anywhere, and two may be joined with `cat`:
+A file contains only records, so it may be truncated anywhere, and files may be joined with `cat`:
 
     record   magic C1 55 56 31 | size u32 | crc u32 | body, `size` bytes long; crc is the CRC-32 (zlib) of the body
     body     heard f64 [s since 1970] | epoch u64 | writer u64 | n u8 | encoding, n bytes of ASCII | payload
@@ -18,26 +18,26 @@ from typing import NamedTuple
 from fleet.bus.codec import Stamp
 from fleet.telemetry.recording.opening import Source
 
-MAGIC = b"\xc1UV1"  # C1 is the one byte that msgpack never uses
-MOST = 1 << 22  # bytes of the longest body; the longest message there is, a mission of 1,000 items, has 200 kB
+MAGIC = b"\xc1UV1"  # msgpack never uses the byte C1
+MOST = 1 << 22  # maximum body size [bytes]; the longest message, a mission of 1,000 items, has 200 kB
 CHUNK = 1 << 20
-HOPELESS = 1 << 26  # bytes without a single record after which a file is no recording of a fleet
-SEARCHED = 8  # times the bytes read, and a `HOPELESS` more, are summed in vain before the rest is left unread
+HOPELESS = 1 << 26  # bytes without a record after which reading ends
+SEARCHED = 8  # search budget [bytes summed]: this times the bytes read, plus `MAX_UNRECOGNISED`
 _PREFIX = "application/msgpack;"
 _HEAD = struct.Struct("<4sII")
 _BODY = struct.Struct("<dQQB")
 
 
 class Record(NamedTuple):
-    """One message as it was heard."""
+    """One recorded message."""
 
-    heard: float  # by the recorder [s since 1970]
+    heard: float  # reception by the recorder [s since 1970]
     encoding: str  # as on the bus
     payload: bytes
     stamp: Stamp | None = None
 
     def pack(self) -> bytes:
-        """Return the bytes in the file."""
+        """Encode the record for the file."""
         named = self.encoding.removeprefix(_PREFIX).encode("ascii", "replace")[:255]
         epoch, writer = self.stamp or (0, 0)
         body = _BODY.pack(self.heard, epoch, writer, len(named)) + named + self.payload
@@ -45,7 +45,7 @@ class Record(NamedTuple):
 
 
 class FleetLog:
-    """The records of a file, whole, cut short or damaged.
+    """Reader of the records of a file, tolerant of truncation and damage.
 
     Args:
         source: the file
@@ -53,13 +53,13 @@ class FleetLog:
 
     def __init__(self, source: Source) -> None:
         self._source = source
-        self.read = 0  # records
-        self.bad = 0  # bytes that belong to no sound record
-        self.first_bad: int | None = None  # where the first of them is
-        self.tangled = False  # the rest was left unread: too much begins like a record and is none
+        self.read = 0  # number of records read
+        self.bad = 0  # bytes outside valid records
+        self.first_bad: int | None = None  # position of the first of them
+        self.tangled = False  # reading ended: too many invalid record headers
 
     def records(self) -> Iterator[tuple[int, Record]]:
-        """Return the sound records: (place in the file [bytes], record)."""
+        """Return the valid records: (file offset [bytes], record)."""
         rest, place, vain = b"", 0, Vain(HOPELESS)
         with self._source.open() as stream:
             while True:
@@ -84,19 +84,19 @@ class FleetLog:
 
 
 class Vain:
-    """How many bytes may still be summed for records that are none."""
+    """Number of bytes that may still be summed for invalid records."""
 
     def __init__(self, left: int) -> None:
         self.left = left
 
 
 def sound(told: bytes, last: bool = True, vain: Vain | None = None) -> Iterator[tuple[int, int]]:
-    """Find the sound records in some bytes; the last pair is empty and tells where the search must go on.
+    """Find the valid records in bytes; the last pair is empty and marks where to continue.
 
     Args:
-        told: any bytes
-        last: nothing follows, so that what is not whole never will be
-        vain: lowered by what is summed in vain; below 0 the search ends
+        data: any bytes
+        last: whether no bytes follow, so that incomplete records are invalid
+        budget: reduced by the bytes summed for invalid records; below 0 the search ends
     """
     at, vain = 0, Vain(HOPELESS) if vain is None else vain
     while vain.left >= 0 and (start := told.find(MAGIC, at)) >= 0:
@@ -110,14 +110,14 @@ def sound(told: bytes, last: bool = True, vain: Vain | None = None) -> Iterator[
         else:
             at = start + 1
             vain.left -= max(-stop, 0)
-    kept = len(told) if last else max(at, len(told) - len(MAGIC) + 1)  # the beginning of a magic may be there
+    kept = len(told) if last else max(at, len(told) - len(MAGIC) + 1)  # may contain the start of a magic
     yield kept, kept
 
 
 def _stop(told: bytes, start: int) -> int:
-    """Tell where the record that begins here ends; beyond the bytes: not whole yet.
+    """Return the end of the record at `start`; beyond the bytes if incomplete.
 
-    0: it is none; less: it is none, and that many bytes were summed to know.
+    0: invalid; negative: invalid, after a checksum over this number of bytes.
     """
     after = start + _HEAD.size
     if after > len(told):

@@ -1,4 +1,4 @@
-"""A recorded bus as news: the gateway's messages, and if wanted what the workers said then, in the order heard."""
+"""Read a bus recording: messages of the gateway, optionally of the workers, in order of reception."""
 
 import math
 from collections import Counter
@@ -32,13 +32,13 @@ from fleet.telemetry.recording.opening import Source
 NEWS = (Sample, Status, Mission, Params)
 RESULTS = (Model, Prediction, Mismatch, Alert, FleetState)
 MOST_UAV = 999_999
-_BREAK_S = 86_400.0  # a longer pause lies between two recordings in one file, not within one [s]
-_LATEST_S = 4e9  # believable fleet time [s since 1970]
+_BREAK_S = 86_400.0  # a longer pause separates two recordings in one file [s]
+_LATEST_S = 4e9  # latest plausible fleet time [s since 1970]
 _KINDS = {encoding(kind): kind for kind in TOPICS.values()}
 
 
 class FleetNews:
-    """The messages of one `.parauav` file.
+    """Reader of the messages of one `.parauav` file.
 
     Args:
         source: the file
@@ -49,26 +49,26 @@ class FleetNews:
         self._log = FleetLog(source)
         self._offset = offset
         self._refused: Counter[str] = Counter()
-        self._places: dict[str, int] = {}  # of the first message refused for each reason
-        self._claims: dict[int, Stamp] = {}  # highest so far, by UAV id
+        self._places: dict[str, int] = {}  # position of the first message rejected, by reason
+        self._claims: dict[int, Stamp] = {}  # highest stamp so far, by UAV id
 
     @property
     def skipped(self) -> list[str]:
-        """Say what could not be read and where."""
-        said = [f"{n} messages refused, {why}, the first near byte {self._places[why]}"
+        """Return messages on unreadable parts and their positions."""
+        said = [f"{n} messages rejected, {why}, the first near byte {self._places[why]}"
                 for why, n in self._refused.items()]  # fmt: skip
         if self._log.bad:
             where = f"the first near byte {self._log.first_bad}"
             said.insert(0, f"{self._log.bad} damaged bytes skipped, {where}, {self._log.read} messages read")
         if self._log.tangled:
-            said.insert(0, "too much of it begins like a record and is none, the rest was left unread; cut it")
+            said.insert(0, "too many invalid record headers, the rest was not read; split it")
         return said
 
     def steps(self, results: bool = False) -> Iterator[tuple[float, list[Any]]]:
-        """Return messages in steps of 0.1 s of the time they were heard: (end of the step [s since 1970], messages).
+        """Return messages in steps of 0.1 s of reception time: (end of the step [s since 1970], messages).
 
         Args:
-            results: give also what workers said: models, predictions, mismatches, alerts, fleet tables
+            results: include worker messages: models, predictions, mismatches, alerts, fleet tables
         """
         first, now, left_out, step = math.nan, 0.0, 0.0, 0
         held: list[Any] = []
@@ -90,7 +90,7 @@ class FleetNews:
             yield first + (step + 1) * STEP_S, held
 
     def _message(self, place: int, record: Record, results: bool) -> Any | None:
-        """Unpack a record; None where it is not wanted, or refused."""
+        """Decode a record; None if it is not wanted or rejected."""
         kind = _KINDS.get(record.encoding)
         if kind is not None and kind not in NEWS and not (results and kind in RESULTS):
             return None
@@ -105,7 +105,7 @@ class FleetNews:
         if kind is None:
             raise ValueError(f"of a class or version unknown here ({record.encoding[:80]!r})")
         if not 0 < record.heard < _LATEST_S:
-            raise ValueError("heard at no time there is")
+            raise ValueError("with an invalid reception time")
         message: Any = decode(kind, record.payload, record.encoding)
         _check(message)
         if self._offset and (message := renumbered(message, lambda uav: uav + self._offset)) is None:
@@ -118,7 +118,7 @@ class FleetNews:
         self._places.setdefault(why, place)
 
     def _in_force(self, message: Any, record: Record) -> bool:
-        """Return whether the writer held the aircraft: readers keep the highest claim and drop the rest."""
+        """Return whether the writer owned the aircraft: only the highest fencing token is valid."""
         uav = getattr(message, "uav", None)
         if uav is None or record.stamp is None:
             return True
@@ -129,11 +129,11 @@ class FleetNews:
 
 
 def renumbered(message: Any, number: Any) -> Any | None:
-    """Return a message another aircraft's id, in its sentences too; None where that is no id.
+    """Renumber a message, its sentences included; None if the new id is invalid.
 
     Args:
-        message: of the contract
-        number: gives the new id for the one recorded
+        message: contract message
+        new_id: returns the new id of a recorded id
     """
     if isinstance(message, FleetState):
         rows = tuple(_row(row, number(row.uav)) for row in message.rows)
@@ -143,7 +143,7 @@ def renumbered(message: Any, number: Any) -> Any | None:
 
 
 def named(message: Any, uav: int, **more: Any) -> Any:
-    """Replace the UAV id of a message, also where its sentences name it, and whatever else is given."""
+    """Replace the UAV id of a message, its sentences included, and the given fields."""
     if getattr(message, "sentence", ""):
         more["sentence"] = message.sentence.replace(f"uav-{message.uav}:", f"uav-{uav}:")
     if isinstance(message, Model):
@@ -162,14 +162,14 @@ def _row(row: Any, uav: int) -> Any:
 
 
 def _check(message: Any) -> None:
-    """Refuse what no gateway and no worker says.
+    """Validate a message against the contract.
 
     Raises:
-        ValueError: when it contradicts the contract; the sentence says how.
+        ValueError: if it violates the contract; the message has the reason.
     """
     kind = type(message).__name__
     if not 0 <= message.t <= _LATEST_S:
-        raise ValueError(f"{kind} at a time there is not")
+        raise ValueError(f"{kind} at an invalid time")
     if not isinstance(message, Message):
         return
     if not 0 <= message.uav <= MOST_UAV:
@@ -178,14 +178,14 @@ def _check(message: Any) -> None:
         for field in COLUMNS:
             rows: Rows | None = getattr(message, field)
             if rows is not None and not _fits(rows, len(COLUMNS[field])):
-                raise ValueError(f"Sample with rows of {field} that do not fit")
+                raise ValueError(f"Sample with invalid rows of {field}")
     if isinstance(message, Mission) and (
         len(message.items) > MAX_ITEMS
         or not all(map(math.isfinite, (x for i in message.items for x in (i.param1, i.param2, i.param3, i.alt_m))))
     ):
-        raise ValueError("Mission with items that cannot be")
+        raise ValueError("Mission with invalid items")
     if isinstance(message, Params) and not all(map(math.isfinite, message.values.values())):
-        raise ValueError("Params with a value that is no number")
+        raise ValueError("Params with a non-finite value")
 
 
 def _fits(rows: Rows, width: int) -> bool:

@@ -1,13 +1,13 @@
-"""Who is who where several recordings, and copies of them, fly together: every aircraft has an id of its own."""
+"""Allocate unique aircraft ids for several recordings and their copies."""
 
 from collections.abc import Hashable
 
 
 class Ids:
-    """Ids given out so far.
+    """Allocator of ids.
 
     Args:
-        least, most: ids there are
+        min_id, max_id: range of ids
     """
 
     def __init__(self, least: int = 0, most: int = 999_999) -> None:
@@ -16,10 +16,10 @@ class Ids:
         self._held: set[int] = set()
 
     def give(self, who: Hashable, wanted: int) -> int:
-        """Return `who` the id it has, else the wanted one, else the next free one above, else the first free one.
+        """Return the id of `key`: the allocated one, else `preferred`, else the next free one above, else any free one.
 
         Raises:
-            ValueError: when none is left.
+            ValueError: if no id is free; replay fewer aircraft or copies.
         """
         if who in self._of:
             return self._of[who]
@@ -29,7 +29,7 @@ class Ids:
             free = next((i for i in range(self._least, after) if i not in self._held), None)
         if free is None:
             count = self._most - self._least + 1
-            raise ValueError(f"ids: found all {count} taken, expected a free one; play fewer aircraft or copies")
+            raise ValueError(f"ids: found all {count} taken, expected a free one; replay fewer aircraft or copies")
         self._of[who] = free
         self._held.add(free)
         return free

@@ -1,4 +1,4 @@
-"""A recording's bytes, compressed or not: read in pieces, with how far one has come, and never without an end."""
+"""Read recordings in pieces, compressed or not, with progress and a size limit."""
 
 import bz2
 import gzip
@@ -13,24 +13,24 @@ from typing import IO, Any
 
 _OPENERS: dict[str, Callable[..., Any]] = {".xz": lzma.open, ".gz": gzip.open, ".bz2": bz2.open}
 COMPRESSED = tuple(_OPENERS)
-_BROKEN = (EOFError, lzma.LZMAError, OSError, MemoryError, zlib.error)  # what a damaged archive raises
-RATIO = 12  # a recording compresses to a fifth, at best to a tenth: what unfolds further is no recording
-UNFOLDED = 1 << 24  # bytes a compressed file may unfold to, whatever its size
-LARGEST_UNFOLDED = 1 << 28  # bytes of a compressed file that are read
+_BROKEN = (EOFError, lzma.LZMAError, OSError, MemoryError, zlib.error)  # errors raised by damaged archives
+RATIO = 12  # maximum compression ratio; recordings reach 5 to 10
+UNFOLDED = 1 << 24  # decompressed size allowed for any file [bytes]
+LARGEST_UNFOLDED = 1 << 28  # maximum decompressed size [bytes]
 
 
 class Source:
-    """One recording as a file: opens as often as wanted, and remembers what was wrong with it.
+    """One recording as a file: can be opened repeatedly, and stores the last read problem.
 
     Raises:
-        OSError: when it is no file that can be read.
+        OSError: if it is not a readable file; check path and permissions.
     """
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         self.name = self.path.name
         self.trouble = ""
-        self.stop: threading.Event | None = None  # set it, and whoever reads comes to an end
+        self.stop: threading.Event | None = None  # set it to end reading
         try:
             found = self.path.stat()
         except OSError as error:
@@ -43,16 +43,16 @@ class Source:
 
     @property
     def share(self) -> float:
-        """Tell how far the newest reading has come, 0..1 of the file."""
+        """Return the progress of the latest read, fraction of the file 0..1."""
         if self._raw is None or not self.size:
             return 0.0
         return 1.0 if self._raw.closed else min(self._raw.tell() / self.size, 1.0)
 
     def open(self) -> "Bytes":
-        """Open from the beginning.
+        """Open the file at the start.
 
         Raises:
-            OSError: when it cannot be opened; the sentence says why.
+            OSError: if it cannot be opened; the message has the reason.
         """
         try:
             self._raw = self.path.open("rb")
@@ -65,30 +65,30 @@ class Source:
 
 
 class Bytes(RawIOBase):
-    """The bytes of a source; where its archive is damaged or unfolds without end they end, and the source says so."""
+    """Bytes of a recording; they end at damage or at the size limit, and the recording stores the problem."""
 
     def __init__(self, source: Source, stream: Any, most: int | None = None) -> None:
         self._source, self._stream, self._left, self._read = source, stream, most, 0
 
     def readable(self) -> bool:
-        """Tell that this can be read."""
+        """Return True: the stream is readable."""
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Fill a buffer; 0 at the end."""
+        """Fill a buffer; return the number of bytes, 0 at the end."""
         filled = 0
         if self._source.stop is not None and self._source.stop.is_set():
             return 0
         while filled < len(buffer):
             wanted = len(buffer) - filled if self._left is None else min(len(buffer) - filled, self._left)
             if not wanted:
-                size = f"{self._source.size:,} bytes that unfold to more than {self._read >> 20} MiB"
-                self._source.trouble = f"found {size}, the rest was left unread; decompress it yourself if it is yours"
+                size = f"{self._source.size:,} bytes that decompress to more than {self._read >> 20} MiB"
+                self._source.trouble = f"found {size}, the rest was not read; decompress a trusted file first"
                 break
             try:
                 data = self._stream.read1(wanted)
             except _BROKEN as error:
-                self._source.trouble = f"the compressed file is damaged ({error}); what came before is used"
+                self._source.trouble = f"the compressed file is damaged ({error}); the data before are used"
                 break
             if not data:
                 break
@@ -99,7 +99,7 @@ class Bytes(RawIOBase):
         return filled
 
     def close(self) -> None:
-        """Close the file too."""
+        """Close the stream and its file."""
         if not self.closed:
             self._stream.close()
             if self._source._raw is not None:

@@ -1,4 +1,4 @@
-"""Recorded time against the wall clock: when the next step is due, and how fast it really goes."""
+"""Replay timing: wait until recorded times are due, and measure the replay speed."""
 
 import math
 import threading
@@ -6,7 +6,7 @@ import time
 
 
 class Pace:
-    """Play at a multiple of recorded time.
+    """Replay at a multiple of real time.
 
     Args:
         speed: recorded seconds per second; inf: as fast as possible
@@ -14,12 +14,12 @@ class Pace:
 
     def __init__(self, speed: float) -> None:
         self.speed = speed
-        self.passed_s = 0.0  # recorded time played
+        self.passed_s = 0.0  # recorded time replayed [s]
         self._first: float | None = None
         self._begun = self._newest = 0.0
 
     def wait(self, now: float, stop: threading.Event) -> bool:
-        """Wait until recorded time `now` [s since 1970] is due; True when told to stop meanwhile."""
+        """Wait until recorded time `now` [s since 1970] is due; return True if stopped meanwhile."""
         if self._first is None:
             self._first, self._begun = now, time.monotonic()
         due = self._begun + (now - self._first) / self.speed - time.monotonic()
@@ -29,16 +29,16 @@ class Pace:
 
     @property
     def took_s(self) -> float:
-        """Tell how long it has been playing [s]."""
+        """Return the elapsed wall time [s]."""
         return self._newest - self._begun
 
     @property
     def reached(self) -> float:
-        """Tell the speed reached so far, recorded seconds per second; nan before the start."""
+        """Return the mean replay speed, recorded seconds per second; nan before the start."""
         return self.passed_s / self.took_s if self.took_s > 0 else math.nan
 
     def words(self) -> str:
-        """Say how far it has come, and how fast."""
+        """Return progress and speed as text."""
         minutes, seconds = divmod(int(self.passed_s), 60)
         hours, minutes = divmod(minutes, 60)
         fast = "" if math.isnan(self.reached) else f", {self.reached:.1f} times real time"
@@ -46,10 +46,10 @@ class Pace:
 
 
 def read_speed(text: str) -> float:
-    """Read a replay speed: a number of times real time, or `max`.
+    """Parse a replay speed: a multiple of real time, or `max`.
 
     Raises:
-        ValueError: when it is neither.
+        ValueError: if it is neither; pass a number above 0 or `max`.
     """
     try:
         speed = math.inf if text == "max" else float(text)

@@ -1,4 +1,4 @@
-"""Recordings as news of the aircraft in them: whatever was recorded, in the order and at the time it happened."""
+"""Read recordings of all kinds as messages of their aircraft, in order of recorded time."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -28,21 +28,21 @@ KINDS = {
     ".ulg": "ULog",
     ".parauav": "fleet recording",
 }
-_HEAD = 1 << 16  # bytes looked at to tell the kind
-_MOST_AT_ONCE = 500_000  # frames taken in while recorded time stands still
+_HEAD = 1 << 16  # bytes examined to detect the kind
+_MOST_AT_ONCE = 500_000  # maximum frames at one recorded time
 
 _log = logging.getLogger("parauav.recordings")
 
 
 class Recording:
-    """One recording, opened: what kind it is, who is in it, what could not be read.
+    """One opened recording: its kind, its aircraft, and its unreadable parts.
 
     Args:
         path: a recording of one of `KINDS`, possibly compressed
         offset: UAV id = MAVLink system id + offset; in a fleet recording, recorded id + offset
     Raises:
-        ValueError: when it is no recording, or holds nothing.
-        OSError: when it cannot be opened.
+        ValueError: if it is not a recording, or empty; check the file.
+        OSError: if it cannot be opened; check the path.
     """
 
     def __init__(self, path: Path | str, offset: int = 0) -> None:
@@ -55,31 +55,31 @@ class Recording:
 
     @property
     def kind(self) -> str:
-        """Name the kind of recording."""
+        """Return the kind of recording."""
         return KINDS[self.suffix]
 
     @property
     def share(self) -> float:
-        """Tell how far reading has come, 0..1."""
+        """Return the read progress, 0..1."""
         return self._opened.share if isinstance(self._opened, Tlog) else self.source.share
 
     def words(self) -> str:
-        """Say what is being done with it."""
+        """Return the current activity."""
         return "reading"
 
     @property
     def skipped(self) -> list[str]:
-        """Say what was skipped, where, and what was assumed; whole once read to the end."""
+        """Return messages on skipped parts and assumptions; complete after reading to the end."""
         found = [*self._told, *(self._opened.skipped if self._opened else ()), self.source.trouble]
         return [f"{self.name}: {sentence.removeprefix(f'{self.name}: ')}" for sentence in found if sentence]
 
     def steps(self, results: bool = False) -> Iterator[tuple[float, list[Any]]]:
-        """Return the recording in steps of 0.1 s: (end of the step [s since 1970], news).
+        """Return the recording in steps of 0.1 s: (end of the step [s since 1970], messages).
 
         Args:
-            results: give also what workers said then, where it was recorded
+            results: include recorded messages of the workers
         Raises:
-            ValueError: when there is nothing in it.
+            ValueError: if it has no messages; check the file.
         """
         steps: Iterator[tuple[float, list[Any]]]
         if self.suffix == ".parauav":
@@ -99,7 +99,7 @@ class Recording:
         self._opened = tlog = Tlog(self.source)
         intake = Intake(self.offset)
         steps = Steps(intake.take)
-        waiting = left_out = 0  # frames since time went on, and those of them that are too many
+        waiting = left_out = 0  # frames at the current time, and frames beyond the limit
         for frames in tlog.batches():
             waiting += len(frames.at)
             if waiting > _MOST_AT_ONCE:
@@ -113,11 +113,11 @@ class Recording:
         if steps.gaps > MOST_GAPS:
             self._told.append(
                 f"{steps.gaps} silences of over {SILENT_STEPS * STEP_S:.0f} s, more than {MOST_GAPS}: "
-                "what a twin does in the later ones is left out"
+                "the later ones are skipped"
             )
         if left_out:
             self._told.append(
-                f"{left_out} frames left out: over {_MOST_AT_ONCE:,} in {STEP_S} s, which no radio carries"
+                f"{left_out} frames skipped: over {_MOST_AT_ONCE:,} in {STEP_S} s, more than any radio carries"
             )
         yield from steps.last()
 
@@ -130,7 +130,7 @@ class Recording:
         yield from log_steps(log, craft)
 
     def _recognise(self) -> str:
-        """Tell the kind by the content, else by the name."""
+        """Detect the kind by the content, else by the file name."""
         with self.source.open() as stream:
             head = stream.read(_HEAD) or b""
         path = self.source.path
@@ -139,7 +139,7 @@ class Recording:
             raise ValueError(f"{self.name}: {self.source.trouble or 'is empty'}; expected a recording; check the file")
         found = _by_content(head)
         if found and named in KINDS and found != named:
-            self._told.append(f"is a {KINDS[found]} by its content, whatever its name says; read as that")
+            self._told.append(f"is a {KINDS[found]} by its content, in spite of its name; read as such")
         if not found and named not in KINDS:
             kinds = ", ".join(f"{KINDS[suffix]} ({suffix})" for suffix in KINDS)
             raise ValueError(f"{self.name}: found no recording in it, expected one of {kinds}; convert it")
@@ -147,7 +147,7 @@ class Recording:
 
 
 def _by_content(head: bytes) -> str:
-    """Tell the suffix whose content this is; empty where nothing is recognised."""
+    """Return the suffix that matches the content, or an empty string."""
     if head.startswith(b"ULog\x01\x12"):
         return ".ulg"
     if head.startswith(MAGIC):
@@ -170,16 +170,16 @@ _READERS: dict[str, Callable[..., OnboardLog]] = {".bin": DataflashLog, ".log": 
 def replay_messages(
     path: Path | str, offset: int = 0, crafts: dict[int, Craft] | None = None, skipped: list[str] | None = None
 ) -> Iterator[News]:
-    """Read a recording as the gateway would have heard it, in time order; fleet time is the recording's own.
+    """Read a recording as the gateway would receive it, in time order; fleet time is recorded time.
 
     Args:
         path: a recording of one of `KINDS`, possibly compressed
         offset: UAV id = MAVLink system id + offset
-        crafts: filled by UAV id with what is known of each aircraft
-        skipped: filled with sentences at the end
+        aircraft: filled with the state of each aircraft, by UAV id
+        skipped: filled with messages on skipped parts at the end
     Raises:
-        ValueError: when it is no recording.
-        OSError: when it cannot be opened.
+        ValueError: if it is not a recording; check the file.
+        OSError: if it cannot be opened; check the path.
     """
     recording = Recording(path, offset)
     if crafts is not None:

@@ -1,4 +1,4 @@
-"""A `.tlog` as timed frames, in batches: whole, cut short, damaged, or written by a radio that caught up.
+"""Read a `.tlog` as timed frames in batches, tolerant of truncation, damage and backlogs.
 
 A .tlog repeats: 8 bytes big-endian microseconds since 1970, one MAVLink frame.
 """
@@ -13,35 +13,35 @@ from fleet.telemetry.mavlink.parsing.payload_gather import gather
 from fleet.telemetry.recording.opening import Source
 
 CHUNK = 1 << 20
-HOPELESS = 1 << 25  # damaged bytes, beyond `_WORSE` times the good ones, after which the rest is left unread
+HOPELESS = 1 << 25  # damaged bytes, beyond `_MAX_DAMAGE_RATIO` times the good ones, that end reading
 _WORSE = 4
-LOOK = 0.1  # share of the work that is done before the first frame is given
-BACK_S = 1.0  # a clock that steps back further was set; time goes on all the same [s]
-BACKLOG_S = 5.0  # arriving later than boot time tells by more than this is a backlog, not a delay [s]
+LOOK = 0.1  # fraction of the work before the first frame is returned
+BACK_S = 1.0  # a larger step back is a clock adjustment and is removed [s]
+BACKLOG_S = 5.0  # a larger variation of arrival minus boot time is a backlog [s]
 _BOOT_FIRST = [IDS[name] for name in ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")]
 
 
 class Tlog:
-    """A telemetry log, opened.
+    """One opened telemetry log.
 
     Args:
         source: the file
     """
 
     def __init__(self, source: Source) -> None:
-        self.decoder = Decoder()  # its counters tell what was skipped
+        self.decoder = Decoder()  # its counters include skipped bytes
         self.skipped: list[str] = []
         self._source = source
         self._looking = True
-        self.tangled: int | None = None  # from which byte on the rest was left unread
+        self.tangled: int | None = None  # file offset at which reading ended
 
     @property
     def share(self) -> float:
-        """Tell how far reading has come, 0..1; a look for a backlog comes first."""
+        """Return the read progress, 0..1, including the search for a backlog."""
         return LOOK * self._source.share if self._looking else LOOK + (1 - LOOK) * self._source.share
 
     def batches(self) -> Iterator[Frames]:
-        """Return the frames in the time the flight took, even where a backlog arrived in a rush."""
+        """Return the frames in flight time; boot time replaces the arrival of a backlog."""
         offset_s = backlog_offset(self._batches(Decoder()))
         batches = self._batches(self.decoder)
         yield from batches if offset_s is None else restamped(batches, offset_s)
@@ -50,10 +50,10 @@ class Tlog:
             where = f", the first near byte {self._first_bad}" if self._first_bad is not None else ""
             self.skipped.append(f"{bad} damaged bytes skipped{where}, {read} frames read")
         if self.tangled is not None:
-            self.skipped.append(f"hardly anything but damage to byte {self.tangled}, the rest was left unread; cut it")
+            self.skipped.append(f"too much damage up to byte {self.tangled}, the rest was not read; split it")
 
     def _batches(self, decoder: Decoder) -> Iterator[Frames]:
-        """Return the frames with their arrival as it stands in the file, made to never fall."""
+        """Return the frames with the arrival in the file, corrected to be non-decreasing."""
         counts, self._first_bad = decoder.counts, None
         rest, last_t, place, line = b"", np.nan, 0, Line()
         with self._source.open() as stream:
@@ -68,7 +68,7 @@ class Tlog:
                 )
                 at, stamps, last_t = frames_of(buf, parts, counts, s.STAMP, last_t)
                 done = int(parts[0, 0])
-                if chunk and len(at) > 1:  # the last one waits: only its successor tells whether its stamp is right
+                if chunk and len(at) > 1:  # hold back the last frame: its successor is needed to check its stamp
                     done, last_t = int(at[-1, s.START]) - s.STAMP, stamps[-2]
                     at, stamps = at[:-1], stamps[:-1]
                     counts[s.MESSAGES] -= 1
@@ -87,15 +87,15 @@ class Tlog:
 
 
 class Line:
-    """The recorder's clock, straightened: single wrong stamps taken out, steps back undone."""
+    """Correct the recorder's clock: remove single wrong stamps and steps back."""
 
     def __init__(self) -> None:
-        self._raw: float | None = None  # newest stamp as it stands in the file [s]
-        self._latest = -np.inf  # newest time given out [s]
-        self._shift = 0.0  # what is added to the stamps [s]
+        self._raw: float | None = None  # newest stamp in the file [s]
+        self._latest = -np.inf  # newest time returned [s]
+        self._shift = 0.0  # offset added to the stamps [s]
 
     def straight(self, t: np.ndarray) -> np.ndarray:
-        """Return times that never fall for stamps as they stand in the file, (n,) [s]."""
+        """Return non-decreasing times for the stamps in the file, (n,) [s]."""
         raw = despiked(np.concatenate([[t[0] if self._raw is None else self._raw], t]))
         steps = np.diff(raw)
         shifts = self._shift + np.cumsum(np.where(steps < -BACK_S, -steps, 0.0))
@@ -105,7 +105,7 @@ class Line:
 
 
 def despiked(t: np.ndarray) -> np.ndarray:
-    """Take out single stamps that disagree with both neighbours by more than `BACK_S`, (n,) [s]."""
+    """Replace single stamps that differ from both neighbours by more than `BACK_S`, (n,) [s]."""
     t = t.copy()
     before, after = t[:-2], t[2:]
     high = (t[1:-1] > after + BACK_S) & (t[1:-1] > before + BACK_S) & (after >= before - BACK_S)
@@ -115,7 +115,7 @@ def despiked(t: np.ndarray) -> np.ndarray:
 
 
 def boot_s(frames: Frames) -> np.ndarray:
-    """Read `time_boot_ms` of the messages that lead with it [s]; nan for all others, (n,)."""
+    """Return `time_boot_ms` of the messages that begin with it [s]; nan for all others, (n,)."""
     own = np.full(len(frames.at), np.nan)
     for number in _BOOT_FIRST:
         which = np.flatnonzero((frames.at[:, s.ID] == number) & (frames.at[:, s.SIZE] >= 4))
@@ -125,10 +125,10 @@ def boot_s(frames: Frames) -> np.ndarray:
 
 
 def backlog_offset(batches: Iterator[Frames]) -> float | None:
-    """Return fleet time minus boot time of a recording that holds a backlog [s]; None where arrival can be trusted.
+    """Return fleet time minus boot time of a recording with a backlog [s]; None if arrival times are valid.
 
-    A radio that catches up writes minutes of flight into seconds of file; then arrival - boot falls by more than
-    radios ever delay. Only for a single aircraft whose clock never goes back: otherwise nothing can be concluded.
+    A radio that transmits a backlog compresses minutes of flight to seconds of arrival: arrival - boot falls by more
+    than a radio delay. Applies only to a single aircraft whose clock never steps back.
     """
     least, most, newest = np.inf, -np.inf, -np.inf
     systems: set[int] = set()
@@ -148,7 +148,7 @@ def backlog_offset(batches: Iterator[Frames]) -> float | None:
 
 
 def restamped(batches: Iterator[Frames], offset_s: float) -> Iterator[Frames]:
-    """Stamp every frame with the newest boot time at that point, plus `offset_s`."""
+    """Set the arrival of every frame to the newest boot time before it plus `offset_s`."""
     newest = np.nan
     for frames in batches:
         own = boot_s(frames)

@@ -1,1 +1,1 @@
-"""Replay of recordings over UDP, also as many aircraft at once."""
+"""Replay of recordings over UDP, optionally as many aircraft."""

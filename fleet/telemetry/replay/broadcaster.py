@@ -1,4 +1,4 @@
-"""A `.tlog` on the air again: its aircraft, and copies of them, as MAVLink datagrams on this machine."""
+"""Send a `.tlog` as MAVLink datagrams on this machine: its aircraft and copies of them."""
 
 import ipaddress
 import socket
@@ -24,21 +24,21 @@ from fleet.telemetry.replay.rewrite_frames import Cut, cut, recast
 from fleet.telemetry.replay.send_batch import Volley
 
 Said = tuple[np.ndarray, Cut]
-"""Frames of one aircraft as every copy says them, (n, b) uint8, and where they are in it; each is a datagram."""
-STEP_S = 0.05  # recorded time between two rounds of datagrams [s]
-MOST_ON_A_LINK = 250  # system ids 1 to 250; the rest belongs to ground stations
+"""Frames of one aircraft rewritten for each copy, (n, b) uint8, and their positions; each frame is a datagram."""
+STEP_S = 0.05  # recorded time between two batches of datagrams [s]
+MOST_ON_A_LINK = 250  # system ids 1 to 250; higher ones are for ground stations
 
 
 def shared(copies: int, places: int) -> list[range]:
-    """Share copies out over places: the numbers of each one's."""
+    """Distribute copies over destinations: the copy numbers of each."""
     return [range(place, copies, places) for place in range(places)]
 
 
 def address(text: str) -> tuple[str, int]:
-    """Read HOST:PORT of this machine, `udpout:` before it or not.
+    """Parse HOST:PORT of this machine, with optional prefix `udpout:`.
 
     Raises:
-        ValueError: when it is none, or another machine: recorded aircraft must not reach real ground stations.
+        ValueError: if it is invalid, or another machine: recorded aircraft must not reach real ground stations.
     """
     host, _, port = text.removeprefix("udpout:").rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65_536:
@@ -46,33 +46,33 @@ def address(text: str) -> tuple[str, int]:
     try:
         found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)[0][4]
     except OSError as error:
-        raise ValueError(f"--to: found {host!r}, which nobody knows ({error}); name 127.0.0.1") from None
+        raise ValueError(f"--to: found {host!r}, expected a resolvable host ({error}); use 127.0.0.1") from None
     if not ipaddress.ip_address(str(found[0]).partition("%")[0]).is_loopback:
         raise ValueError(
             f"--to: found {text!r} on another machine, expected a loopback address such as 127.0.0.1:{port}; "
-            "copies of aircraft are for this machine alone"
+            "copies of aircraft must stay on this machine"
         )
     return str(found[0]), int(port)
 
 
 class Airing:
-    """One telemetry log, sent.
+    """Send one telemetry log.
 
     Args:
         path: the recording
         speed: times real time
-        numbers: of the copies sent to this place; 0 is the recorded aircraft itself
-        total: copies at all places
-        ids: MAVLink system ids given out, shared by all that are sent to one place
+        numbers: copy numbers sent to this destination; 0 is the recorded aircraft
+        total: number of copies at all destinations
+        ids: allocator of MAVLink system ids, shared by all logs sent to one destination
     Raises:
-        ValueError: when it is no telemetry log.
-        OSError: when it cannot be read.
+        ValueError: if it is not a telemetry log; omit --to.
+        OSError: if it cannot be read; check path and permissions.
     """
 
     def __init__(self, path: Path, speed: float, numbers: range, total: int, ids: Ids) -> None:
         recording = Recording(path)
         if recording.suffix != ".tlog":
-            raise ValueError(f"{path.name}: found a {recording.kind}, expected a telemetry log for --to; leave it out")
+            raise ValueError(f"{path.name}: found a {recording.kind}, expected a telemetry log for --to; omit --to")
         self.name = path.name
         self.pace = Pace(speed)
         self.sent = 0  # datagrams
@@ -80,22 +80,22 @@ class Airing:
         self._source = Source(path)
         self._tlog = Tlog(self._source)
         self._numbers, self._total, self._ids = np.array(numbers), total, ids
-        self._systems: dict[int, np.ndarray] = {}  # of the cast, by the recorded one, (copies,)
+        self._systems: dict[int, np.ndarray] = {}  # system ids of the copies, by recorded system id, (copies,)
         self._asides: list[Aside] | None = None
 
     @property
     def share(self) -> float:
-        """Tell how far reading has come, 0..1."""
+        """Return the read progress, 0..1."""
         return self._tlog.share
 
     def words(self) -> str:
-        """Say how far it has been sent, and how fast."""
+        """Return progress and send rate as text."""
         aircraft, took = len(self._systems) * len(self._numbers), self.pace.took_s
         rate = f", {self.sent / took:,.0f} a second" if took > 0 else ""
         return f"{self.pace.words()}, {aircraft} aircraft, {self.sent:,} datagrams{rate}"
 
     def send(self, to: tuple[str, int], stop: threading.Event) -> None:
-        """Send everything until it ends or `stop` is set; what goes wrong is left in `trouble`."""
+        """Send the log until its end or until `stop` is set; errors are stored in `problem`."""
         self._source.stop = stop
         family = socket.AF_INET6 if ":" in to[0] else socket.AF_INET
         try:
@@ -115,7 +115,7 @@ class Airing:
             self.trouble = f"{self.name}: found no aircraft in it, expected at least one heartbeat; check the file"
 
     def _rounds(self) -> Iterator[tuple[float, list[Said]]]:
-        """Return round by round: (recorded time [s since 1970], what is said now)."""
+        """Return the batches: (recorded time [s since 1970], frames to send)."""
         past: deque[list[Cut]] = deque(maxlen=GROUPS)  # newest first
         sources: deque[list[int]] = deque(maxlen=GROUPS)
         first, now = np.nan, 0.0
@@ -129,13 +129,13 @@ class Airing:
                 past.appendleft([cut(frames, part[frames.at[part, SYSTEM] == n]) for n in systems])
                 sources.appendleft(systems)
                 yield now, list(self._said(past, sources))
-        for lag in range(1, GROUPS):  # the originals have ended
+        for lag in range(1, GROUPS):  # delayed copies after the end of the log
             past.appendleft([])
             sources.appendleft([])
             yield now + lag * STEP_S, list(self._said(past, sources))
 
     def _said(self, past: deque[list[Cut]], sources: deque[list[int]]) -> Iterator[Said]:
-        """Return what originals say now, and copies a few steps later."""
+        """Return the frames of the originals, and delayed frames of the copies."""
         for lag, (cuts, systems) in enumerate(zip(past, sources, strict=True)):
             for one, system in zip(cuts, systems, strict=True):
                 cast = self._systems[system][lag::GROUPS]
@@ -144,7 +144,7 @@ class Airing:
                     yield recast(one, cast, aside), one
 
     def _meet(self, frames: Frames) -> None:
-        """Learn which aircraft there are; return them and their copies system ids."""
+        """Register new aircraft, and allocate system ids for them and their copies."""
         new: set[int] = set()
         for heartbeat in frames.messages(np.flatnonzero(frames.at[:, ID] == IDS["HEARTBEAT"])):
             system = heartbeat.get_srcSystem()

@@ -1,4 +1,4 @@
-"""Many aircraft from one recording: copies with ids, places and times of their own, patched into prepared bytes."""
+"""Copies of recorded aircraft with own ids, positions and times, written into encoded messages."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -15,20 +15,20 @@ from fleet.telemetry.mavlink.steps import STEP_S
 from fleet.telemetry.recording.fleet_news import named
 from fleet.telemetry.replay.offset import Aside
 
-GROUPS = 10  # copies that lag behind the original by 1, 2 … steps, so that not all speak at once
+GROUPS = 10  # groups of copies delayed by 0, 1, 2 … steps, to spread the load
 _PLACES = ("position", "target")
 
 
 class Group(NamedTuple):
-    """Copies of one aircraft that lag equally."""
+    """Copies of one aircraft with equal delay."""
 
     ids: np.ndarray  # UAV ids, (n,)
-    aside: Aside | None  # None until it is known where the original is
-    lag_s: float  # behind the original [s]
+    aside: Aside | None  # None until the original has a position
+    lag_s: float  # delay behind the original [s]
 
 
 class Prepared:
-    """One message, packed so that id, times and places can be written over in place."""
+    """One encoded message whose id, times and positions can be overwritten."""
 
     def __init__(self, message: Message) -> None:
         self.message = message
@@ -38,8 +38,8 @@ class Prepared:
         packed = plain[:head] + b"\xce" + bytes(4) + b"\xa1t\xcb" + bytes(8) + plain[rest:]
         self._bytes = np.frombuffer(packed, np.uint8)
         self._uav, self._t = head + 1, head + 8
-        self._times: list[tuple[int, np.ndarray]] = []  # where in the bytes, (m,) [s since 1970]
-        self._places: list[tuple[int, np.ndarray]] = []  # where, (m, 3) [1e-7 deg, 1e-7 deg, mm]
+        self._times: list[tuple[int, np.ndarray]] = []  # byte offset, (m,) [s since 1970]
+        self._places: list[tuple[int, np.ndarray]] = []  # byte offset, (m, 3) [1e-7 deg, 1e-7 deg, mm]
         if isinstance(message, Sample):
             self._find_rows(packed, message)
 
@@ -77,27 +77,27 @@ def _write(out: np.ndarray, at: int, values: np.ndarray) -> None:
 
 
 class Copies:
-    """The copies of the aircraft of one recording, fed step by step.
+    """Copies of the aircraft of one recording, processed step by step.
 
     Args:
-        count: aircraft in place of each recorded one, itself included
+        count: number of aircraft per recorded one, itself included
     """
 
     def __init__(self, count: int) -> None:
         self.count = count
-        self._ids: dict[int, np.ndarray] = {}  # of the copies, by the original's
+        self._ids: dict[int, np.ndarray] = {}  # ids of the copies, by id of the original
         self._past: deque[list[Prepared]] = deque(maxlen=GROUPS)  # newest first
         self._asides: list[Aside | None] = [None] * GROUPS
         self._origin: Origin | None = None
         self._items: dict[int, tuple[tuple[Item, ...], dict[int, tuple[Item, ...]]]] = {}
-        self._early: dict[int, Mission] = {}  # said before it was known where the original is
+        self._early: dict[int, Mission] = {}  # missions before the first position of the original
 
     def name(self, uav: int, ids: Sequence[int]) -> None:
-        """Say which UAV ids the copies of an original have."""
+        """Set the UAV ids of the copies of an original."""
         self._ids[uav] = np.array(ids, np.int64)
 
     def step(self, news: Sequence[Message]) -> list[Wire]:
-        """Take what the originals said in one step of 0.1 s; return what copies say now."""
+        """Add the messages of the originals in one step of 0.1 s; return the messages of the copies."""
         if self.count < 2:
             return []
         if self._origin is None:
@@ -108,7 +108,7 @@ class Copies:
         return [wire for lag, past in enumerate(self._past) for one in past for wire in self._said(one, lag)]
 
     def last(self) -> Iterator[list[Wire]]:
-        """Give, step by step, what the copies still say after the originals have ended."""
+        """Return step by step the remaining messages of the copies after the end of the originals."""
         for _ in range(GROUPS - 1 if self.count > 1 else 0):
             yield self.step([])
 
@@ -135,14 +135,14 @@ class Copies:
             yield Wire(kind, uav, payload, message.t + group.lag_s)
 
     def _one_by_one(self, message: Message, group: Group) -> list[bytes]:
-        """Pack every copy by itself: of a mission, and of what names the aircraft in its sentence; both are rare."""
+        """Encode each copy separately: for missions, and for messages with a sentence; both are rare."""
         items = self._missions(message, group) if isinstance(message, Mission) else {}
         t = message.t + group.lag_s
         more: dict[int, dict[str, Any]] = {uav: {"items": moved} for uav, moved in items.items()}
         return [encode(named(message, uav, t=t, **more.get(uav, {}))) for uav in group.ids.tolist()]
 
     def _missions(self, mission: Mission, group: Group) -> dict[int, tuple[Item, ...]]:
-        """Return every copy's items, moved once and kept as long as the list stays the same."""
+        """Return the offset items of each copy, cached while the mission is unchanged."""
         known, moved = self._items.get(mission.uav, ((), {}))
         if known != mission.items:
             moved = {}

@@ -1,4 +1,4 @@
-"""MAVLink frames in another aircraft's name: system id, places and checksum written anew; everything else as it was."""
+"""Rewrite system id, positions and checksum of MAVLink frames for copies of an aircraft."""
 
 from typing import NamedTuple
 
@@ -21,21 +21,21 @@ PLACES = {
     "MISSION_ITEM_INT": ("x", "y"),
     "MISSION_ITEM": ("x", "y"),  # degrees as floats; all others are integers
 }
-"""Messages that say where something is on the ground: fields of latitude and longitude."""
+"""Messages with geodetic positions: their fields of latitude and longitude."""
 
 
 class Cut(NamedTuple):
-    """Frames of one system one after the other, signatures cut off."""
+    """Concatenated frames of one system, without signatures."""
 
     told: np.ndarray  # bytes, (b,) uint8
-    start: np.ndarray  # of each frame in them, (m,)
-    payload: np.ndarray  # of each payload in them, (m,)
-    size: np.ndarray  # of each payload, (m,) [bytes]
-    message: np.ndarray  # ids, (m,)
+    start: np.ndarray  # start of each frame in them, (m,)
+    payload: np.ndarray  # start of each payload in them, (m,)
+    size: np.ndarray  # size of each payload, (m,) [bytes]
+    message: np.ndarray  # message ids, (m,)
 
 
 def cut(frames: Frames, which: np.ndarray) -> Cut:
-    """Copy frames `which`, all of one system, out of what was heard."""
+    """Extract frames of one system from the received frames."""
     at = frames.at[which]
     head, size = at[:, s.PAYLOAD] - at[:, s.START], at[:, s.SIZE]
     length = head + size + 2
@@ -43,17 +43,17 @@ def cut(frames: Frames, which: np.ndarray) -> Cut:
     spans = zip(at[:, s.START].tolist(), length.tolist(), strict=True)
     told = np.concatenate([frames.buf[begin : begin + n] for begin, n in spans])
     second = start[told[start] == s.V2]
-    told[second + 2] &= ~np.uint8(s.SIGNED)  # who signed it did not sign this
+    told[second + 2] &= ~np.uint8(s.SIGNED)  # the signature is invalid for changed frames
     return Cut(told, start, start + head, size, at[:, s.ID])
 
 
 def recast(one: Cut, systems: np.ndarray, aside: Aside | None) -> np.ndarray:
-    """Return the bytes of the same frames from every other system, (n, b) uint8.
+    """Return the bytes of the frames rewritten for each system, (n, b) uint8.
 
     Args:
-        one: the original's frames
+        block: frames of the original
         systems: MAVLink system ids, (n,)
-        aside: moves places, a row for each of `systems`; None leaves them
+        offset: position offset, one row per system; None: no offset
     """
     out = np.tile(one.told, (len(systems), 1))
     at = one.start + np.where(one.told[one.start] == s.V2, 5, 3)
@@ -65,7 +65,7 @@ def recast(one: Cut, systems: np.ndarray, aside: Aside | None) -> np.ndarray:
 
 
 def _move(out: np.ndarray, one: Cut, name: str, aside: Aside) -> None:
-    """Move the places in all frames of one message; a place the sender cut off, for it was 0, stays."""
+    """Offset the positions in all frames of one message; truncated zero positions are unchanged."""
     fields = layout(name).fields
     assert fields is not None
     (lat, _), (lon, _) = (fields[field][:2][::-1] for field in PLACES[name])
@@ -88,11 +88,11 @@ def _move(out: np.ndarray, one: Cut, name: str, aside: Aside) -> None:
 
 @nb.njit(cache=True)
 def seal(out, start, payload, size, extra, table):
-    """Write every frame's checksum anew.
+    """Write the checksum of each frame.
 
     Args:
-        out: the same frames of several systems, changed in place, (n, b) uint8
-        start, payload, size: where frames and payloads begin, and how long payloads are, (m,)
+        out: frames of several systems, changed in place, (n, b) uint8
+        start, payload, size: starts of frames and payloads, sizes of payloads, (m,)
         extra: CRC_EXTRA, (m,)
         table: `scan.CRC`
     """

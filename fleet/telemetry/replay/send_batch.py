@@ -1,4 +1,4 @@
-"""Many datagrams in one call: `sendmmsg` on Linux, one by one elsewhere.
+"""Send many datagrams in one call: `sendmmsg` on Linux, individually on other systems.
 
 Source: sendmmsg(2); structures as in <sys/socket.h> of 64-bit Linux.
 """
@@ -9,7 +9,7 @@ import sys
 
 import numpy as np
 
-MOST = 1024  # datagrams in one call, the system's limit
+MOST = 1024  # datagrams per call, the system's limit
 _VECTOR = np.dtype([("base", "u8"), ("size", "u8")])
 _MESSAGE = np.dtype(
     {
@@ -22,7 +22,7 @@ _MESSAGE = np.dtype(
 
 
 class Volley:
-    """Sends from one connected socket."""
+    """Sender of datagrams on one connected socket."""
 
     def __init__(self, out: socket.socket) -> None:
         self._out = out
@@ -31,11 +31,11 @@ class Volley:
             self._call.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int)
 
     def send(self, told: np.ndarray, start: np.ndarray, length: np.ndarray) -> int:
-        """Send the datagrams that begin at `start` in `told`; gives how many the system took.
+        """Send datagrams; return the number accepted by the system.
 
         Args:
-            told: bytes, (b,) uint8
-            start, length: of each datagram in them, (n,)
+            data: bytes of all datagrams, (b,) uint8
+            start, length: start and length of each datagram in them, (n,)
         """
         if self._call is None:
             return sum(
@@ -48,7 +48,8 @@ class Volley:
         while at < len(start):
             where = messages.ctypes.data + at * _MESSAGE.itemsize
             took = self._call(self._out.fileno(), where, min(MOST, len(start) - at), 0)
-            at, sent = at + max(took, 1), sent + max(took, 0)  # nobody listens yet, no room: gone, as with a radio
+            # without receiver or buffer space the datagram is lost
+            at, sent = at + max(took, 1), sent + max(took, 0)
         return sent
 
     def _one(self, datagram: bytes) -> int:

@@ -1,1 +1,1 @@
-"""Tables from MAVLink, DataFlash and ULog messages to the columns of a `Sample`, and the clock they share."""
+"""Tables from MAVLink, DataFlash and ULog messages to the columns of a `Sample`, and the shared clock."""

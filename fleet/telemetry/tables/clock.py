@@ -1,8 +1,8 @@
-"""Boot time to fleet time: an offset with slow drift, wraps undone, jumps noticed and survived. Compiled.
+"""Convert boot time to fleet time: slewed offset, wrap correction, jump detection. Compiled.
 
-fleet = boot + offset, and offset = min(arrival - boot) over the last half minute: the message that travelled
-fastest tells the offset best. Source: minimum-delay filter as in NTP (RFC 5905, section 10). The offset is slewed; a
-clock that falls behind faster than that (a simulator slower than real time, or paused) is re-anchored, forward only.
+fleet = boot + offset, and offset = min(arrival - boot) over the last 15 to 30 s: the message with the least
+delay gives the best estimate. Source: minimum-delay filter as in NTP (RFC 5905, section 10). The offset is slewed. A
+clock that falls behind faster (a slow or paused simulator) is re-anchored, forward only.
 """
 
 from math import inf, isnan, nan
@@ -11,48 +11,48 @@ import numba as nb
 import numpy as np
 
 WRAP_BOOT_S = 2**32 * 1e-3  # time_boot_ms [s]
-WRAP_USEC_S = 2**32 * 1e-6  # time_usec cut to 32 bit [s]
-BACK_S = 1.0  # going back further than this is a jump, not a late message [s]
-LEAP_S = 2.0  # getting ahead of arrival further than this is a jump [s]
-CONFIRM = 3  # messages in a row that must agree on a jump
-WARM_UP_S = 1.0  # the offset may still step [s]
-BUCKET_S = 15.0  # the minimum is over one to two of these [s]
+WRAP_USEC_S = 2**32 * 1e-6  # time_usec truncated to 32 bit [s]
+BACK_S = 1.0  # a larger step back is a jump, not a late message [s]
+LEAP_S = 2.0  # a larger lead over arrival is a jump [s]
+CONFIRM = 3  # consecutive messages that confirm a jump
+WARM_UP_S = 1.0  # time after an anchor in which the offset may step [s]
+BUCKET_S = 15.0  # length of a bucket; the minimum covers one to two buckets [s]
 LATELY = 0.01  # weight of the newest delay in the mean
-SLEW = 2e-3  # drift the offset may follow [s/s]
-SLEW_FAST = 0.1  # when the offset is plainly too late [s/s]
-PLAIN_S = 0.25  # what is plainly [s]
-BEHIND_S = 1.0  # minimum delay of a whole window above which the offset is re-anchored instead of slewed [s]
+SLEW = 2e-3  # maximum slew rate of the offset [s/s]
+SLEW_FAST = 0.1  # the same for an offset error above the next limit [s/s]
+PLAIN_S = 0.25  # offset error above which the fast slew applies [s]
+BEHIND_S = 1.0  # minimum delay of a window above which the offset is re-anchored [s]
 
 (
-    OFFSET,  # fleet time minus own time [s]
-    NEWEST,  # newest own time, wraps undone; nan before any [s]
-    JUMPS,  # jumps noticed
-    WRAP,  # own time wraps after this; 0: never [s]
-    ARRIVAL,  # of the newest
+    OFFSET,  # fleet time minus message time [s]
+    NEWEST,  # newest unwrapped message time; nan before the first [s]
+    JUMPS,  # number of detected jumps
+    WRAP,  # wrap period of the message time; 0: none [s]
+    ARRIVAL,  # arrival of the newest message
     ANCHORED,  # arrival at the last anchor
-    LATEST,  # newest fleet time given out
-    SUSPECTS,  # messages in a row that hint at a jump
-    LEAST,  # least delay of this bucket [s]
-    LEAST_BEFORE,  # and of the one before [s]
-    BUCKET,  # arrival at which this bucket began
-    DELAY,  # of late, mean: arrival minus fleet time given out [s]
-    WORST,  # largest since it was last taken [s]
-    ADVANCE,  # sum of the steps by which the offset was re-anchored forward, because the clock fell behind [s]
+    LATEST,  # newest fleet time returned
+    SUSPECTS,  # consecutive messages that indicate a jump
+    LEAST,  # minimum delay of this bucket [s]
+    LEAST_BEFORE,  # minimum delay of the previous bucket [s]
+    BUCKET,  # arrival at the start of this bucket
+    DELAY,  # smoothed arrival minus fleet time [s]
+    WORST,  # maximum since the last reset [s]
+    ADVANCE,  # sum of the forward re-anchoring steps [s]
     LENGTH,
 ) = range(15)
 BOOT, USEC, USEC32, NONE = range(4)
-"""Where the time of a message comes from: time_boot_ms, time_usec, time_usec cut to 32 bit, nowhere."""
+"""Time source of a message: time_boot_ms, time_usec, time_usec truncated to 32 bit, none."""
 
 
 def new_clock(wrap_s: float = 0.0) -> np.ndarray:
-    """Make the state of one clock, (LENGTH,)."""
+    """Return the initial state of one clock, (STATE_SIZE,)."""
     clock = np.zeros(LENGTH)
     clock[NEWEST], clock[LATEST], clock[WRAP] = nan, -inf, wrap_s
     return clock
 
 
 def new_clocks() -> np.ndarray:
-    """Make the clocks of one aircraft, (3, LENGTH): boot, and those of `time_usec` that does not count from boot."""
+    """Return the clocks of one aircraft, (3, STATE_SIZE): boot, and two for `time_usec` not counted from boot."""
     return np.stack([new_clock(WRAP_BOOT_S), new_clock(), new_clock(WRAP_USEC_S)])
 
 
@@ -61,10 +61,10 @@ def read(clock, raw_s, arrival, latest):
     """Return the fleet time of a message [s since 1970]; nan while a jump is suspected.
 
     Args:
-        clock: state, changed in place, (LENGTH,)
-        raw_s: the message's own time [s]
+        clock: state, changed in place, (STATE_SIZE,)
+        raw_s: time stamp of the message [s]
         arrival: when it arrived, fleet clock [s since 1970]
-        latest: newest fleet time already given out; a new anchor never lies before it [s since 1970]
+        latest: newest fleet time returned; a new anchor is later [s since 1970]
     """
     if isnan(clock[NEWEST]):
         return _anchor(clock, raw_s, arrival, latest)
@@ -88,7 +88,7 @@ def read(clock, raw_s, arrival, latest):
 
 @nb.njit(cache=True)
 def unwrap(clock, raw_s):
-    """Undo wraps: the value nearest to the newest own time [s]."""
+    """Unwrap a message time to the value nearest to the newest one [s]."""
     if clock[WRAP] == 0.0 or isnan(clock[NEWEST]):
         return raw_s
     return raw_s + np.rint((clock[NEWEST] - raw_s) / clock[WRAP]) * clock[WRAP]
@@ -103,7 +103,7 @@ def _at(clock, own_s):
 
 @nb.njit(cache=True)
 def now(clock, arrival):
-    """Return the fleet time of a message without a time of its own: the newest, moved on by at most 0.5 s."""
+    """Return the fleet time of a message without time stamp: the newest, extrapolated by at most 0.5 s."""
     if isnan(clock[NEWEST]):
         clock[LATEST] = max(clock[LATEST], arrival)
         return arrival
@@ -126,7 +126,7 @@ def _follow(clock, delay, arrival, passed):
     least = min(clock[LEAST], clock[LEAST_BEFORE])
     error = least - clock[OFFSET]
     if error > BEHIND_S:
-        anchor = max(least, delay - BEHIND_S)  # the least may be half a minute old, the newest may be an unlucky one
+        anchor = max(least, delay - BEHIND_S)  # the minimum may be 30 s old, the newest delay an outlier
         clock[ADVANCE] += anchor - clock[OFFSET]
         clock[OFFSET], clock[LEAST], clock[LEAST_BEFORE] = anchor, delay, delay
         clock[ANCHORED] = clock[BUCKET] = arrival
@@ -143,9 +143,9 @@ def tell(clocks, tick, raw_s, arrival):
     """Return the fleet time of one message of an aircraft [s since 1970]; nan while a jump is suspected.
 
     Args:
-        clocks: states, changed in place, (3, LENGTH)
+        clocks: states, changed in place, (3, STATE_SIZE)
         tick: BOOT, USEC, USEC32 or NONE
-        raw_s: the message's own time [s]
+        raw_s: time stamp of the message [s]
         arrival: when it arrived, fleet clock [s since 1970]
     """
     boot = clocks[BOOT]
@@ -164,5 +164,5 @@ def tell(clocks, tick, raw_s, arrival):
 
 
 def jumps(clocks: np.ndarray) -> int:
-    """Count the jumps noticed."""
+    """Return the number of detected jumps."""
     return int(clocks[:, JUMPS].max())

@@ -1,11 +1,11 @@
-"""THE TABLE of DataFlash: one row per message and `Sample` field, ArduPilot from 2013 to 2026. A newcomer adds a row.
+"""DataFlash table: one row per message and `Sample` field, ArduPilot from 2013 to 2026. A new source is a new row.
 
-The only place where degrees, per cent and centimetres become SI, NED, FRD and rad. ArduPilot renames its fields:
-a row fits a log when that log has every field the row reads, and of the rows that fit and flow the highest rank wins.
-Numbers arrive as the format's letter scales them (`c` in units, `L` in degrees), the same from binary and text logs.
+All unit conversions of DataFlash to SI, NED, FRD and rad are here. ArduPilot renames its fields: a row applies if the
+log has all fields that the row reads; of the active applicable rows the highest rank wins. Values are scaled by their
+format letter (`c` in units, `L` in degrees), identically for binary and text logs.
 
-A field whose columns come from several messages has `PARTS`: the first part gives the instants, the others are
-interpolated onto them. What no message tells is left out: copters log no cross-track error, so they have no `command`.
+A field whose columns come from several messages has `PARTS`: the first part defines the times, the others are
+interpolated to them. Fields without source are omitted: copters log no cross-track error, so they have no `command`.
 Source: ArduPilot's Log.cpp of Plane and Copter and AP_Logger's LogStructure.h, releases 2013 to 2026.
 """
 
@@ -28,9 +28,9 @@ PARTS: dict[str, tuple[tuple[str, int], ...]] = {
 
 ANGLES, RATES = "attitude", "attitude: rates"
 
-_FIX = 3  # GPS status from here on: position in three dimensions
-_NO_FIX_DEG = 0.01  # a kilometre round zero, zero
-_LAST_NAV = 95  # MAV_CMD: up to here navigation, beyond conditions and actions, but for
+_FIX = 3  # minimum GPS status of a 3D fix
+_NO_FIX_DEG = 0.01  # within 1 km of latitude 0, longitude 0
+_LAST_NAV = 95  # last navigation MAV_CMD; later ones are conditions and actions, except
 _NAV_TOO = (213, 42702, 42703)  # set yaw and speed, script time, attitude time
 
 
@@ -71,24 +71,24 @@ def _ned(m: Any) -> tuple[Any, ...]:
 
 
 def _started(m: Any) -> Any:
-    return (m.VN != 0) | (m.VE != 0) | (m.VD != 0)  # a filter that has not started says zero to the last digit
+    return (m.VN != 0) | (m.VE != 0) | (m.VD != 0)  # exact zeros: the filter has not started
 
 
 def _wind(m: Any) -> tuple[Any, ...]:
-    return (m.VWN, m.VWE)  # where it blows to
+    return (m.VWN, m.VWE)  # direction the wind blows to
 
 
 def _blows(m: Any) -> Any:
-    return (m.VWN != 0) | (m.VWE != 0)  # exact zeros: this filter does not estimate wind, or not yet
+    return (m.VWN != 0) | (m.VWE != 0)  # exact zeros: no wind estimate
 
 
 def _outputs(m: Any, names: str) -> tuple[Any, ...]:
     given = tuple(getattr(m, name) for name in names.split())
-    return (*given, *(given[0] * 0.0,) * (8 - len(given)))  # an output that is not logged is off, as MAVLink has it
+    return (*given, *(given[0] * 0.0,) * (8 - len(given)))  # an output that is not logged is 0, as in MAVLink
 
 
 def _is_plane(m: Any) -> Any:
-    return np.isfinite(m.NavRoll)  # Copter's message of the same name has none
+    return np.isfinite(m.NavRoll)  # Copter's message of the same name has no NavRoll
 
 
 def _copter_throttle(m: Any) -> tuple[Any, ...]:
@@ -115,7 +115,7 @@ TABLE: tuple[Row, ...] = (
     Row("IMU", "attitude: rates", _gyro, rank=3),
     Row("GYR", "attitude: rates", _gyro, rank=2, when=lambda m: m.I == 0),
     Row("RATE", "attitude: rates", lambda m: _rate(m, DEG + 0.0 * m.AOutSlew), rank=1),
-    Row("RATE", "attitude: rates", lambda m: _rate(m, DEG / 100 + 0.0 * m.TimeMS), rank=1),  # between: either unit
+    Row("RATE", "attitude: rates", lambda m: _rate(m, DEG / 100 + 0.0 * m.TimeMS), rank=1),  # either unit
     Row("IMU", "imu", _imu, rank=2, when=lambda m: m.I == 0),
     Row("IMU", "imu", _imu, rank=1),
     Row("POS", "position", _place, rank=4, when=_somewhere),
@@ -162,7 +162,7 @@ TABLE: tuple[Row, ...] = (
     Row("NTUN", "command: errors", lambda m: (m.XT, m.AltErr, m.AspdE), rank=2),
     Row("NTUN", "command: errors", lambda m: (m.XT, m.AltErr, m.ArspdErr), rank=1),
     Row("MISE", "leg", lambda m: (m.CNum,), rank=2, when=_is_leg),
-    Row("CMD", "leg", lambda m: (m.CNum,), rank=1, when=_is_leg),  # those that were carried out; lists are missions
+    Row("CMD", "leg", lambda m: (m.CNum,), rank=1, when=_is_leg),  # executed items; item lists are missions
     Row("XKF2", "wind", _wind, rank=5, when=lambda m: (m.C == 0) & _blows(m)),
     Row("XKF2", "wind", _wind, rank=4, when=_blows),
     Row("NKF2", "wind", _wind, rank=3, when=lambda m: (m.C == 0) & _blows(m)),
@@ -172,7 +172,7 @@ TABLE: tuple[Row, ...] = (
     Row(
         "NTUN",
         "target",
-        lambda m: _target(m, m.TAlt * np.where(m.whole("TAlt"), 1e-2, 1.0)),  # centimetres while it was an integer
+        lambda m: _target(m, m.TAlt * np.where(m.whole("TAlt"), 1e-2, 1.0)),  # integers are centimetres
         rank=1,
         when=_has_target,
     ),
@@ -191,15 +191,15 @@ COLUMNS_OF: dict[str, slice] = {
     for parts in PARTS.values()
     for i, (part, _) in enumerate(parts)
 }
-"""Which columns of its `Sample` field a part fills; a field without parts fills them all."""
+"""Columns of the `Sample` field that a part fills; a field without parts fills all."""
 
 
 def field_of(part: str) -> str:
-    """Name the `Sample` field a part belongs to."""
+    """Return the `Sample` field of a part."""
     return part.split(":")[0]
 
 
 def believable(part: str, values: np.ndarray) -> np.ndarray:
-    """Tell for each row of a part, (n, k), whether every column is finite and within its largest magnitude, (n,)."""
+    """Return a mask of the rows of a part, (n, k), with all columns finite and within `MAX_MAGNITUDE`, (n,)."""
     highest = np.array(HIGHEST[field_of(part)])[COLUMNS_OF.get(part, slice(None))]
     return (np.abs(values) <= highest).all(axis=-1)

@@ -1,7 +1,7 @@
-"""THE TABLE of MAVLink: one row per message and `Sample` field, with the clock its time comes from.
+"""MAVLink table: one row per message and `Sample` field, with its time source.
 
-The only place where degrees, centimetres, milli-g and per cent become SI, NED, FRD and rad. A newcomer adds a row.
-Source: MAVLink common.xml; for what ArduPilot really sends, its GCS_Common.cpp and GCS_MAVLink_Plane.cpp.
+All unit conversions of MAVLink to SI, NED, FRD and rad are here. A new source is a new row.
+Source: MAVLink common.xml; for ArduPilot's deviations its GCS_Common.cpp and GCS_MAVLink_Plane.cpp.
 """
 
 from math import pi
@@ -32,11 +32,11 @@ def _servo(m: Any) -> tuple[Any, ...]:
 
 _NO_ITEM = 65535
 _FIX_3D = 3
-_NO_FIX_E7 = 100_000  # a kilometre round zero, zero [1e-7 deg]
+_NO_FIX_E7 = 100_000  # within 1 km of latitude 0, longitude 0 [1e-7 deg]
 
 
 def _has_fix(m: Any) -> Any:
-    return _somewhere(m.lat, m.lon)  # without a fix autopilots say zero, zero, or drift around it
+    return _somewhere(m.lat, m.lon)  # without a fix autopilots send 0, 0 or values near it
 
 
 def _somewhere(lat: Any, lon: Any) -> Any:
@@ -47,7 +47,7 @@ _ABS_PRESSURE = 1 << 9  # HIGHRES_IMU_UPDATED_FLAGS
 
 
 def _started(m: Any) -> Any:
-    """Tell where there is a velocity: an estimator that has none says zero to the last digit, or not a number."""
+    """Return a mask of valid velocities: an estimator without velocity sends exact zeros or NaN."""
     return np.isfinite(m.vx + m.vy + m.vz) & ((m.vx != 0) | (m.vy != 0) | (m.vz != 0))
 
 
@@ -56,7 +56,8 @@ def _measured(m: Any) -> Any:
 
 
 def _wind(m: Any) -> tuple[Any, ...]:
-    return (-m.speed * np.cos(m.direction * DEG), -m.speed * np.sin(m.direction * DEG))  # it names where from
+    # direction: where the wind comes from
+    return (-m.speed * np.cos(m.direction * DEG), -m.speed * np.sin(m.direction * DEG))
 
 
 TABLE: tuple[Row, ...] = (
@@ -68,7 +69,7 @@ TABLE: tuple[Row, ...] = (
     ),
     Row("HIGHRES_IMU", "imu", lambda m: (m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro), USEC, rank=3),
     Row("SCALED_IMU", "imu", _imu_milli, BOOT, rank=2),
-    Row("RAW_IMU", "imu", _imu_milli, USEC, rank=1, autopilots=("ardupilot",)),  # elsewhere raw has no unit
+    Row("RAW_IMU", "imu", _imu_milli, USEC, rank=1, autopilots=("ardupilot",)),  # others: raw without unit
     Row("GLOBAL_POSITION_INT", "position", lambda m: (m.lat, m.lon, m.alt), BOOT, when=_has_fix),
     Row(
         "GLOBAL_POSITION_INT",
@@ -78,13 +79,13 @@ TABLE: tuple[Row, ...] = (
         when=_has_fix,
     ),
     Row(
-        "LOCAL_POSITION_NED",  # the same estimator without rounding, and often faster
+        "LOCAL_POSITION_NED",  # the same estimator, unrounded and often faster
         "velocity",
         lambda m: (m.vx, m.vy, m.vz),
         BOOT,
         rank=1,
         when=_started,
-        given="position",  # without a fix PX4 sends what drifts, in a frame that need not face north
+        given="position",  # without a fix PX4 sends a drifting velocity, not aligned with north
     ),
     Row("VFR_HUD", "air", lambda m: (m.airspeed, m.throttle * 1e-2, m.climb), NONE),
     Row("SERVO_OUTPUT_RAW", "servo", _servo, USEC32, when=lambda m: m.port == 0),
@@ -98,7 +99,7 @@ TABLE: tuple[Row, ...] = (
     Row(
         "NAV_CONTROLLER_OUTPUT",
         "command",
-        lambda m: _command(m, -m.alt_error, -m.aspd_error),  # PX4 sends flown minus wanted
+        lambda m: _command(m, -m.alt_error, -m.aspd_error),  # PX4 sends actual minus commanded
         NONE,
         autopilots=("px4",),
     ),
@@ -114,7 +115,7 @@ TABLE: tuple[Row, ...] = (
         "command",
         lambda m: (*euler(np.asarray(m.q, float).T)[:2], np.nan, np.nan, np.nan),
         BOOT,
-        rank=1,  # PX4 sends the set points of its attitude loop here, at a rate; in the other only some builds do
+        rank=1,  # PX4 attitude set points; only some builds send the other message
         autopilots=("px4",),
     ),
     Row("MISSION_CURRENT", "leg", lambda m: (np.where(m.seq == _NO_ITEM, -1.0, m.seq),), NONE),
@@ -134,9 +135,9 @@ TABLE: tuple[Row, ...] = (
         "pressure",
         lambda m: (m.press_abs * 1e2,),
         BOOT,
-        when=lambda m: m.press_abs != 0,  # zero: no barometer
+        when=lambda m: m.press_abs != 0,  # 0: no barometer
     ),
-    # its time is since boot here, of the receiver there: it would upset the clock that other messages share
+    # time_usec is boot time or receiver time, depending on the autopilot: not usable for the shared clock
     Row("GPS_RAW_INT", "gnss", lambda m: (m.alt,), NONE, when=lambda m: m.fix_type >= _FIX_3D),
 )
 
@@ -145,5 +146,5 @@ _OWN_TIME[USEC32] = _OWN_TIME[USEC]
 
 
 def own_seconds(row: Row, message: Any) -> Any:
-    """Read the messages' own time on whatever clock the row names [s]; 0 where it names none."""
+    """Return the time stamps of the messages from the row's time source [s]; 0 without source."""
     return _OWN_TIME[row.tick](message)

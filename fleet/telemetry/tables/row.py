@@ -1,4 +1,4 @@
-"""What every dialect's table is made of: `Row`; and which values any of them may claim."""
+"""Row type of the dialect tables, and the range of plausible values of each field."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -9,19 +9,19 @@ from fleet.contract import UNTOLD
 
 
 class Row(NamedTuple):
-    """One way from a message to columns of a `Sample` field.
+    """Mapping from one message to the columns of a `Sample` field.
 
-    `columns` and `when` read the message's fields as attributes, numbers and arrays alike: no `if`, no `math`.
+    `columns` and `when` read message fields as attributes, numbers or arrays: they must not use `if` or `math`.
     """
 
-    message: str  # its name in the dialect
+    message: str  # message name in the dialect
     field: str  # field of `Sample`; columns as in `contract.COLUMNS`
     columns: Callable[[Any], tuple[Any, ...]]
-    tick: int = 0  # MAVLink: the clock its time comes from, BOOT, USEC, USEC32 or NONE of `telemetry.clock`
-    rank: int = 0  # among rows of one field the highest rank that flows wins; in MAVLink's table below `settle.RANKS`
+    tick: int = 0  # MAVLink: time source BOOT, USEC, USEC32 or NONE of `tables.clock`
+    rank: int = 0  # priority: the highest active rank of a field wins; in MAVLink below `RANK_COUNT`
     autopilots: tuple[str, ...] = ()  # empty: any
-    when: Callable[[Any], Any] | None = None  # which messages of that name count
-    given: str = ""  # MAVLink: it counts only while rows of this field flow
+    when: Callable[[Any], Any] | None = None  # mask of the applicable messages
+    given: str = ""  # MAVLink: used only while this field is active
 
 
 _RATES = (100.0,) * 3  # [rad/s]
@@ -41,15 +41,15 @@ HIGHEST: dict[str, tuple[float, ...]] = {
     "gnss": _PLACE[2:],
     "height": (9e4,),
 }
-"""Largest believable magnitude per column, in the units of `contract.COLUMNS`; beyond it (or not finite) is refused."""
+"""Maximum plausible magnitude per column in the units of `contract.COLUMNS`; other values are rejected."""
 
 _HIGHEST = {field: np.array(values) for field, values in HIGHEST.items()}
 
 
 def believable(field: str, values: np.ndarray) -> np.ndarray:
-    """Tell for each row, (n, k), whether every column is within its largest believable magnitude, (n,).
+    """Return a mask of the rows, (n, k), with all columns within `MAX_MAGNITUDE`, (n,).
 
-    Every column is finite but those of `UNTOLD`.
+    Only the optional columns of `UNTOLD` may be non-finite.
     """
     good = np.abs(values) <= _HIGHEST[field]
     untold = UNTOLD.get(field, values.shape[-1])

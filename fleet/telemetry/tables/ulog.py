@@ -1,9 +1,9 @@
-"""THE TABLE of ULog: one row per PX4 topic and `Sample` field, from PX4 1.6 (2017) to 1.16.
+"""ULog table: one row per PX4 topic and `Sample` field, from PX4 1.6 (2017) to 1.16.
 
-PX4 moves things between topics from release to release. A row whose topic, sister topic or fields a log lacks does not
-apply; the highest rank that flows wins. So a new release is a new row, and no row asks for a version.
-A row reads its topic's fields as arrays; `beside` reads another topic at the same times. A newcomer adds a row.
-Source: PX4-Autopilot msg/ at the release tags; what it tells by radio: src/modules/mavlink/streams/.
+PX4 moves fields between topics from release to release. A row applies if the log has its topic, auxiliary topics and
+fields; the highest active rank wins. A new release is a new row, and no row checks a version.
+A row reads the fields of its topic as arrays; `interpolated` reads another topic at the same times.
+Source: PX4-Autopilot msg/ at the release tags; MAVLink equivalents: src/modules/mavlink/streams/.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,12 +15,12 @@ import numpy as np
 from fleet.telemetry.tables.row import Row, euler
 
 DEG = pi / 180  # [rad/deg]
-_NO_FIX_DEG = 0.01  # a kilometre round zero, zero [deg]
+_NO_FIX_DEG = 0.01  # within 1 km of latitude 0, longitude 0 [deg]
 _FIX_3D = 3
-_RAREST_PA = 2_000.0  # at 26 km; no air is 2,000 millibar dense
-_IDLE = 5  # position_setpoint.type: nothing to steer for
-_EARTH_M = 6_371_000.0  # the sphere on which PX4 projects its local frame
-_SHORTEST_US, _LONGEST_US = 700.0, 2300.0  # pulse widths a servo knows
+_RAREST_PA = 2_000.0  # at 26 km altitude; lower values are in millibar
+_IDLE = 5  # position_setpoint.type without target
+_EARTH_M = 6_371_000.0  # radius of the sphere of PX4's local projection
+_SHORTEST_US, _LONGEST_US = 700.0, 2300.0  # valid servo pulse widths
 
 Columns = Callable[[Any], tuple[Any, ...]]
 
@@ -34,7 +34,7 @@ def _place(lat_deg: Any, lon_deg: Any, alt_m: Any) -> tuple[Any, ...]:
 
 
 def _local(m: Any) -> tuple[Any, ...]:
-    """Undo PX4's azimuthal equidistant projection. Source: PX4 src/lib/geo, MapProjection::reproject."""
+    """Invert PX4's azimuthal equidistant projection. Source: PX4 src/lib/geo, MapProjection::reproject."""
     lat, lon = m.ref_lat * DEG, m.ref_lon * DEG
     c = np.hypot(m.x, m.y) / _EARTH_M
     k = np.sinc(c / pi)  # sin(c) / c
@@ -44,8 +44,8 @@ def _local(m: Any) -> tuple[Any, ...]:
     return _place(north / DEG, (east / DEG + 180) % 360 - 180, m.ref_alt - m.z)
 
 
-# --- air: where the airspeed is, and where the throttle -----------------------------------------------------------
-# Calibrated before true: it is what PX4 sends in VFR_HUD, what its controllers hold and what ArduPilot sends.
+# --- air: sources of airspeed and throttle ------------------------------------------------------------------------
+# Calibrated before true airspeed: PX4's VFR_HUD and controllers and ArduPilot use calibrated airspeed.
 
 _AIRSPEED: tuple[tuple[str, Columns], ...] = (
     ("airspeed_validated", lambda m: (m.calibrated_airspeed_m_s,)),  # since 1.12
@@ -58,7 +58,7 @@ def _thrust(m: Any) -> Any:
     return np.sqrt(sum(axis**2 for axis in m.xyz))
 
 
-_THROTTLE: tuple[Callable[[Any], Any], ...] = (  # of a VTOL whichever pushes more, as VFR_HUD has it
+_THROTTLE: tuple[Callable[[Any], Any], ...] = (  # VTOL: the larger thrust, as in VFR_HUD
     lambda m: np.fmax(m.beside("actuator_controls_0").control[3], m.beside("actuator_controls_1").control[3]),
     lambda m: m.beside("actuator_controls_0").control[3],  # until 1.13
     lambda m: np.fmax(_thrust(m.beside("vehicle_thrust_setpoint")), _thrust(m.beside("vehicle_thrust_setpoint.1"))),
@@ -88,7 +88,7 @@ def _output(m: Any) -> tuple[Any, ...]:
 
 
 def _pulses(m: Any) -> Any:
-    """Tell where outputs are pulse widths: since 1.13 they may be ESC counts or rad/s; all zero drives nothing."""
+    """Return a mask of outputs that are pulse widths, not ESC counts or rad/s (since 1.13) nor all zero."""
     outputs = np.array(_output(m))
     fits = ((outputs == 0) | ((outputs > _SHORTEST_US) & (outputs < _LONGEST_US))).all(axis=0)
     driven = (outputs != 0).any(axis=0)
@@ -96,7 +96,7 @@ def _pulses(m: Any) -> Any:
 
 
 def _widths(m: Any, middle: float, reach: float) -> tuple[Any, ...]:
-    """Return pulse widths [us] for a control of -1..1; not finite is not driven."""
+    """Return pulse widths [us] for a control of -1..1; 0 for non-finite controls."""
     pulses = [np.where(np.isfinite(c), middle + reach * np.clip(c, -1, 1), 0.0) for c in m.control[:8]]
     return (*pulses, *([np.zeros_like(pulses[0])] * (8 - len(pulses))))
 
@@ -105,9 +105,9 @@ def _driven(m: Any) -> Any:
     return np.isfinite(np.array(m.control[:8])).any(axis=0)
 
 
-# --- command: set points of a fixed wing, errors are wanted minus flown as in the house ----------------------------
+# --- command: set points of a fixed wing; errors are commanded minus actual ---------------------------------------
 
-_WANTED: tuple[tuple[Columns, str, Columns], ...] = (  # roll and pitch, path topic, altitude and airspeed error
+_WANTED: tuple[tuple[Columns, str, Columns], ...] = (  # roll and pitch, path topic, errors
     (
         lambda m: euler(m.q_d)[:2],  # 1.16 has no roll_body
         "position_controller_status",
@@ -117,7 +117,7 @@ _WANTED: tuple[tuple[Columns, str, Columns], ...] = (  # roll and pitch, path to
         ),
     ),
     (
-        lambda m: (m.roll_body, m.pitch_body),  # 1.14, 1.15: TECS no longer tells its own altitude
+        lambda m: (m.roll_body, m.pitch_body),  # 1.14, 1.15: TECS no longer logs its own altitude
         "position_controller_status",
         lambda m: (
             m.beside("tecs_status").altitude_sp - m.beside("vehicle_global_position").alt,
@@ -271,16 +271,16 @@ TABLE: tuple[Row, ...] = (
 )
 
 FLOWS_HZ = {"attitude": 4.0, "imu": 4.0, "position": 1.0, "velocity": 1.0, "air": 2.0, "servo": 2.0, "command": 1.0}
-"""Below this rate a source trickles: a lower rank that flows wins, else whichever has the most rows [Hz]."""
+"""Minimum rate of an active source; without one, the source with the most rows wins [Hz]."""
 
 CALCULATED = {
     "actuator_servos": "servo: calculated as 1500 ± 500 us from actuator_servos, in PX4's order of surfaces",
     "actuator_motors": "servo: calculated as 1000 to 2000 us from actuator_motors, in PX4's order of motors",
 }
-"""What to say where a field is not as it was logged."""
+"""Notes on fields that are calculated, not logged."""
 
 HELD = ("vehicle_status", "vtol_vehicle_status", "mission_result", "mission", "position_setpoint_triplet")
-"""Topics told on change: what was said last before the log began is in force when it begins."""
+"""Topics published on change: the last value before the log start applies at the start."""
 
 _SISTERS = (
     *("vehicle_angular_velocity", "actuator_controls_0", "actuator_controls_1", "vehicle_thrust_setpoint"),
@@ -321,11 +321,11 @@ MODES: dict[int, tuple[tuple[tuple[int, int], str], ...]] = {
     22: (((0, 0), "VTOL_TAKEOFF"),),
     **{23 + i: (((0, 0), f"EXTERNAL{i + 1}"),) for i in range(8)},
 }
-"""vehicle_status.nav_state -> (since which release, name), names as a heartbeat gives them where it has one."""
+"""vehicle_status.nav_state -> (first release, name), names as in the heartbeat, if it has one."""
 
 
 def mode(nav_state: int, release: tuple[int, int]) -> str:
-    """Name a nav_state as `release` (major, minor) meant it."""
+    """Return the mode name of a nav_state in `release` (major, minor)."""
     names = [name for since, name in MODES.get(nav_state, ()) if since <= release]
     return names[-1] if names else f"nav_state {nav_state}"
 
@@ -338,8 +338,8 @@ AUTOSTART: tuple[tuple[range, str], ...] = (
     (range(16_000, 17_000), "helicopter"),
     (range(17_000, 18_000), "fixed_wing"),
 )
-"""SYS_AUTOSTART -> kind of vehicle, where nothing else tells. Source: PX4 ROMFS/px4fmu_common/init.d/airframes."""
+"""SYS_AUTOSTART -> vehicle type, if no other source has it. Source: PX4 ROMFS/px4fmu_common/init.d/airframes."""
 
 VEHICLE_TYPE = {1: "multirotor", 2: "fixed_wing"}  # vehicle_status.vehicle_type, since 1.9
 TRANSITIONS = {1: "transition to fixed wing", 2: "transition to multicopter", 3: "hovers", 4: "flies as a fixed wing"}
-"""What vtol_vehicle_status says, numbered as its `vehicle_vtol_state` since 1.13."""
+"""Texts for vtol_vehicle_status, keyed by `vehicle_vtol_state` since 1.13."""

@@ -1,1 +1,1 @@
-"""State of many aircraft in arrays: one pass costs the same few calls for one aircraft or a thousand."""
+"""State of many aircraft in arrays: the number of calls per pass is independent of the number of aircraft."""

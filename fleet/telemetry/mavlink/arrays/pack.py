@@ -1,6 +1,6 @@
-"""Rows to `Sample` messages on the wire, all aircraft of a tick in one call: the bytes `codec.encode` would give.
+"""Encode the rows of all aircraft as `Sample` messages in one call, with the same bytes as `codec.encode`.
 
-Compiled. Source: msgpack specification; what precedes and follows the numbers is taken from `codec.encode` itself.
+Compiled. Source: msgpack specification; the bytes around the numbers are taken from `codec.encode`.
 """
 
 import numba as nb
@@ -12,15 +12,15 @@ from fleet.contract import COLUMNS, Sample
 Packed = tuple[int, bytes, float]
 """Number of the aircraft, bytes of its `Sample`, the sample's time [s since 1970]."""
 FIELDS = tuple(COLUMNS)
-MOST_ROWS = 2_000  # rows of one kind in one publication; more is a flood
+MOST_ROWS = 2_000  # maximum rows of one field in one message
 WIDTHS = np.array([len(COLUMNS[field]) for field in FIELDS])
-_WHOLE = {"position", "leg", "target", "gnss"}  # fields of whole numbers, <i4; all others are <f4
+_WHOLE = {"position", "leg", "target", "gnss"}  # integer fields, <i4; all others are <f4
 WHOLE = np.array([field in _WHOLE for field in FIELDS])
-_MOST_HEAD = 160  # bytes of a field beside its numbers, more than enough
+_MOST_HEAD = 160  # upper limit of the bytes of a field without its numbers
 
 
 def _chunks(*told: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Lay chunks of bytes one after the other: bytes, and where each begins."""
+    """Concatenate byte strings: bytes, and start of each."""
     return np.frombuffer(b"".join(told), np.uint8), np.cumsum([0, *map(len, told)])
 
 
@@ -33,13 +33,13 @@ _WORDS = _chunks(
     b"\x82" + _T + b"\x83" + encode("dtype") + encode("<f8") + encode("shape") + b"\x91",  # 1: times of rows
     encode("data"),  # 2: before any bytes
     encode("x") + b"\x83" + encode("dtype") + encode("<f4") + encode("shape") + b"\x92",  # 3: values of rows
-    encode("x") + b"\x83" + encode("dtype") + encode("<i4") + encode("shape") + b"\x92",  # 4: the same, whole numbers
+    encode("x") + b"\x83" + encode("dtype") + encode("<i4") + encode("shape") + b"\x92",  # 4: the same, integers
 )
 
 
 @nb.njit(cache=True, nogil=True)
 def _put(out, at, told, start, stop):
-    to, start, n = nb.uint64(at), nb.uint64(start), nb.uint64(stop - start)  # no index from the end: twice as fast
+    to, start, n = nb.uint64(at), nb.uint64(start), nb.uint64(stop - start)  # unsigned indices: twice as fast
     for i in range(n):
         out[to + i] = told[start + i]
     return at + stop - start
@@ -47,7 +47,7 @@ def _put(out, at, told, start, stop):
 
 @nb.njit(cache=True, nogil=True)
 def _number(out, at, value):
-    """Write a whole number from 0 on in as few bytes as can be."""
+    """Write a non-negative integer in the shortest msgpack form."""
     if value < 0x80:
         out[at] = value
         return at + 1
@@ -60,7 +60,7 @@ def _number(out, at, value):
 
 @nb.njit(cache=True, nogil=True)
 def _data(out, at, size):
-    """Write the head of so many bytes."""
+    """Write the msgpack header of a byte string."""
     if size < 0x100:
         out[at], out[at + 1] = 0xC4, size
         return at + 2
@@ -94,7 +94,7 @@ def _field(out, at, times, values, field, whole, words, w):
 
 @nb.njit(cache=True, nogil=True)
 def _samples(out, uavs, start, stop, t, values, widths, whole, begin, names, first, words, w):
-    """Write a sample for every aircraft that has rows; gives owners, where each ends in `out`, and its time."""
+    """Write a sample for every aircraft with rows; return owners, end of each in `out`, and sample times."""
     owners, ends, at = np.empty(len(start), np.int64), np.empty(len(start), np.int64), 0
     ts = np.empty(len(start))
     newest = np.empty(1)
@@ -124,12 +124,12 @@ def _samples(out, uavs, start, stop, t, values, widths, whole, begin, names, fir
 
 
 def samples(uavs: np.ndarray, start: np.ndarray, stop: np.ndarray, t: np.ndarray, values: np.ndarray) -> list[Packed]:
-    """Pack the rows of all aircraft that have any.
+    """Encode the rows of all aircraft that have rows.
 
     Args:
         uavs: UAV ids, (m,)
-        start, stop: which rows are of each aircraft's fields, at most `MOST_ROWS`, (m, fields)
-        t: fleet times, rising within a field, (n,) [s since 1970]
+        start, stop: row range of each aircraft and field, at most `MAX_ROWS`, (m, fields)
+        t: fleet times, increasing within a field, (n,) [s since 1970]
         values: columns, (n, 8)
     """
     rows = stop - start

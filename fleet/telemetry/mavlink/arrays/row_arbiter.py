@@ -1,4 +1,4 @@
-"""The compiled judge of aircraft's rows: each gets its fleet time; late, repeated and second-best ones go."""
+"""Compiled row arbitration: assign fleet times, and skip late, repeated and lower-ranked rows."""
 
 from math import inf, isnan
 
@@ -9,35 +9,36 @@ from fleet.contract import COLUMNS
 from fleet.telemetry.tables import clock as c
 
 FIELDS = tuple(COLUMNS)
-YIELD_S = 3.0  # a lower-ranked source speaks again after this silence of the better one [s]
-SLOWER = 1.5  # a source with intervals this much longer than another's trickles: the other is heard
-SMOOTH = 0.1  # weight of the newest interval in a source's usual one
-RANKS = 4  # ranks are below this
-LAST, HEARD, EVERY = 0, 1, 1 + RANKS  # columns of the memory: newest time kept; by rank: newest time, usual interval
+YIELD_S = 3.0  # silence of a source after which a lower-ranked source is used [s]
+SLOWER = 1.5  # a source with a longer relative period is skipped in favour of a faster one
+SMOOTH = 0.1  # weight of the newest interval in the mean period of a source
+RANKS = 4  # number of ranks
+# state columns: newest accepted time; by rank: newest time, mean period
+LAST, HEARD, EVERY = 0, 1, 1 + RANKS
 NO_FIELD = -1
 KEPT, PASSED_OVER, REFUSED = range(3)
 
 
 def new_memory() -> np.ndarray:
-    """Make what has to be remembered of one aircraft between two batches, (fields, EVERY + RANKS)."""
+    """Return the initial state of one aircraft, (fields, SOURCE_PERIOD + RANK_COUNT)."""
     return np.tile([-inf] * (1 + RANKS) + [inf] * RANKS, (len(FIELDS), 1))
 
 
 @nb.njit(cache=True, nogil=True)
 def settle(clocks, memory, owner, ticks, raw_s, arrival, field, rank, given, t, fate, jumped, advanced):
-    """Judge rows in the order they were heard.
+    """Arbitrate rows in order of reception.
 
     Args:
-        clocks, memory: of all aircraft, changed in place, (m, 3, LENGTH) and (m, fields, EVERY + RANKS)
+        clocks, state: of all aircraft, changed in place, (m, 3, STATE_SIZE) and (m, fields, SOURCE_PERIOD + RANK_COUNT)
         owner: number of the aircraft, (n,)
-        ticks: clock each time comes from, (n,)
-        raw_s: own times [s], arrival: fleet times [s since 1970], (n,)
-        field: numbers in `FIELDS`, rank: of the source, (n,)
-        given: number in `FIELDS` of what must flow for the row to count, or NO_FIELD, (n,)
+        ticks: time source, (n,)
+        raw_s: message time stamps [s], arrival: fleet times [s since 1970], (n,)
+        field: numbers in `FIELDS`, rank: rank of the source, (n,)
+        requires: number in `FIELDS` of the required active field, or NO_FIELD, (n,)
         t: filled with fleet times, nan while a jump is suspected [s since 1970]
-        fate: filled with KEPT, PASSED_OVER or REFUSED
-        jumped: arrival of the last row at which a jump of the clock was noticed, by aircraft, (m,) [s since 1970]
-        advanced: filled with the step by which a clock was re-anchored forward at this row, mostly 0, (n,) [s]
+        decision: filled with ACCEPTED, SKIPPED or REJECTED
+        jumped: arrival of the last row at which a clock jump was detected, by aircraft, (m,) [s since 1970]
+        advanced: filled with the forward re-anchoring step of the clock at this row, mostly 0, (n,) [s]
     """
     for i in range(len(t)):
         mine, fields = clocks[owner[i]], memory[owner[i]]
@@ -66,12 +67,12 @@ def _advance(clocks):
 
 @nb.njit(cache=True)
 def _judge(memory, rank, t, timeless):
-    """Tell a row's fate; without a time of its own a message may well repeat one: no fault."""
+    """Return the decision for one row; a repeated time is no error for messages without time stamp."""
     heard, every = memory[HEARD:EVERY], memory[EVERY:]
     step = t - heard[rank]
     repeated = step <= 0
     if step >= YIELD_S:
-        every[rank] = inf  # only its next row tells
+        every[rank] = inf  # known after its next row
     elif not repeated:
         every[rank] = step if every[rank] == inf else every[rank] + SMOOTH * (step - every[rank])
     heard[rank] = max(heard[rank], t)
@@ -85,7 +86,7 @@ def _judge(memory, rank, t, timeless):
 
 @nb.njit(cache=True)
 def _speaker(heard, every, t):
-    """Return the highest rank that flows: it spoke of late, and not much less often than any other that did."""
+    """Return the highest active rank: received recently, at a period comparable to the fastest source."""
     busiest = inf
     for rank in range(RANKS):
         if t < heard[rank] + YIELD_S:

@@ -1,4 +1,4 @@
-"""Rows of many aircraft that wait for their publication: in time order, handed over as far as they had arrived."""
+"""Rows of many aircraft awaiting publication, in time order, released by arrival time."""
 
 import numba as nb
 import numpy as np
@@ -9,18 +9,18 @@ WIDEST = 8  # columns of the widest field
 
 
 class Shelves:
-    """Rows by aircraft and field."""
+    """Pending rows by aircraft and field."""
 
     def __init__(self) -> None:
         self.uavs = np.empty(0, np.int64)  # UAV ids, by number of the aircraft
-        self.refused = np.empty(0, np.int64)  # rows beyond `MOST_ROWS`, by aircraft
-        self._key = np.empty(0, np.int64)  # aircraft and field of each row, rising
+        self.refused = np.empty(0, np.int64)  # rows beyond `MAX_ROWS`, by aircraft
+        self._key = np.empty(0, np.int64)  # aircraft and field of each row, sorted
         self._arrival, self._t, self._x = np.empty(0), np.empty(0), np.empty((0, WIDEST))
-        self._start = self._end = np.empty((0, len(FIELDS)), np.int64)  # rows not handed over
-        self._due = np.inf  # arrival of the next row to hand over [s since 1970]
+        self._start = self._end = np.empty((0, len(FIELDS)), np.int64)  # range of the pending rows
+        self._due = np.inf  # arrival of the next pending row [s since 1970]
 
     def add(self, uav: int) -> None:
-        """Make room for one more aircraft."""
+        """Add one aircraft."""
         self.uavs, self.refused = np.append(self.uavs, uav), np.append(self.refused, 0)
         none = np.full((1, len(FIELDS)), len(self._key))
         self._start, self._end = np.concatenate([self._start, none]), np.concatenate([self._end, none])
@@ -30,9 +30,9 @@ class Shelves:
 
         Args:
             key: number of the aircraft * number of fields + number of the field, (n,)
-            arrival: when they were heard, never falling within a key, (n,) [s since 1970]
-            t: fleet time, rising within a key and newer than what was laid before, (n,) [s since 1970]
-            x: values, (n, k); columns beyond those of the field are left out
+            arrival: arrival times, non-decreasing within a key, (n,) [s since 1970]
+            t: fleet time, increasing within a key and later than all earlier rows, (n,) [s since 1970]
+            x: values, (n, k); columns beyond those of the field are ignored
         """
         if len(self._key):
             kept = _left(self._start, self._end, len(self._key))
@@ -45,7 +45,7 @@ class Shelves:
         self._due = float(arrival.min()) if len(key) else np.inf
 
     def take(self, now: float) -> list[Packed]:
-        """Hand over what was heard up to `now` and not handed over before."""
+        """Return the pending rows received up to `now`, encoded as samples."""
         if self._due > now:
             return []
         stop = self._start.copy()
@@ -62,7 +62,7 @@ class Shelves:
 
 @nb.njit(cache=True, nogil=True)
 def _upto(start, end, arrival, now, stop):
-    """Fill `stop` with how far rows had arrived up to `now`; gives the arrival of the next one."""
+    """Fill `stop` with the end of the rows that arrived up to `now`; return the next arrival."""
     due = np.inf
     for owner in range(len(start)):
         for field in range(start.shape[1]):
@@ -77,7 +77,7 @@ def _upto(start, end, arrival, now, stop):
 
 @nb.njit(cache=True, nogil=True)
 def _left(start, end, n):
-    """Tell which rows have not been handed over, (n,) bool."""
+    """Return a mask of the pending rows, (n,) bool."""
     kept = np.zeros(n, np.bool_)
     for owner in range(len(start)):
         for field in range(start.shape[1]):

@@ -1,1 +1,1 @@
-"""MAVLink's parameter and mission protocols, and the route that follows from them."""
+"""MAVLink's parameter and mission protocols, and the resulting mission."""

@@ -1,4 +1,4 @@
-"""Autopilot parameters, collected from PARAM_VALUE whoever asked for them."""
+"""Collect autopilot parameters from PARAM_VALUE, requested by any station."""
 
 import struct
 import sys
@@ -7,30 +7,30 @@ from typing import Any
 
 from fleet.contract import Params
 
-UNSOLICITED = 65535  # index of a value nobody asked for
-HASH = "_HASH_CHECK"  # no parameter: the hash over all of them
-MOST = 5_000  # parameters accepted from one aircraft
-PAUSE_S = 1.0  # least time between two publications [s]
+UNSOLICITED = 65535  # index of an unsolicited value
+HASH = "_HASH_CHECK"  # not a parameter: hash over all parameters
+MOST = 5_000  # maximum number of parameters of one aircraft
+PAUSE_S = 1.0  # minimum time between two publications [s]
 _AS_INTEGER = {1: "<Bxxx", 2: "<bxxx", 3: "<Hxx", 4: "<hxx", 5: "<I", 6: "<i"}  # MAV_PARAM_TYPE
 
 
 class ParamBook:
-    """The parameters of one aircraft: values by name, and which indices are still missing."""
+    """Parameters of one aircraft: values by name, and missing indices."""
 
     def __init__(self, uav: int) -> None:
         self.uav = uav
         self.values: dict[str, float] = {}
         self.rejected = 0
-        self.heard = float("-inf")  # when the last one came
-        self.count = 0  # as the aircraft tells it, 0 before
-        self.hash: float | None = None  # over all of them, as PX4 tells it
+        self.heard = float("-inf")  # arrival of the last PARAM_VALUE
+        self.count = 0  # number of parameters reported by the aircraft, 0 if unknown
+        self.hash: float | None = None  # hash over all parameters reported by PX4
         self._indices: set[int] = set()
         self._refused: dict[str, None] = {}
         self._changed = False
         self._said = float("-inf")
 
     def hear(self, message: Any, autopilot: str, now: float) -> None:
-        """Take one PARAM_VALUE."""
+        """Process one PARAM_VALUE."""
         name, value = message.param_id, as_number(message, autopilot)
         self.heard = now
         if name == HASH:
@@ -46,7 +46,7 @@ class ParamBook:
         self.put(name, value)
 
     def put(self, name: str, value: float) -> None:
-        """Take one parameter by name, whoever told."""
+        """Set one parameter by name."""
         if not name or not name.isprintable() or (len(self.values) >= MOST and name not in self.values):
             self.rejected += 1
         elif not isfinite(value):
@@ -55,42 +55,42 @@ class ParamBook:
             self._refused[name] = None
             self.values.pop(name, None)
         elif self.values.get(name) != value:
-            self.values[sys.intern(name)] = value  # the aircraft of a fleet have the same names
+            self.values[sys.intern(name)] = value  # all aircraft share the name strings
             self._refused.pop(name, None)
             self._changed = True
 
     def adopt(self, values: dict[str, float], count: int) -> None:
-        """Take all parameters as they were told before, found still to hold."""
+        """Restore all parameters from a verified cache."""
         self.values, self.count, self._indices, self._changed = dict(values), count, set(range(count)), True
 
     @property
     def complete(self) -> bool:
-        """Return whether every index was heard."""
+        """Return whether every index was received."""
         return self.count > 0 and len(self._indices) >= self.count
 
     def missing(self) -> list[int] | None:
-        """Return the indices not heard yet; None when not even their number is known."""
+        """Return the missing indices; None if the number of parameters is unknown."""
         if not self.count:
             return None
         return [index for index in range(self.count) if index not in self._indices]
 
     def take(self, now: float) -> Params | None:
-        """Return the parameters when there is news, at most once a second."""
+        """Return changed parameters, at most once per second."""
         if not self._changed or now - self._said < PAUSE_S:
             return None
         self._changed, self._said = False, now
         return Params(uav=self.uav, t=now, values=dict(self.values), complete=self.complete, sentence=self.sentence())
 
     def sentence(self) -> str:
-        """Say which parameters were refused."""
+        """Return a text that names the rejected parameters."""
         if not self._refused:
             return ""
         names = ", ".join(list(self._refused)[:5])
-        return f"uav-{self.uav}: parameter {names} is not a number and was left out; set it on the autopilot"
+        return f"uav-{self.uav}: parameter {names} is not a number and was ignored; set it on the autopilot"
 
 
 def as_number(message: Any, autopilot: str) -> float:
-    """Read the value: PX4 sends the bytes of an integer in the place of the float, the others convert it."""
+    """Return the numeric value: PX4 sends integer bytes in the float field, other autopilots convert."""
     layout = _AS_INTEGER.get(message.param_type)
     if autopilot != "px4" or layout is None:
         return float(message.param_value)

@@ -1,4 +1,4 @@
-"""The mission on board, put together from what is overheard: a download or an upload, ours or another station's."""
+"""Collect the onboard mission from downloads and uploads of any ground station."""
 
 from itertools import pairwise
 from math import isfinite
@@ -8,15 +8,15 @@ import msgspec
 
 from fleet.contract import MAX_ITEMS, Item, Mission
 
-NOTHING = 0  # no MAV_CMD; stands for an item that cannot be flown
-NAV_LAST = 95  # MAV_CMD_NAV_LAST: commands above it are no place to fly to
+NOTHING = 0  # not a MAV_CMD; marks an invalid item
+NAV_LAST = 95  # MAV_CMD_NAV_LAST: commands above it have no waypoint
 DO_JUMP = 177
 WAYPOINT = 16
-SPOT, FIRST = 10, 3  # of a mission recalled, the first three of every ten items are asked for before it is believed
-ACCEPT_S = 3.0  # an upload without an acknowledgement is believed after this silence [s]
-SETTLE_S = 2.0  # an incomplete list is shown after this silence [s]
+SPOT, FIRST = 10, 3  # check of a recalled mission: the first 3 of every 10 items are downloaded
+ACCEPT_S = 3.0  # silence after which an upload without acknowledgement is accepted [s]
+SETTLE_S = 2.0  # silence after which an incomplete list is published [s]
 
-_MOVED_M = 1.0  # a home that moves less stays [m]
+_MOVED_M = 1.0  # smaller changes of home are ignored [m]
 _ABSOLUTE = {3: 0, 6: 5}  # MAV_FRAME: relative to home -> above sea level
 
 _NAMES = ("MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_ACK", "MISSION_CLEAR_ALL", "MISSION_CURRENT")
@@ -24,13 +24,13 @@ MESSAGES = frozenset(_NAMES)
 
 
 class _Draft:
-    """A list on its way, in one direction."""
+    """A mission transfer in progress, in one direction."""
 
     def __init__(self, count: int | None, now: float) -> None:
         self.count = count
         self.items: dict[int, Item] = {}
         self.notes: dict[int, str] = {}
-        self.guessed: set[int] = set()  # filled in from what was there before
+        self.guessed: set[int] = set()  # items from the recalled mission
         self.heard = now
 
     def whole(self) -> bool:
@@ -38,17 +38,17 @@ class _Draft:
 
 
 class RouteBook:
-    """The route of one aircraft: drafts of both directions, the accepted list, the item in force."""
+    """Mission of one aircraft: transfers in both directions, accepted items, current item."""
 
     def __init__(self, uav: int) -> None:
         self.uav = uav
         self.items: tuple[Item, ...] = ()
         self.complete = False
-        self.stale = True  # somebody should ask for it again
+        self.stale = True  # the mission must be downloaded again
         self.seq = -1
-        self.count: int | None = None  # of the download on its way
+        self.count: int | None = None  # item count of the download in progress
         self.rejected = 0
-        self.unproven: set[int] = set()  # items believed since a few others are as they were before
+        self.unproven: set[int] = set()  # recalled items, accepted after a check of a few others
         self._recalled: tuple[Item, ...] = ()
         self._home_m: float | None = None
         self._sentence = ""
@@ -56,7 +56,7 @@ class RouteBook:
         self._changed = False
 
     def hear(self, message: Any, *, up: bool, now: float) -> None:
-        """Take one message of the mission protocol; `up` when a ground station sent it to the aircraft."""
+        """Process one mission protocol message; `is_upload` if a ground station sent it to the aircraft."""
         name = message.get_type()
         if name == "MISSION_CURRENT":
             self._in_force(message.seq)
@@ -72,34 +72,34 @@ class RouteBook:
             self.stale = True
 
     def adopt(self, items: tuple[Item, ...]) -> None:
-        """Take a whole mission, as an onboard log tells it."""
+        """Set a complete mission from an onboard log."""
         draft = _Draft(len(items), 0.0)
         draft.items = dict(enumerate(items))
         self._adopt(draft)
 
     def recall(self, items: tuple[Item, ...]) -> None:
-        """Learn what the mission was before: so it is again where the count and a few items are the same."""
+        """Set the previous mission; it is reused if the count and a few items are equal."""
         self._recalled = items
 
     def place_home(self, altitude_m: float) -> None:
-        """Learn how high home is above sea level [m], for a mission that does not hold home (PX4)."""
+        """Set the altitude of home above sea level [m], for missions without home item (PX4)."""
         if isfinite(altitude_m) and (self._home_m is None or abs(altitude_m - self._home_m) > _MOVED_M):
             self._home_m = altitude_m
             self._changed = self._changed or bool(self.items)
 
     def missing(self) -> list[int] | None:
-        """Return the sequence numbers a download on its way still lacks; None when no count was heard."""
+        """Return the missing sequence numbers of the download in progress; None without count."""
         draft = self._drafts[False]
         if draft is None or draft.count is None:
             return None
         return [seq for seq in range(draft.count) if seq not in draft.items]
 
     def drop_download(self) -> None:
-        """Forget a download that came to a stop; the list has to be asked for again."""
+        """Discard a stalled download; the mission must be requested again."""
         self._drafts[False], self.stale = None, True
 
     def take(self, now: float) -> Mission | None:
-        """Return the mission when there is news."""
+        """Return the mission if it has changed."""
         up, down = self._drafts[True], self._drafts[False]
         if up is not None and up.whole() and now - up.heard > ACCEPT_S:
             self._settle(accepted=True)
@@ -121,7 +121,7 @@ class RouteBook:
     def _open(self, count: int, up: bool, now: float) -> None:
         if count > MAX_ITEMS:
             self.rejected += 1
-            self._say(f"found a mission of {count} items, at most {MAX_ITEMS} are accepted; shorten it")
+            self._say(f"found a mission of {count} items, expected at most {MAX_ITEMS}; shorten it")
             return
         draft = self._drafts[up]
         if draft is None or draft.count != count:
@@ -156,7 +156,7 @@ class RouteBook:
             self._adopt(draft)
 
     def _compare(self, message: Any) -> None:
-        """Notice by one item of a mission that is known whole that there is another on board."""
+        """Compare one item with the complete mission; request a download if it differs."""
         known = self.items[message.seq : message.seq + 1]
         if known == (read_item(message)[0],):
             self.unproven.discard(message.seq)
@@ -168,8 +168,8 @@ class RouteBook:
         if accepted:
             if draft is not None and draft.whole():
                 self._adopt(draft)
-            self._drafts[False] = None  # half of a list that is no more
-            self.stale = True  # the autopilot may have changed it, home for one; ask it
+            self._drafts[False] = None  # the download is of the replaced mission
+            self.stale = True  # the autopilot may change items, e.g. home; download again
 
     def _adopt(self, draft: _Draft) -> None:
         items = tuple(draft.items[seq] for seq in range(draft.count or 0))
@@ -185,7 +185,7 @@ class RouteBook:
         if items != self.items:
             self.items = items
             of = "an unknown number of" if draft.count is None else draft.count
-            self._say(f"{len(items)} of {of} mission items arrived; ask for the mission again")
+            self._say(f"{len(items)} of {of} mission items arrived; request the mission again")
 
     def _say(self, sentence: str) -> None:
         self._changed = self._changed or sentence != self._sentence
@@ -193,24 +193,24 @@ class RouteBook:
 
 
 def _absolute(item: Item, home_m: float) -> Item:
-    """Return an item with its altitude above sea level, where it was above home."""
+    """Convert an altitude relative to home to altitude above sea level."""
     if item.frame not in _ABSOLUTE:
         return item
     return msgspec.structs.replace(item, frame=_ABSOLUTE[item.frame], alt_m=item.alt_m + home_m)
 
 
 def read_item(message: Any) -> tuple[Item, str]:
-    """Read MISSION_ITEM or MISSION_ITEM_INT; an item with a coordinate that is no number becomes command 0."""
+    """Parse MISSION_ITEM or MISSION_ITEM_INT; an item with a non-finite coordinate gets command 0."""
     scale = 1.0 if message.get_type() == "MISSION_ITEM_INT" else 1e7
     params = [message.param1, message.param2, message.param3, message.param4]
     place = [message.x * scale, message.y * scale, float(message.z)]
     note = ""
     command = message.command
     if not all(map(isfinite, place)) or abs(place[0]) > 2**31 or abs(place[1]) > 2**31:
-        note = f"mission item {message.seq} has a coordinate that is no number and stands for nothing; upload it again"
+        note = f"mission item {message.seq} has an invalid coordinate and is ignored; upload it again"
         command, place = NOTHING, [0.0, 0.0, 0.0]
     elif not all(map(isfinite, params[:3])):
-        note = f"mission item {message.seq} has a parameter that is no number, taken as 0; upload it again"
+        note = f"mission item {message.seq} has a non-finite parameter, set to 0; upload it again"
     p1, p2, p3, p4 = (p if isfinite(p) else 0.0 for p in params)  # param4 = nan is legal: keep the yaw
     item = Item(
         seq=message.seq,
@@ -228,7 +228,7 @@ def read_item(message: Any) -> tuple[Item, str]:
 
 
 def review(items: tuple[Item, ...]) -> list[str]:
-    """List what an operator should know of a mission: empty, jumps that lead nowhere, legs without length."""
+    """Return the problems of a mission: no items, endless jumps, legs of zero length."""
     if not items:
         return ["the mission has no items; upload one"]
     found = [f"jump of item {item.seq} never reaches a waypoint; upload another target" for item in _endless(items)]
@@ -240,7 +240,7 @@ def review(items: tuple[Item, ...]) -> list[str]:
 
 
 def _endless(items: tuple[Item, ...]) -> list[Item]:
-    """Find jumps from which following the list meets no item to fly to: a loop, or a target that does not exist."""
+    """Return the jumps that never reach a waypoint: a loop, or a target that does not exist."""
     by_seq = {item.seq: item for item in items}
     lost = []
     for jump in (item for item in items if item.command == DO_JUMP):

@@ -1,4 +1,4 @@
-"""Mission files as ground stations write them, `QGC WPL 110`: a line an item, twelve columns apart by tabs or blanks.
+"""Read mission files of ground stations, `QGC WPL 110`: one item per line, twelve columns separated by white space.
 
     seq  current  frame  command  param1  param2  param3  param4  latitude  longitude  altitude  autocontinue
 
@@ -19,19 +19,23 @@ def read_waypoints(path: Path) -> tuple[Item, ...]:
     """Read a mission file.
 
     Raises:
-        ValueError: when it is none, or a line of it does not fit; the sentence names the line.
+        ValueError: if it is not a mission file, or a line is invalid; the message names the line.
     """
     with path.open("rb") as file:
         text = file.read(_MOST_BYTES + 1).decode(errors="replace")
     lines = [line.strip() for line in text.splitlines()]
     if not lines or " ".join(lines[0].lstrip("\ufeff").split()) != _HEAD:
         found = lines[0][:40] if lines else "nothing"
-        raise ValueError(f"{path.name}: found {found!r} in the first line, expected {_HEAD!r}; save it as waypoints")
+        raise ValueError(
+            f"{path.name}: found {found!r} in the first line, expected {_HEAD!r}; save the mission as waypoints"
+        )
     items = tuple(
         _item(path.name, number, line) for number, line in enumerate(lines[1:], start=2) if line and line[0] != "#"
     )
     if not items or len(items) > MAX_ITEMS:
-        raise ValueError(f"{path.name}: found {len(items):,} items, expected 1 to {MAX_ITEMS:,}; save another mission")
+        raise ValueError(
+            f"{path.name}: found {len(items):,} items, expected 1 to {MAX_ITEMS:,}; select another mission"
+        )
     return items
 
 
@@ -46,7 +50,9 @@ def _item(name: str, number: int, line: str) -> Item:
             f"{name} line {number}: found {line[:60]!r}, expected {_COLUMNS} numbers; save the mission again"
         ) from None
     if not (abs(lat) <= 90 and abs(lon) <= 180 and isfinite(alt)):
-        raise ValueError(f"{name} line {number}: found {lat}, {lon} at {alt} m, expected a place on earth; correct it")
+        raise ValueError(
+            f"{name} line {number}: found {lat}, {lon} at {alt} m, expected a position on earth; correct it"
+        )
     return Item(
         seq=whole[0],
         frame=whole[1],

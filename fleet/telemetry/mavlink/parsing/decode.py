@@ -1,4 +1,4 @@
-"""Bytes to MAVLink frames of many senders at once, and frames to fields or whole messages."""
+"""Decode bytes of many senders to MAVLink frames, and frames to field arrays or messages."""
 
 import re
 from collections import Counter, OrderedDict
@@ -13,7 +13,7 @@ from fleet.telemetry.mavlink.parsing.objects import objects
 from fleet.telemetry.mavlink.parsing.payload_gather import deal, gather
 from fleet.telemetry.mavlink.parsing.received import Heard, tight
 
-MOST_SENDERS = 512  # addresses whose cut frames are remembered on one link
+MOST_SENDERS = 512  # senders of one link whose incomplete frames are stored
 _NAMES = {number: kind.msgname for number, kind in dialect.mavlink_map.items()}
 IDS = {name: number for number, name in _NAMES.items()}
 _KIND = {"c": "S", "b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4"}
@@ -21,16 +21,16 @@ _KIND |= {"q": "<i8", "Q": "<u8", "f": "<f4", "d": "<f8"}
 
 
 class Frames(NamedTuple):
-    """Sound frames in the order they were heard."""
+    """Valid frames in order of reception."""
 
-    buf: np.ndarray  # bytes they lie in, (b,) uint8
-    at: np.ndarray  # `scan.COLUMNS` numbers a frame, (n, 9)
+    buf: np.ndarray  # bytes that contain the frames, (b,) uint8
+    at: np.ndarray  # `scan.COLUMNS` numbers per frame, (n, 9)
     arrival: np.ndarray  # fleet time, (n,) [s since 1970]
     sender: np.ndarray  # number of the sender in `senders`, (n,)
     senders: tuple[Hashable, ...] = (None,)
 
     def messages(self, which: np.ndarray) -> list[Any]:
-        """Return frames, by number, as pymavlink would, (k,)."""
+        """Return frames, by number, as message objects like those of pymavlink, (k,)."""
         found: list[Any] = [None] * len(which)
         numbers = self.at[which, s.ID]
         for number in np.unique(numbers).tolist():
@@ -42,22 +42,22 @@ class Frames(NamedTuple):
         return found
 
     def only(self, which: np.ndarray) -> "Frames":
-        """Return some of the frames, by number or by mask."""
+        """Return a selection of the frames, by number or mask."""
         return self._replace(at=self.at[which], arrival=self.arrival[which], sender=self.sender[which])
 
     def fields(self, which: np.ndarray, name: str) -> "Fields":
-        """Return the fields of frames `which`, all of one message, as arrays."""
+        """Return the fields of frames of one message as arrays."""
         kind = layout(name)
         laid = gather(self.buf, self.at[which, s.PAYLOAD], self.at[which, s.SIZE], kind.itemsize)
         return Fields(laid.view(kind)[:, 0])
 
     def dealt(self) -> "Dealt":
-        """Sort all frames by message."""
+        """Group all frames by message."""
         return Dealt(self)
 
 
 def joined(parts: Sequence[Frames]) -> Frames:
-    """Make one batch of several, in their order."""
+    """Join several batches in order."""
     if len(parts) == 1:
         return parts[0]
     ats, numbers = [], []
@@ -75,7 +75,7 @@ def joined(parts: Sequence[Frames]) -> Frames:
 
 
 class Fields:
-    """Fields of equal messages by name, each an array."""
+    """Field arrays of frames of one message, by field name."""
 
     __slots__ = ("rows",)
 
@@ -90,7 +90,7 @@ _DTYPES: dict[str, np.dtype] = {}
 
 
 def layout(name: str) -> np.dtype:
-    """Return the layout of a message on the wire, read off pymavlink's class."""
+    """Return the wire layout of a message, derived from pymavlink's class."""
     if name not in _DTYPES:
         kind = dialect.mavlink_map[IDS[name]]
         tokens = re.findall(r"(\d*)([a-zA-Z])", kind.unpacker.format.lstrip("<"))
@@ -109,46 +109,46 @@ _WIDTHS = np.array([kind.itemsize for kind in _LAYOUTS])
 
 
 KINDS = tuple(_ORDER)
-"""Names of all messages known here, by number."""
+"""Names of all messages of the dialect, by number."""
 
 
 def kinds(frames: Frames) -> np.ndarray:
-    """Number the frames' messages as `KINDS` does, (n,)."""
+    """Return the index of each frame's message in `MESSAGE_NAMES`, (n,)."""
     return _KINDS[frames.at[:, s.ID]]
 
 
 class Dealt:
-    """Frames sorted by message, in the order they were heard."""
+    """Frames grouped by message, in order of reception."""
 
     def __init__(self, frames: Frames) -> None:
         self._told, begin, self._which, first = deal(frames.buf, frames.at, _KINDS, _WIDTHS)
         self._begin, self._first = begin.tolist(), first.tolist()
 
     def fields(self, name: str) -> tuple[np.ndarray, Fields]:
-        """Return the frames of one message: numbers, (k,), and their fields as arrays."""
+        """Return the frames of one message: frame numbers, (k,), and field arrays."""
         kind = _ORDER[name]
         told = self._told[self._begin[kind] : self._begin[kind + 1]]
         return self._which[self._first[kind] : self._first[kind + 1]], Fields(told.view(_LAYOUTS[kind]))
 
     def names(self) -> list[str]:
-        """Name the messages that were heard."""
+        """Return the names of the received messages."""
         return [name for name, kind in _ORDER.items() if self._first[kind] < self._first[kind + 1]]
 
 
 class Decoder:
-    """Find the frames in what many senders say; each has its own carry, for frames may be cut between pieces."""
+    """Find frames in the bytes of many senders; incomplete frames are carried over by sender."""
 
     def __init__(self) -> None:
         self.counts = np.zeros(s.COUNTS, np.int64)
         self._carry: OrderedDict[Hashable, bytes] = OrderedDict()
 
     def counters(self) -> Counter[str]:
-        """Return messages, bad_bytes, bad_frames and unknown (frames of messages unknown here) so far."""
+        """Return the counts of messages, bad_bytes, bad_frames and unknown (frames of messages outside the dialect)."""
         names = ("messages", "bad_bytes", "bad_frames", "unknown")
         return Counter(dict(zip(names, self.counts.tolist(), strict=True)))
 
     def feed(self, heard: Heard) -> Frames:
-        """Take pieces as they came, return the frames completed by them in order of arrival."""
+        """Decode pieces in order of arrival; return the frames they complete."""
         if self._carry and not self._carry.keys().isdisjoint(heard.senders):
             return self._joined(heard)
         found = _room(heard.buf, 0)
@@ -167,11 +167,11 @@ class Decoder:
         return Frames(heard.buf, found, heard.arrival[part], heard.sender[part], heard.senders)
 
     def _joined(self, heard: Heard) -> Frames:
-        """Put the pieces of each sender together, after what is left of its earlier ones."""
+        """Decode the joined pieces of each sender, after its carried bytes."""
         order = np.argsort(heard.sender, kind="stable")
         told, ends = tight(heard.buf, heard.start[order], (heard.stop - heard.start)[order])
         last = np.searchsorted(heard.sender[order], np.arange(len(heard.senders)), side="right")
-        stops = np.concatenate([[0], ends])[last]  # of each sender
+        stops = np.concatenate([[0], ends])[last]  # end of each sender's bytes
         carries = [self._carry.pop(sender, b"") for sender in heard.senders]
         carried = np.array([len(carry) for carry in carries])
         grown = np.cumsum(carried)
@@ -195,7 +195,7 @@ class Decoder:
 def frames_of(
     buf: np.ndarray, parts: np.ndarray, counts: np.ndarray, prefix: int = 0, last_t: float = np.nan
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Run `scan.scan` over `buf`; gives its frames (n, 9), their stamps (n,) [us] and the newest stamp [us]."""
+    """Run `scan.scan` on `buf`; return frames (n, 9), their stamps (n,) [us] and the newest stamp [us]."""
     found = _room(buf, prefix)
     times = np.empty(len(found) if prefix else 0)
     n, last_t = s.scan(buf, parts, prefix, last_t, found, times, counts, s.EXTRA, s.CRC)
@@ -203,5 +203,5 @@ def frames_of(
 
 
 def _room(buf: np.ndarray, prefix: int) -> np.ndarray:
-    """Make room for as many frames as there can be in so many bytes."""
+    """Return an empty header array for the maximum number of frames in `buf`."""
     return np.empty((len(buf) // (8 + prefix) + 1, s.COLUMNS), np.int64)

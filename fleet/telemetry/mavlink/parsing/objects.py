@@ -1,4 +1,4 @@
-"""Messages as objects, many read at once: fields as pymavlink reads them, a fifteenth of the time."""
+"""Message objects with pymavlink's field values, created in batches, 15 times faster than pymavlink."""
 
 from collections import namedtuple
 from collections.abc import Sequence
@@ -9,21 +9,21 @@ import numpy as np
 
 
 class _Said:
-    """What every message tells of itself, as pymavlink's do."""
+    """Base of all message objects, with pymavlink's interface."""
 
     __slots__ = ()
     NAME = ""
 
     def get_type(self) -> str:
-        """Name the message."""
+        """Return the message name."""
         return self.NAME
 
     def get_srcSystem(self) -> int:
-        """Return the MAVLink system id of who said it."""
+        """Return the MAVLink system id of the sender."""
         return self[-2]  # type: ignore[index, no-any-return]
 
     def get_srcComponent(self) -> int:
-        """Return the MAVLink component id of who said it."""
+        """Return the MAVLink component id of the sender."""
         return self[-1]  # type: ignore[index, no-any-return]
 
 
@@ -34,12 +34,12 @@ def _kind(name: str, fields: tuple[str, ...]) -> type:
 
 
 def objects(name: str, rows: np.ndarray, systems: Sequence[int], components: Sequence[int]) -> list[Any]:
-    """Make an object of every row of one message's fields.
+    """Create a message object for every row of field values.
 
     Args:
-        name: of the message
-        rows: laid out as `decode.layout(name)`, (n,)
-        systems, components: who said each, n numbers
+        name: message name
+        rows: structured array with the layout `decode.layout(name)`, (n,)
+        systems, components: MAVLink ids of the senders, n numbers
     """
     names = rows.dtype.names or ()
     kind, texts = _kind(name, names), [k for k, field in enumerate(names) if rows.dtype[field].kind == "S"]

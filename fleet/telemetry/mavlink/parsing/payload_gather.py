@@ -1,4 +1,4 @@
-"""Payloads of frames laid under each other, as many bytes each as pymavlink's classes say; compiled."""
+"""Copy payloads of frames to arrays of the payload length in pymavlink's classes; compiled."""
 
 import numba as nb
 import numpy as np
@@ -10,7 +10,7 @@ _u = nb.uint64
 
 @nb.njit(cache=True, nogil=True)
 def gather(buf, starts, sizes, width):
-    """Lay payloads under each other, zeros where the sender cut them off, (n, width) uint8."""
+    """Return payloads as rows, truncated payloads padded with zeros, (n, width) uint8."""
     out = np.zeros((len(starts), width), np.uint8)
     for i in range(len(starts)):
         for k in range(min(sizes[i], width)):
@@ -20,16 +20,16 @@ def gather(buf, starts, sizes, width):
 
 @nb.njit(cache=True, nogil=True)
 def deal(buf, at, kinds, widths):
-    """Lay all payloads under each other, those of one message together, zeros where the sender cut them off.
+    """Copy all payloads grouped by message, truncated payloads padded with zeros.
 
     Args:
         buf: bytes
-        at: what `scan` found in them, (n, 9)
-        kinds: number of each message by its id
-        widths: length of its payload by that number, (m,) [bytes]
+        headers: frames found by `scan`, (n, 9)
+        kinds: message index by message id
+        widths: payload length by message index, (m,) [bytes]
     Returns:
-        the payloads, (b,) uint8; where each message's begin in them, (m + 1,); numbers of the frames they are from,
-        (n,); where each message's begin in those, (m + 1,)
+        payloads, (b,) uint8; start of each message in them, (m + 1,); frame numbers grouped by message, (n,);
+        start of each message in them, (m + 1,)
     """
     first, begin = np.zeros(len(widths) + 1, np.int64), np.zeros(len(widths) + 1, np.int64)
     for i in range(len(at)):
@@ -45,7 +45,7 @@ def deal(buf, at, kinds, widths):
         which[done[kind]] = i
         done[kind] += 1
         k = 0
-        while k + 8 <= size:  # eight loads, then eight stores: one move each
+        while k + 8 <= size:  # eight loads, then eight stores: compiled to one move each
             i0, o0 = _u(start + k), _u(to + k)
             a, b, c, d = buf[i0], buf[i0 + _u(1)], buf[i0 + _u(2)], buf[i0 + _u(3)]
             e, f, g, h = buf[i0 + _u(4)], buf[i0 + _u(5)], buf[i0 + _u(6)], buf[i0 + _u(7)]

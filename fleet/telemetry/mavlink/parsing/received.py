@@ -1,18 +1,17 @@
-"""What a link heard, as one stretch of bytes: the seam between receiving and decoding.
+"""Received bytes of a link: the interface between receiving and decoding.
 
-A receiving thread lays the datagrams (or pieces of a stream) it got at once into one buffer, says where each begins
-and ends, when it came and who sent it, and puts all on the queue as one
-`gateway.links.link.Batch(number, heard=Heard(...))`:
+A receiving thread copies the available datagrams (or pieces of a stream) into one buffer, with start, end, arrival and
+sender of each, and queues them as one `gateway.links.link.Batch(number, received=ReceivedBytes(...))`:
 
     slots: (1024, 2048) uint8 as `recvmmsg` filled them, lengths: (n,), addresses: a bytes-like per slot
-    buf, stop = tight(slots.ravel(), np.arange(n) * 2048, lengths)            # a copy: the slots are free again
-    Heard(buf, stop - lengths, stop, np.full(n, wall()), sender, senders)     # sender: np.unique of the addresses
+    buf, stop = compact(slots.ravel(), np.arange(n) * 2048, lengths)          # a copy: the slots can be reused
+    ReceivedBytes(buf, stop - lengths, stop, np.full(n, wall()), sender, senders)  # sender: np.unique of the addresses
 
-Pieces may lie anywhere in `buf`, in any order and with gaps, but they are in order of arrival. A piece need not be a
-whole frame: what is cut off at its end is kept by sender and goes on with that sender's next piece, whatever the link.
-`senders` are what `Link.send` takes; `None` on a stream with a single far end. The same far end must be an equal object
-every time. Take what there is every few milliseconds (not datagram by datagram): a batch costs some 20 us, a datagram
-in it next to nothing. `Heard.of` makes one of a list of (arrival, sender, bytes).
+Pieces may be anywhere in `buf`, in any order and with gaps; the arrays are in order of arrival. A piece may end inside
+a frame: the decoder joins the rest with the next piece of that sender. `senders` are the addresses for `Link.send`;
+`None` on a stream with a single remote end. A sender must be an equal object every time. Collect data every few
+milliseconds, not per datagram: a batch costs about 20 us, an additional datagram almost nothing.
+`ReceivedBytes.from_pieces` converts a list of (arrival, sender, bytes).
 """
 
 from collections.abc import Hashable, Sequence
@@ -22,22 +21,22 @@ import numba as nb
 import numpy as np
 
 Piece = tuple[float, Hashable, bytes]
-"""(arrival, fleet time [s since 1970]; sender; bytes as they came)."""
+"""(arrival, fleet time [s since 1970]; sender; received bytes)."""
 
 
 class Heard(NamedTuple):
     """Pieces of bytes in order of arrival."""
 
-    buf: np.ndarray  # bytes they lie in, (b,) uint8
-    start: np.ndarray  # where each begins, (n,) int64
-    stop: np.ndarray  # and ends, (n,) int64
-    arrival: np.ndarray  # fleet time, never falling, (n,) float64 [s since 1970]
+    buf: np.ndarray  # bytes that contain the pieces, (b,) uint8
+    start: np.ndarray  # start of each piece, (n,) int64
+    stop: np.ndarray  # end of each piece, (n,) int64
+    arrival: np.ndarray  # fleet time, non-decreasing, (n,) float64 [s since 1970]
     sender: np.ndarray  # number of the sender in `senders`, (n,) int64
     senders: tuple[Hashable, ...] = (None,)
 
     @classmethod
     def of(cls, pieces: Sequence[Piece]) -> "Heard":
-        """Lay pieces one after the other."""
+        """Concatenate pieces."""
         number: dict[Hashable, int] = {}
         sender = np.array([number.setdefault(who, len(number)) for _, who, _ in pieces], np.int64)
         stop = np.cumsum(np.array([len(data) for _, _, data in pieces], np.int64))
@@ -47,7 +46,7 @@ class Heard(NamedTuple):
 
 
 def merged(parts: Sequence[Heard]) -> Heard:
-    """Lay what was heard at several times one after the other."""
+    """Concatenate several batches of received bytes."""
     if len(parts) == 1:
         return parts[0]
     number: dict[Hashable, int] = {}
@@ -66,7 +65,7 @@ def merged(parts: Sequence[Heard]) -> Heard:
 
 @nb.njit(cache=True, nogil=True)
 def tight(buf, start, length):
-    """Copy pieces one after the other: their bytes, (b,) uint8, and where each ends in them, (n,)."""
+    """Copy pieces to a contiguous buffer: bytes, (b,) uint8, and end of each piece, (n,)."""
     stop = np.cumsum(length)
     out = np.empty(stop[-1] if len(stop) else 0, np.uint8)
     at = 0

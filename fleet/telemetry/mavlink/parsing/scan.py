@@ -1,8 +1,8 @@
-"""The compiled search for MAVLink frames, versions 1 and 2, in any bytes; nothing is raised, nothing good is lost.
+"""Compiled search for MAVLink frames, versions 1 and 2, in arbitrary bytes; never raises, never loses a valid frame.
 
-After a false start the search goes on one byte later, so that a good frame inside garbage is still found. A frame with
-an id unknown here has no checksum that could be tested: it is passed over whole where it fills a piece, or where the
-one before ended, what follows is sound and nothing sound begins inside; else it is a false start.
+After a false start the search continues one byte later, so that valid frames inside garbage are found. The checksum of
+a frame with an unknown id cannot be tested. Such a frame is skipped if it fills a piece, or if it follows a frame, is
+followed by a valid frame and contains none; otherwise it is a false start.
 Source: MAVLink serialization guide; checksum CRC-16/MCRF4XX over everything but the magic, plus CRC_EXTRA.
 """
 
@@ -13,16 +13,16 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 V1, V2 = 0xFE, 0xFD
 SIGNED = 0x01  # incompatibility flag of MAVLink 2
 LONGEST = 280  # bytes of the longest frame, signature included
-STAMP = 8  # bytes of time before a frame in a .tlog
-START, STOP, PAYLOAD, SIZE, ID, SYSTEM, COMPONENT, SEQ, PART, COLUMNS = range(10)  # columns of what `scan` finds
-MESSAGES, BAD_BYTES, BAD_FRAMES, UNKNOWN, COUNTS = range(5)  # what `scan` counts
-_EARLIEST, _LATEST = 3e14, 4e15  # believable stamps [us since 1970]
+STAMP = 8  # bytes of the time stamp before a frame in a .tlog
+START, STOP, PAYLOAD, SIZE, ID, SYSTEM, COMPONENT, SEQ, PART, COLUMNS = range(10)  # columns of a frame header
+MESSAGES, BAD_BYTES, BAD_FRAMES, UNKNOWN, COUNTS = range(5)  # counters of `scan`
+_EARLIEST, _LATEST = 3e14, 4e15  # plausible stamps [us since 1970]
 _LONGEST_GAP = 86_400e6  # between two stamps [us]
 _u = nb.uint64
 
 
 def _crc_table() -> np.ndarray:
-    """Return the effect of a byte followed by k zeros on the checksum, (8, 256): so eight bytes go at once.
+    """Return the effect of a byte followed by k zeros on the checksum, (8, 256), for eight bytes at once.
 
     Source: Kounavis & Berry 2005, "slicing-by-8".
     """
@@ -43,12 +43,12 @@ def _extra_table() -> np.ndarray:
 
 CRC = _crc_table()
 EXTRA = _extra_table()
-"""CRC_EXTRA by message id; -1: no such message here."""
+"""CRC_EXTRA by message id; -1: not in the dialect."""
 
 
 @nb.njit(cache=True, nogil=True)
 def frame_length(buf, at, end):
-    """Return the length a frame starting at `at` claims [bytes]; 0: no frame, -1: header not complete yet."""
+    """Return the length in the header of a frame at `at` [bytes]; 0: no frame, -1: incomplete header."""
     if end < at + 3:
         return -1
     if buf[at] == V1:
@@ -68,8 +68,8 @@ def message_id(buf, at):
 
 @nb.njit(cache=True, nogil=True)
 def checksum(told, at, end, extra, table):
-    """Return the checksum of bytes `at` to `end`, CRC_EXTRA after them; `table` is `CRC`."""
-    crc, i, last, low = _u(0xFFFF), _u(at), _u(end), _u(0xFF)  # unsigned: no index can be negative
+    """Return the checksum of bytes `at` to `end` followed by CRC_EXTRA; `table` is `CRC`."""
+    crc, i, last, low = _u(0xFFFF), _u(at), _u(end), _u(0xFF)  # unsigned: no check for negative indices
     while i + _u(8) <= last:
         a, b = _u(told[i]) ^ (crc & low), _u(told[i + _u(1)]) ^ (crc >> _u(8))
         early = table[7, a] ^ table[6, b] ^ table[5, told[i + _u(2)]] ^ table[4, told[i + _u(3)]]
@@ -97,7 +97,7 @@ def _timely(t, last):
 
 @nb.njit(cache=True, nogil=True)
 def sound(buf, at, end, extras, table):
-    """Return the end of the whole, sound frame of a message known here that starts at `at`; 0: there is none."""
+    """Return the end of a complete, valid frame of a dialect message at `at`; 0 if there is none."""
     if at + 8 > end or (buf[at] != V1 and buf[at] != V2):
         return 0
     head, tail, number = 6, 2, nb.int64(buf[at + 5])
@@ -116,7 +116,7 @@ def sound(buf, at, end, extras, table):
 
 @nb.njit(cache=True, nogil=True)
 def _leads_on(buf, at, end, extras, table):
-    """Follow frames of unknown ids from `at` on; return where that ends: soundly, or -1."""
+    """Skip frames with unknown ids from `at`; return the start of the next valid frame or the end, or -1."""
     while at < end:
         if sound(buf, at, end, extras, table):
             return at
@@ -132,7 +132,7 @@ def _leads_on(buf, at, end, extras, table):
 
 @nb.njit(cache=True, nogil=True)
 def _hides(buf, at, after, end, extras, table):
-    """Return whether a sound frame begins between `at` and `after`."""
+    """Return whether a valid frame starts between `at` and `after`."""
     inside = at + 1
     while inside < after and not sound(buf, inside, end, extras, table):
         inside += 1
@@ -141,7 +141,7 @@ def _hides(buf, at, after, end, extras, table):
 
 @nb.njit(cache=True, nogil=True)
 def _note(buf, at, stop, found, n):
-    """Write down frame `n`: all columns but its part."""
+    """Store the header of frame `n`: all columns but PIECE."""
     second = buf[at] == V2
     head = 10 if second else 6
     found[n, START], found[n, STOP], found[n, PAYLOAD], found[n, SIZE] = at, stop, at + head, buf[at + 1]
@@ -153,13 +153,13 @@ def _note(buf, at, stop, found, n):
 
 @nb.njit(cache=True, nogil=True)
 def straight(buf, begin, end, found, extras, table):
-    """Find the frames of pieces that hold nothing but sound frames of messages known here: the usual case, at speed.
+    """Find the frames of pieces that contain only valid frames of dialect messages: the common case, optimised.
 
     Args:
-        buf, found, extras, table: as for `scan`
-        begin, end: where each piece begins and ends, (k,)
+        buf, headers, extras, table: as for `scan`
+        begin, end: start and end of each piece, (k,)
     Returns:
-        how many were found; -1 where there is anything else, which is for `scan`
+        number of frames; -1 if the pieces contain anything else and need `scan`
     """
     n = 0
     for part in range(len(begin)):
@@ -185,26 +185,26 @@ def straight(buf, begin, end, found, extras, table):
 
 @nb.njit(cache=True, nogil=True)
 def scan(buf, parts, prefix, last_t, found, times, counts, extras, table):
-    """Find every sound frame of a message known here.
+    """Find all valid frames of dialect messages.
 
     Args:
-        buf: bytes of one or more senders, one after the other, (n,) uint8
-        parts: where each piece or each sender's bytes begin, replaced by where the search must go on; where they end;
-            and 1 where they begin with something left over, 0 where a frame is due, (k, 3)
+        buf: concatenated bytes of one or more senders, (n,) uint8
+        pieces: per piece its start, replaced by the position to continue the search; its end; and 1 if it begins with
+            carried bytes, 0 if it begins with a frame, (k, 3)
         prefix: 0, or `STAMP` in a .tlog
-        last_t: newest stamp so far [us]; nan before any
-        found: filled with `COLUMNS` numbers a frame, (m, 9) int64
+        last_t: newest stamp so far [us]; nan before the first
+        headers: filled with `COLUMNS` numbers per frame, (m, 9) int64
         times: filled with the stamps in a .tlog [us], (m,)
-        counts: raised, (COUNTS,) int64
+        counts: incremented, (COUNTER_COUNT,) int64
         extras, table: `EXTRA`, `CRC`
     Returns:
-        how many were found, newest stamp [us]
+        number of frames, newest stamp [us]
     """
     n = 0
     for part in range(len(parts)):
         begin, end = parts[part, 0], parts[part, 1]
         at = begin
-        in_step, sure = parts[part, 2] == 0, at  # the one before ended here; unknown frames up to there are certain
+        in_step, sure = parts[part, 2] == 0, at  # aligned to a frame end; unknown frames confirmed up to here
         while at + prefix < end:
             magic = at + prefix
             stop = sound(buf, magic, end, extras, table)

@@ -1,7 +1,7 @@
-"""DataFlash binary: bytes to `Records`, block by block, whatever was done to the bytes.
+"""Parse binary DataFlash logs to `Records`, block by block, tolerant of damage.
 
-A message is 0xA3 0x95, its type, then what the FMT of that type says. After damage the search goes on one byte later,
-for a header whose message is followed by another header, so that one flipped bit costs one message.
+A message is 0xA3 0x95, its type, and the fields of the FMT of that type. After damage the search continues one byte
+later for a header whose message is followed by another header: one flipped bit loses one message.
 """
 
 import lzma
@@ -19,26 +19,26 @@ HEAD1, HEAD2 = MAGIC
 FMT, FMT_LENGTH = 0x80, 89
 SHORTEST, LONGEST = 3, 255
 _FMT = form("FMT", "BBnNZ", "Type,Length,Name,Format,Columns", FMT_LENGTH)
-HOPELESS = 1 << 25  # damaged bytes, beyond `_WORSE` times the good ones, after which the rest is left unread
+HOPELESS = 1 << 25  # damaged bytes, beyond `_MAX_DAMAGE_RATIO` times the good ones, that end reading
 _WORSE = 4
-_MOST_CHANGES = 2000  # formats that are declared anew and otherwise; a log has some hundred formats, each once
+_MOST_CHANGES = 2000  # maximum number of format declarations; a log has about a hundred
 _READ_ERRORS = (OSError, EOFError, lzma.LZMAError, zlib.error)
 
 
 def blocks(opener: Callable[[], IO[bytes]], damage: Damage) -> Iterator[list[Records]]:
-    """Read a log from its beginning: what each MiB holds, by format, places in bytes."""
+    """Read a log from the start: the records of each MiB, with positions in bytes."""
     walk = Walk(damage)
     with opener() as stream:
         for data in pieces(stream, damage):
             yield walk.feed(data)
             if walk.lost > HOPELESS + _WORSE * (walk.place - walk.lost):
-                damage.note("hardly anything but damage, so the rest was left unread", walk.place)
+                damage.note("too much damage, the rest was not read", walk.place)
                 break
     yield walk.feed(b"", last=True)
 
 
 def pieces(stream: IO[bytes], damage: Damage) -> Iterator[bytes]:
-    """Read a stream to its end, or to where a damaged compression ends it."""
+    """Read a stream to its end, or to the first error of the decompression."""
     place = 0
     while True:
         try:
@@ -53,29 +53,29 @@ def pieces(stream: IO[bytes], damage: Damage) -> Iterator[bytes]:
 
 
 class Walk:
-    """Cut bytes into messages and messages into formats."""
+    """Split bytes into messages, and group messages by format."""
 
     def __init__(self, damage: Damage) -> None:
         assert _FMT is not None
         self._damage = damage
-        self._base = 0  # place in the file of the first byte of `_buf`
+        self._base = 0  # file offset of the first byte of `_buf`
         self._buf = b""
         self._formats: list[Format | None] = [None] * 256
         self._lengths = [0] * 256
-        self._hits: list[list[int]] = [[] for _ in range(256)]  # where messages of each type begin in `_buf`
-        self._done: list[Records] = []  # cut with a format that has changed since
+        self._hits: list[list[int]] = [[] for _ in range(256)]  # start of the messages of each type in `_buf`
+        self._done: list[Records] = []  # records with a format that was redefined
         self._formats[FMT], self._lengths[FMT] = _FMT, FMT_LENGTH
-        self._told: dict[int, bytes] = {}  # the newest FMT of each type, as it stands in the file
+        self._told: dict[int, bytes] = {}  # bytes of the newest FMT of each type
         self._changes = 0
-        self.lost = 0  # bytes stepped over
+        self.lost = 0  # skipped bytes
 
     @property
     def place(self) -> int:
-        """Tell how many bytes were walked over."""
+        """Return the number of parsed bytes."""
         return self._base
 
     def feed(self, data: bytes, last: bool = False) -> list[Records]:
-        """Take the next bytes, return the messages completed by them."""
+        """Parse the next bytes; return the messages they complete."""
         self._buf += data
         at = self._walk(last)
         found = self._done + [r for kind in range(256) if (r := self._records(kind)) is not None]
@@ -109,7 +109,7 @@ class Walk:
         return at
 
     def _resume(self, at: int, before: tuple[int, int] | None, last: bool) -> int:
-        """Find the next message after damage at `at`; the one before may have been damaged itself."""
+        """Find the next message after damage at `at`; the previous message may be damaged too."""
         buf, lengths = self._buf, self._lengths
         bad = at
         if before is not None and buf[at : at + 2] != MAGIC:
@@ -127,7 +127,7 @@ class Walk:
         return found
 
     def _search(self, at: int, last: bool) -> int:
-        """Find a message that is followed by another; else where the search must wait for more bytes."""
+        """Find a message followed by another one, or the position at which more bytes are required."""
         buf, lengths, size = self._buf, self._lengths, len(self._buf)
         while (at := buf.find(MAGIC, at)) >= 0:
             if at + 3 > size:
@@ -144,7 +144,7 @@ class Walk:
     def _lose(self, start: int, stop: int) -> None:
         lost = self._buf[start:stop]
         self.lost += stop - start
-        if lost.strip(b"\0") and lost.strip(b"\xff"):  # pages are padded
+        if lost.strip(b"\0") and lost.strip(b"\xff"):  # page padding is no damage
             known = lost[:2] == MAGIC and len(lost) > 2
             kind = "messages of an unknown type, bytes" if known and not self._lengths[lost[2]] else "damaged bytes"
             self._damage.note(kind, self._base + start, stop - start)
@@ -156,7 +156,7 @@ class Walk:
             return
         self._changes += 1
         if self._changes > _MOST_CHANGES:
-            self._damage.note("formats declared over and over", self._base + at)
+            self._damage.note("too many format declarations", self._base + at)
             return
         self._told[told[3]] = told
         found = Records(_FMT, np.array([at]), np.frombuffer(self._buf, _FMT.layout, 1, at))

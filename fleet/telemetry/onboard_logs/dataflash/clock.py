@@ -1,7 +1,7 @@
-"""The clock of a DataFlash log: gives every message its log time, and refuses times that damage made.
+"""Clock of a DataFlash log: assign a log time to every message, and reject times corrupted by damage.
 
-Logs since 2015 stamp all (TimeUS), those before most (TimeMS), those of 2014 little but satellite fixes: there,
-messages of a steady rate are counted between the fixes, and an event has the time of the last stamp before it.
+Logs since 2015 stamp all messages (TimeUS), earlier ones most (TimeMS), those of 2014 hardly more than GPS fixes: their
+messages of constant rate are interpolated between the fixes, and an event gets the time of the last stamp before it.
 """
 
 from collections.abc import Iterator
@@ -11,45 +11,45 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from fleet.telemetry.onboard_logs.dataflash.records import Damage, Format, Records
 
-LEAP_S = 1.0  # a stamp further from its neighbours in the file is damage
-BACK_S = 5.0  # further back than this from the newest: another start in the same file
+LEAP_S = 1.0  # a stamp further from its neighbours in the file is damaged [s]
+BACK_S = 5.0  # a larger step back is another start in the same file [s]
 LONGEST_GAP_S = 86_400.0
-PERIOD_S = 0.1  # of messages without time, where no stamp tells
-PAUSE_S = 30.0  # so long may the log pause where a block ends and nothing can confirm it
-_REACH, _QUORUM = 5, 3  # neighbours asked on each side, and how few will do
+PERIOD_S = 0.1  # period of messages without time or stamps around them [s]
+PAUSE_S = 30.0  # longest pause at the end of a block, where later stamps are missing [s]
+_REACH, _QUORUM = 5, 3  # neighbours compared on each side, and their minimum number
 
 
 def stamp_of(form: Format, weekly: bool = False) -> tuple[str, float] | None:
-    """Name the column that holds the time since boot, and its seconds.
+    """Return the column of the time since boot and its unit [s].
 
     Args:
-        form: of the messages
-        weekly: nothing in this log tells the time since boot, so the satellites' time of the week serves
+        form: format of the messages
+        use_gps_week: use the GPS time of the week, for logs without time since boot
     """
     if "TimeUS" in form.columns:
         return "TimeUS", 1e-6
     if form.name.startswith("GPS"):
-        names = ("T", "TimeMS", "Time") if weekly else ("T",)  # its TimeMS is the week's, not ours
+        names = ("T", "TimeMS", "Time") if weekly else ("T",)  # TimeMS of GPS is the time of the week
         return next(((name, 1e-3) for name in names if name in form.columns), None)
     return ("TimeMS", 1e-3) if form.columns[:1] == ("TimeMS",) else None
 
 
 class Clock:
-    """Stamp the messages of one reading, block after block."""
+    """Assign times to the messages of one pass, block by block."""
 
     def __init__(self, damage: Damage, counted: frozenset[str], start: float = 0.0, weekly: bool = False) -> None:
-        self.start = start  # of what stands before the first stamp [s]
+        self.start = start  # time of messages before the first stamp [s]
         self.newest = float("-inf")  # [s]
         self.first: float | None = None  # first stamp [s]
         self._damage = damage
-        self._counted = counted  # names of a steady rate, should they carry no time
+        self._counted = counted  # messages of constant rate that may have no time
         self._weekly = weekly
-        self._recent = np.zeros(0)  # the last good stamps, in the order of the file
+        self._recent = np.zeros(0)  # last valid stamps, in file order
         self._anchor: tuple[float, float] | None = None  # (place, time) of the last stamp
-        self._held: dict[Format, Records] = {}  # counted, waiting for the stamp after them
+        self._held: dict[Format, Records] = {}  # counted messages before their next stamp
 
     def stamp(self, block: list[Records], last: bool = False) -> list[Records]:
-        """Return the messages of a block, stamped; those counted since the last stamp come with the next block."""
+        """Return the stamped messages of a block; counted ones after the last stamp follow with the next block."""
         timed, rest = self._own([r for r in block if r.form.name != "FMT"])
         places, times = self._sound(timed)
         timed = [r for r in timed if len(r)]
@@ -69,7 +69,7 @@ class Clock:
         return timed + events + found
 
     def _own(self, block: list[Records]) -> tuple[list[Records], list[Records]]:
-        """Separate those with a stamp of their own from those without."""
+        """Separate records with time stamp from those without."""
         timed, rest = [], []
         for r in block:
             stamp = stamp_of(r.form, self._weekly)
@@ -81,7 +81,7 @@ class Clock:
         return timed, rest
 
     def _sound(self, timed: list[Records]) -> tuple[np.ndarray, np.ndarray]:
-        """Drop messages whose stamp cannot be; return place and time of the others, in the order of the file."""
+        """Drop messages with implausible stamps; return position and time of the others in file order."""
         if not timed:
             return np.zeros(0), np.zeros(0)
         place = np.concatenate([r.place for r in timed]).astype(float)
@@ -121,7 +121,7 @@ class Clock:
         for r in counted:
             held = self._held.pop(r.form, None)
             self._held[r.form] = r if held is None else held.and_then(r)
-        if not len(places):  # no stamp at all: count from before the file
+        if not len(places):  # no stamp: count from the start of the file
             places, times = np.array([-1.0]), np.array([self.start])
         for form, r in list(self._held.items()):
             n = len(r) if final else int(np.searchsorted(r.place, places[-1]))
@@ -135,7 +135,7 @@ class Clock:
 
 
 def neighbours(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each stamp the median of those before and of those after it; infinite where there are too few."""
+    """Return for each stamp the medians of the stamps before and after it; infinite with too few neighbours."""
     n = len(t)
     before, after = np.full(n, -np.inf), np.full(n, np.inf)
     if n > _REACH:
@@ -147,14 +147,14 @@ def neighbours(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def counted_times(place: np.ndarray, places: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Spread messages of a steady rate between the stamps around them.
+    """Interpolate the times of messages of constant rate between stamps.
 
     Args:
-        place: where they stand in the file, rising, (n,)
-        places: where stamps stand, rising, (m,), m >= 1
-        times: what those say, rising, (m,) [s]
+        place: positions of the messages in the file, increasing, (n,)
+        places: positions of the stamps, increasing, (m,), m >= 1
+        times: times of the stamps, increasing, (m,) [s]
     Returns:
-        their times (n,) [s]
+        times of the messages, (n,) [s]
     """
     before = np.searchsorted(place, places)  # messages before each stamp
     u, first = np.unique(before, return_index=True)

@@ -1,4 +1,4 @@
-"""Whose DataFlash log it is: system, vehicle and firmware, gathered from what the log says."""
+"""Identify the aircraft of a DataFlash log: system id, vehicle type and firmware."""
 
 import re
 
@@ -13,7 +13,7 @@ _TELLING = {"MAV_SYSID", "SYSID_THISMAV", "Q_ENABLE"} | _PLANE_HAS | _COPTER_HAS
 
 
 class Identity:
-    """Gather whose log it is from what it says."""
+    """Collect the identity of the aircraft from records and events."""
 
     def __init__(self) -> None:
         self._params: dict[str, float] = {}
@@ -23,7 +23,7 @@ class Identity:
         self.firmware = ""
 
     def look(self, block: list[Records], said: list[Said]) -> None:
-        """Take note of a block."""
+        """Evaluate a block."""
         self._names.update(
             f"{r.form.name}.{c}" for r in block for c in r.form.columns if r.form.name in ("CTUN", "MOT")
         )
@@ -35,13 +35,13 @@ class Identity:
 
     @property
     def system(self) -> int:
-        """MAVLink system id, 1 where the log does not say."""
+        """Return the MAVLink system id, 1 if not in the log."""
         value = self._params.get("MAV_SYSID", self._params.get("SYSID_THISMAV", 1.0))
         return int(value) if 1 <= value <= 255 else 1
 
     @property
     def vehicle(self) -> str:
-        """Kind of vehicle as `Status.vehicle` names it."""
+        """Return the vehicle type as in `Status.vehicle`."""
         kind = self._kind or self._guess()
         if kind == "Plane":
             return QUADPLANE if self._params.get("Q_ENABLE", 0.0) > 0 else FIXED_WING
@@ -56,7 +56,7 @@ class Identity:
             self._frame = text
 
     def _guess(self) -> str:
-        """Tell from what only one kind logs or has parameters for."""
+        """Derive the vehicle type from its specific log columns and parameters."""
         if "CTUN.NavRoll" in self._names or self._params.keys() & _PLANE_HAS:
             return "Plane"
         copter = any(name.startswith("MOT.") for name in self._names) or "CTUN.ThrIn" in self._names

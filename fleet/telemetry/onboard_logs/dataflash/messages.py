@@ -1,4 +1,4 @@
-"""What a DataFlash log says that is no row: modes, arming, parameters, missions, texts."""
+"""Extract events of a DataFlash log: modes, arming, parameters, missions, texts."""
 
 import math
 import re
@@ -78,7 +78,7 @@ _ABSOLUTE, _RELATIVE = 0, 3  # MAV_FRAME
 
 
 class Talk:
-    """Turn messages of one reading, block after block, into what they say."""
+    """Extract the events of one pass, block by block."""
 
     def __init__(self, vehicle: str) -> None:
         self._modes: dict[int, str] = mavutil.mode_mapping_bynumber(_MAV_TYPE.get(vehicle, -1)) or {}
@@ -97,14 +97,14 @@ class Talk:
         }
 
     def take(self, block: list[Records], last: bool = False) -> list[Said]:
-        """Return what a block says, in order of time."""
+        """Return the events of a block in time order."""
         said = [s for r in block if (tell := self._tellers.get(r.form.name)) is not None for s in _heard(tell, r)]
         if last:
             said += self._mission.end()
         return [s for s in sorted(said, key=lambda s: s.t) if self._is_news(s)]
 
     def carried_out(self, records: Records) -> Records:
-        """Leave of CMD messages those that say an item was begun, not those that list the mission."""
+        """Return the CMD messages of executed items, without mission lists."""
         return records.taken(self._mission.carried_out(records))
 
     def _is_news(self, said: Said) -> bool:
@@ -135,7 +135,7 @@ class Talk:
 def _heard(tell: Callable[[Records], Iterator[Said]], records: Records) -> list[Said]:
     try:
         return list(tell(records))
-    except (AttributeError, ValueError):  # another generation's columns
+    except (AttributeError, ValueError):  # columns of another ArduPilot release
         return []
 
 
@@ -171,14 +171,14 @@ def _tell_parameters(r: Records) -> Iterator[Said]:
 
 
 class _Mission:
-    """Follow CMD: a list of the whole mission runs from home, 0, to the end; any other is an item being begun."""
+    """Evaluate CMD: a sequence from item 0 (home) to the end is a mission list; any other CMD is an executed item."""
 
     def __init__(self) -> None:
         self._items: dict[int, Item] = {}
-        self._next: int | None = None  # number the running list continues with
+        self._next: int | None = None  # next item of the list in progress
         self._t = 0.0
         self._last: tuple[Item, ...] = ()
-        self._listed: dict[int, np.ndarray] = {}  # of this block's records, by id: which belong to a list
+        self._listed: dict[int, np.ndarray] = {}  # by id of this block's records: mask of list items
 
     def tell(self, r: Records) -> Iterator[Said]:
         self._listed = {id(r): np.zeros(len(r), bool)}
@@ -221,7 +221,7 @@ def _item(values: tuple[Any, ...]) -> Item | None:
     seq, command, *params, lat, lon, alt, frame = values
     if not 0 <= seq < MAX_ITEMS or abs(lat) > 90 or abs(lon) > 180:
         return None
-    if frame is None:  # not logged before 2016: home is absolute, and items are relative as ground stations send them
+    if frame is None:  # not logged before 2016: home is absolute, other items are relative
         frame = _ABSOLUTE if seq == 0 else _RELATIVE
     p1, p2, p3, p4 = (0.0 if p is None or not math.isfinite(p) else p for p in params)
     return Item(

@@ -1,7 +1,7 @@
-"""DataFlash, the onboard log of ArduPilot, binary (.bin) or text (.log), as `OnboardLog` has it.
+"""Reader of ArduPilot DataFlash logs, binary (.bin) or text (.log), as `OnboardLog`.
 
-A log is read twice: once to learn who it is, when it was and which source serves each field best; once for its rows.
-Damage of any kind is skipped, counted and said; what is good is read. Source: ArduPilot AP_Logger.
+A log is read twice: first for identity, date and the best source of each field, then for its rows. Damage is skipped,
+counted and reported; the rest is read. Source: ArduPilot AP_Logger.
 """
 
 from collections import Counter
@@ -24,12 +24,12 @@ from fleet.telemetry.tables.dataflash import ROWS
 from fleet.telemetry.tables.row import Row
 
 Opener = Callable[[], IO[bytes]]
-_HEAD = 1 << 16  # bytes that tell binary from text
-_FIXES = 64  # enough to outvote a stale one
+_HEAD = 1 << 16  # bytes examined to distinguish binary from text
+_FIXES = 64  # GPS fixes used; the median ignores stale ones
 _GPS_EPOCH_S = 315_964_800.0  # 1980-01-06 since 1970 [s]
 _WEEK_S = 604_800.0
 _LEAPS = ((1_483_228_800.0, 18), (1_435_708_800.0, 17), (1_341_100_800.0, 16), (0.0, 15))
-"""From this instant [s since 1970] GPS time is so many seconds ahead of UTC. Source: IERS Bulletin C."""
+"""(start [s since 1970], GPS time minus UTC [s]). Source: IERS Bulletin C."""
 
 
 class DataflashLog:
@@ -38,14 +38,14 @@ class DataflashLog:
     autopilot = "ardupilot"
 
     def __init__(self, source: Path | str | Opener, name: str = "") -> None:
-        """Learn who it is; the rows come from `chunks`.
+        """Read identity and sources; `chunks` returns the content.
 
         Args:
-            source: a file, or what opens it anew each time (for compressed ones)
-            name: for sentences; the file's by default
+            source: a file, or a function that opens it (for compressed files)
+            name: name for messages, default the file name
 
         Raises:
-            OSError: when it cannot be opened.
+            OSError: if it cannot be opened; check the path.
         """
         self._open: Opener = source if callable(source) else partial(_opened, Path(source))
         self.name = name = name or ("log" if callable(source) else Path(source).name)
@@ -56,7 +56,7 @@ class DataflashLog:
         self._weekly = False
         survey, identity, epoch, clock = self._survey()
         if not np.isfinite(clock.newest):
-            self._weekly = True  # nothing tells the time since boot; perhaps the satellites' week does
+            self._weekly = True  # no time since boot: try the GPS time of the week
             survey, identity, epoch, clock = self._survey()
         self._sources = survey.chosen()
         self._start = clock.first if clock.first is not None else 0.0
@@ -65,11 +65,11 @@ class DataflashLog:
 
     @property
     def sources(self) -> dict[str, Row]:
-        """The row of the table that serves each field, or part of one."""
+        """Return the table row used for each field or part."""
         return dict(self._sources)
 
     def chunks(self) -> Iterator[Chunk]:
-        """Return the log from its beginning; may be called again."""
+        """Return the log from the start; may be called repeatedly."""
         damage = self._damage()
         clock, rows, talk = self._clock(damage), Rows(self._sources), Talk(self.vehicle)
         self.skipped[:] = []
@@ -89,7 +89,7 @@ class DataflashLog:
 
     def _sentences(self, damage: Damage, total: int) -> Iterator[str]:
         if not total:
-            yield "found no DataFlash message, expected a log of ArduPilot; check the file"
+            yield "found no DataFlash message, expected an ArduPilot log; check the file"
         yield from damage.sentences()
         yield from origins(self._sources)
 
@@ -130,7 +130,7 @@ def _is_text(head: bytes, name: str) -> bool:
 
 
 class _Epoch:
-    """When log time 0 was: the median of what the first satellite fixes say, for single ones may be stale."""
+    """Estimate the date of log time 0: the median of the first GPS fixes, because single fixes may be stale."""
 
     def __init__(self) -> None:
         self._found: list[float] = []
@@ -152,5 +152,5 @@ class _Epoch:
 
 
 def utc(gps: float) -> float:
-    """Take the leap seconds off a GPS time [s since 1970]."""
+    """Convert GPS time to UTC [s since 1970]."""
     return next((gps - leap for since, leap in _LEAPS if gps - leap >= since), gps)

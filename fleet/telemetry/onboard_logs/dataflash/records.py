@@ -1,32 +1,32 @@
-"""What both forms of a DataFlash log are cut into: `Records`, all messages of one format in a stretch of the log."""
+"""Parsed content of binary and text DataFlash logs: `Records`, all messages of one format in a block."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 from pymavlink.DFReader import FORMAT_TO_STRUCT
 
-MOST_PLACES = 3  # named for each kind of damage
+MOST_PLACES = 3  # positions reported for each kind of damage
 MOST_KINDS = 40
 _WHOLE = "bBhHiIqQM"
 
 
 class Format(NamedTuple):
-    """One FMT: how messages of a type are laid out."""
+    """One FMT: layout of the messages of a type."""
 
     name: str
-    codes: str  # one letter a column, FORMAT_TO_STRUCT
+    codes: str  # one letter per column, FORMAT_TO_STRUCT
     columns: tuple[str, ...]
-    length: int  # of the whole message, header included [bytes]
-    layout: np.dtype | None  # of a binary message, header included; None: text
+    length: int  # of the message with header [bytes]
+    layout: np.dtype | None  # of a binary message with header; None: text
 
     def scale(self, i: int) -> float:
-        """Return what the numbers of column `i` are to be divided by."""
+        """Return the divisor of the numbers of column `i`."""
         factor = FORMAT_TO_STRUCT[self.codes[i]][1]
         return 1.0 if factor is None else round(1.0 / factor)
 
 
 def form(name: str, codes: str, columns: str, length: int = 0) -> Format | None:
-    """Understand one FMT; with a `length`, a binary one. None: it contradicts itself."""
+    """Parse one FMT, binary if `length` is given; return None if it is inconsistent."""
     names = tuple(c.strip() for c in columns.split(",")) if columns.strip() else ()
     if not name.isidentifier() or len(names) != len(codes) or not all(c in FORMAT_TO_STRUCT for c in codes):
         return None
@@ -39,12 +39,12 @@ def form(name: str, codes: str, columns: str, length: int = 0) -> Format | None:
 
 
 class Records:
-    """The messages of one format, column by column: `records.Roll` is a float array, whatever the form of the log."""
+    """Messages of one format by column: `records.Roll` is a float array for binary and text logs."""
 
     def __init__(self, form: Format, place: np.ndarray, rows: Any) -> None:
         self.form = form
-        self.place = place  # (n,) byte offset or line number, rising
-        self.t = np.zeros(0)  # (n,) log time [s], once the clock has stamped them
+        self.place = place  # (n,) byte offset or line number, increasing
+        self.t = np.zeros(0)  # (n,) log time [s], set by `LogClock`
         self._rows = rows  # structured array, or a list of lists of bytes
         self._seen: dict[str, np.ndarray] = {}
 
@@ -61,24 +61,24 @@ class Records:
         return all(c in self.form.columns for c in columns)
 
     def whole(self, column: str) -> bool:
-        """Return whether the format counts this column in whole numbers."""
+        """Return whether this column has an integer type."""
         return self.has(column) and self.form.codes[self.form.columns.index(column)] in _WHOLE
 
     def taken(self, which: np.ndarray) -> "Records":
-        """Return some of them: a mask or indices."""
+        """Return a selection by mask or indices."""
         rows = self._rows[which] if self.form.layout is not None else _picked(self._rows, which)
         found = Records(self.form, self.place[which], rows)
         found.t = self.t[which] if len(self.t) else self.t
         return found
 
     def and_then(self, later: "Records") -> "Records":
-        """Join what follows of the same format."""
+        """Append later records of the same format."""
         binary = self.form.layout is not None
         rows = np.concatenate([self._rows, later._rows]) if binary else self._rows + later._rows
         return Records(self.form, np.concatenate([self.place, later.place]), rows)
 
     def texts(self, column: str) -> list[str]:
-        """Return a column as words, up to the first zero byte, unprintable bytes dropped."""
+        """Return a text column, up to the first zero byte, without unprintable bytes."""
         i = self.form.columns.index(column)
         cells = (row[i] for row in self._rows) if self.form.layout is None else self._rows[f"f{i + 1}"].tolist()
         return [_words(cell) for cell in cells]
@@ -122,21 +122,21 @@ def _float(cell: bytes) -> float:
 
 
 class Damage:
-    """What could not be read, merged by kind: the first places and the total."""
+    """Unreadable parts by kind: first positions and total."""
 
     def __init__(self, unit: str) -> None:
         self.unit = unit  # byte or line
         self._kinds: dict[str, tuple[int, list[int]]] = {}
 
     def note(self, kind: str, place: int, n: int = 1) -> None:
-        """Count `n` more of a kind of damage that begins at `place`; bounded in memory whatever comes."""
+        """Count `n` units of a kind of damage that begins at `place`, in bounded memory."""
         if kind not in self._kinds and len(self._kinds) >= MOST_KINDS:
             kind = "other damage"
         total, places = self._kinds.get(kind, (0, []))
         self._kinds[kind] = (total + n, places if len(places) >= MOST_PLACES else [*places, int(place)])
 
     def sentences(self) -> list[str]:
-        """Say it, one sentence a kind."""
+        """Return one message per kind of damage."""
         return [self._sentence(*found) for found in self._kinds.items()]
 
     def _sentence(self, kind: str, found: tuple[int, list[int]]) -> str:

@@ -1,4 +1,4 @@
-"""From stamped `Records` to the rows of `Sample` fields: the best source of each, its parts joined, in rising time."""
+"""Convert stamped `Records` to rows of `Sample` fields: select the best source, join parts, sort by time."""
 
 from collections.abc import Iterator
 
@@ -10,16 +10,16 @@ from fleet.telemetry.onboard_logs.dataflash.records import Records
 from fleet.telemetry.tables.dataflash import ANGLES, PARTS, RATES, ROWS, TABLE, believable, field_of
 from fleet.telemetry.tables.row import Row
 
-NEAR_S = 0.5  # parts of one row are measured within this
-WAIT_S = 1.0  # a row waits so long for its other parts
-USEFUL = 0.2  # of the busiest source's messages are enough for a better one to win
+NEAR_S = 0.5  # maximum time between the parts of one row [s]
+WAIT_S = 1.0  # maximum wait of a row for its other parts [s]
+USEFUL = 0.2  # minimum row count of a source, relative to the fastest source of its field
 
 Series = tuple[np.ndarray, np.ndarray]  # times (n,), values (n, k)
 
 
 def read(row: Row, records: Records) -> Series | None:
-    """Return times and values of what a row of the table makes of these messages; None: it does not fit them."""
-    with np.errstate(all="ignore"):  # damaged numbers are refused below, not feared
+    """Return times and values of a table row applied to these messages; None if it does not apply."""
+    with np.errstate(all="ignore"):  # invalid numbers are rejected below
         try:
             columns = np.stack(row.columns(records), axis=-1)
             which = np.ones(len(records), bool) if row.when is None else np.asarray(row.when(records), bool)
@@ -30,20 +30,20 @@ def read(row: Row, records: Records) -> Series | None:
 
 
 class Survey:
-    """Count what each row of the table would give, to choose the sources."""
+    """Count the rows of each source to select the best one."""
 
     def __init__(self) -> None:
         self._counts: dict[int, int] = {}
 
     def look(self, block: list[Records]) -> None:
-        """Take note of a block."""
+        """Count the rows of a block."""
         for records in block:
             for row in ROWS.get(records.form.name, ()):
                 if (found := read(row, records)) is not None:
                     self._counts[id(row)] = self._counts.get(id(row), 0) + len(found[0])
 
     def chosen(self) -> dict[str, Row]:
-        """Return the best source of each part: of those that flow, the one of the highest rank."""
+        """Return the active source of highest rank for each part."""
         best: dict[str, Row] = {}
         most: dict[str, int] = {}
         for row in TABLE:
@@ -56,20 +56,20 @@ class Survey:
 
 
 class Rows:
-    """Turn blocks into rows, one reading of a log."""
+    """Convert blocks to rows, for one pass over a log."""
 
     def __init__(self, sources: dict[str, Row]) -> None:
         self._sources = sources
         self._joints = {field: joint for field in PARTS if (joint := _joint(field, sources)) is not None}
-        self._newest: dict[str, float] = {}  # of each part, what was given [s]
+        self._newest: dict[str, float] = {}  # newest time of each part [s]
 
     def take(self, block: list[Records], newest: float, last: bool = False) -> Table:
-        """Return the rows a block completes.
+        """Return the rows completed by a block.
 
         Args:
             block: stamped messages
             newest: newest time in the log so far [s]
-            last: nothing follows
+            last: whether this is the last block
         """
         table: Table = {}
         for part, row in self._sources.items():
@@ -114,13 +114,13 @@ def _joint(field: str, sources: dict[str, Row]) -> "_Joint | None":
 
 
 class _Joint:
-    """Join the parts of one field: others are interpolated onto the instants of the first."""
+    """Join the parts of one field, interpolated to the times of the first part."""
 
     def __init__(self, field: str, derive: bool) -> None:
         self._parts = PARTS[field]
-        self._derive = derive  # rates from angles, for want of a gyroscope
+        self._derive = derive  # rates from angles, without gyroscope
         self._series: dict[str, Series] = {part: (np.zeros(0), np.zeros((0, n))) for part, n in self._parts}
-        self._angles: Series = self._series[self._parts[0][0]]  # the newest, for the next difference
+        self._angles: Series = self._series[self._parts[0][0]]  # newest angles, for the next difference
 
     def add(self, part: str, t: np.ndarray, values: np.ndarray) -> None:
         if not len(t):
@@ -166,7 +166,7 @@ def _interpolated(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> tuple[np
 
 
 def rates_between(t: np.ndarray, angles: np.ndarray) -> Series:
-    """Differentiate attitude: body rates half-way between neighbours near enough in time.
+    """Differentiate attitude: body rates halfway between neighbouring samples.
 
     p = phi_dot - psi_dot sin(theta); q = theta_dot cos(phi) + psi_dot sin(phi) cos(theta); r likewise.
     Source: Beard & McLain 2012, eq. 3.3.
@@ -189,6 +189,6 @@ def rates_between(t: np.ndarray, angles: np.ndarray) -> Series:
 
 
 def origins(sources: dict[str, Row]) -> Iterator[str]:
-    """Say what is made of something else for want of a source."""
+    """Describe the fields that are derived without a direct source."""
     if ANGLES in sources and RATES not in sources:
         yield "attitude: no gyroscope in this log; p, q, r are differences of the angles"

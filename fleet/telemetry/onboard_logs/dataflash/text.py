@@ -1,4 +1,4 @@
-"""DataFlash text: lines to `Records`, block by block, in the same form as the binary log gives."""
+"""Parse text DataFlash logs to `Records`, block by block, like the binary parser."""
 
 from collections.abc import Callable, Iterator
 from typing import IO
@@ -10,11 +10,11 @@ from fleet.telemetry.onboard_logs.dataflash.records import Damage, Format, Recor
 
 LONGEST = 4096  # of a line [bytes]
 MOST_FORMATS = 512
-_WORDY = "nNZ"  # columns that may hold a comma
+_WORDY = "nNZ"  # columns that may contain a comma
 
 
 def blocks(opener: Callable[[], IO[bytes]], damage: Damage) -> Iterator[list[Records]]:
-    """Read a log from its beginning: what each MiB holds, by format, places in lines from 1."""
+    """Read a log from the start: the records of each MiB, with line numbers from 1."""
     reader = Lines(damage)
     with opener() as stream:
         for data in pieces(stream, damage):
@@ -23,18 +23,18 @@ def blocks(opener: Callable[[], IO[bytes]], damage: Damage) -> Iterator[list[Rec
 
 
 class Lines:
-    """Cut text into messages and messages into formats."""
+    """Split text into messages, and group messages by format."""
 
     def __init__(self, damage: Damage) -> None:
         self._damage = damage
         self._carry = b""
-        self._endless = False  # within a line too long to be one
+        self._endless = False  # inside a line longer than the limit
         self._line = 0
         self._formats: dict[bytes, Format] = {}
         self._found: dict[Format, tuple[list[int], list[list[bytes]]]] = {}
 
     def feed(self, data: bytes) -> list[Records]:
-        """Take the next bytes, return the messages completed by them."""
+        """Parse the next bytes; return the messages they complete."""
         lines = (self._carry + data).split(b"\n")
         self._carry = lines.pop()
         for line in lines:
@@ -52,8 +52,8 @@ class Lines:
     def _take(self, line: bytes) -> None:
         head, comma, rest = line.partition(b",")
         if not comma:
-            if self._formats and line.strip():  # a title stands before the first format
-                self._bad("lines that are no message")
+            if self._formats and line.strip():  # text before the first format is allowed
+                self._bad("lines without message")
             return
         known = self._formats.get(head)
         if known is None:

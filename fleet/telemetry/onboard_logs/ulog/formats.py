@@ -1,4 +1,4 @@
-"""What a ULog declares of itself: message formats, their sizes, and which number stands for which topic."""
+"""Declarations of a ULog: message formats, their sizes, and topic subscriptions."""
 
 import re
 from typing import NamedTuple
@@ -11,47 +11,47 @@ SIZES = {
 }
 _LARGEST = 0xFFFF - 2  # bytes of one row
 _LARGEST_WANTED = 4096  # bytes of one row of a topic in the table; PX4 stays below 2000
-_MOST_TOPICS = 2000  # subscriptions of one file
-_DEEPEST = 8  # formats within formats
-_MOST_FIELDS = 999  # of one format
-_MOST_DECLARED = 50_000  # fields of all formats; PX4 declares some 10,000
-_MOST_COLUMNS = 50_000  # numbers in one row of each wanted topic, all topics together
-_MOST_ATTEMPTS = 10_000  # subscriptions looked at, good or not
+_MOST_TOPICS = 2000  # maximum subscriptions of one file
+_DEEPEST = 8  # maximum nesting of formats
+_MOST_FIELDS = 999  # maximum fields of one format
+_MOST_DECLARED = 50_000  # maximum fields of all formats; PX4 declares about 10,000
+_MOST_COLUMNS = 50_000  # maximum numbers per row, summed over all wanted topics
+_MOST_ATTEMPTS = 10_000  # maximum subscriptions parsed, valid or not
 _LONGEST_NAME = 100
 _NAME = re.compile(rb"[A-Za-z_]\w{0,99}")
 _FORMAT_TEXT = re.compile(rb"[A-Za-z_]\w{0,99}:[\w \[\];]*")
 _FIELD = re.compile(rb"(\w{1,60})(?:\[(\d{1,5})\])? (\w{1,60})")  # no two parts can match the same bytes
 _KEY = re.compile(rb"(\w+)(?:\[(\d+)\])? ([\w./@-]+)")
-_CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f]")  # escape may colour a text
+_CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f]")  # escape is allowed: it colours texts
 
 
 class Topic(NamedTuple):
-    """One subscription: what a row of it must weigh, and where its stamp is."""
+    """One subscription: size of its rows and offset of their time stamp."""
 
     name: str
-    least: int  # bytes of a row without the padding at its end
-    most: int  # bytes with it
+    least: int  # bytes of a row without trailing padding
+    most: int  # bytes with padding
     stamp_at: int
     wanted: bool
 
 
 def readable(text: bytes) -> bool:
-    """Return whether bytes are text."""
+    """Return whether bytes contain no control characters."""
     return _CONTROL.search(text) is None
 
 
 class Formats:
-    """The formats declared so far, and the topics made of them."""
+    """Declared formats and subscribed topics."""
 
     def __init__(self, wanted: frozenset[str]) -> None:
         self.topics: dict[int, Topic] = {}
         self._wanted = wanted
         self._fields: dict[bytes, list[tuple[bytes, int, bytes]]] = {}
-        self._extents: dict[tuple[bytes, int], tuple[int, int] | None] = {}  # found before, by type and depth left
+        self._extents: dict[tuple[bytes, int], tuple[int, int] | None] = {}  # cached, by type and remaining depth
         self._declared = self._columns = self._attempts = 0
 
     def is_format(self, body: bytes) -> bool:
-        """Return whether the bytes declare a format; in a time proportional to their number."""
+        """Return whether the bytes declare a format, in linear time."""
         name, colon, fields = body.partition(b":")
         if not colon or len(body) >= 0xFFFF or _NAME.fullmatch(name) is None:
             return False
@@ -59,7 +59,7 @@ class Formats:
         return 0 < len(parts) <= _MOST_FIELDS and all(_FIELD.fullmatch(part) for part in parts)
 
     def is_value(self, body: bytes) -> bool:
-        """Return whether the bytes are a key and a value of the type the key names."""
+        """Return whether the bytes are a key and a value of the key's type."""
         if not body or len(body) < 1 + body[0]:
             return False
         key = _KEY.fullmatch(body, 1, 1 + body[0])
@@ -69,11 +69,11 @@ class Formats:
         return len(body) - 1 - body[0] == size and (key[1] != b"char" or readable(body[1 + body[0] :].rstrip(b"\0")))
 
     def knows(self, name: bytes) -> bool:
-        """Return whether a format of that name was declared."""
+        """Return whether a format of this name is declared."""
         return name in self._fields
 
     def learn(self, body: bytes) -> bool:
-        """Take a format; the first of a name stands, and only so many are kept; tell whether it was taken."""
+        """Declare a format; reject a repeated name or too many fields; return whether it was accepted."""
         name, _, fields = body.partition(b":")
         parts = [match.groups() for part in _parts(fields) if (match := _FIELD.fullmatch(part))]
         found = [(kind, max(int(n or 1), 1), field) for kind, n, field in parts]
@@ -86,7 +86,7 @@ class Formats:
         return True
 
     def subscribe(self, body: bytes) -> bool:
-        """Take a subscription; tell whether its rows are wanted and can be read."""
+        """Add a subscription; return whether its rows are wanted and readable."""
         number = int.from_bytes(body[1:3], "little")
         self._attempts += 1
         if number in self.topics or len(self.topics) >= _MOST_TOPICS or self._attempts > _MOST_ATTEMPTS:
@@ -115,12 +115,12 @@ class Formats:
         return wanted
 
     def _size(self, kind: bytes, depth: int) -> int | None:
-        """Return the bytes of a type; None where it is unknown, too large or contains itself."""
+        """Return the size of a type [bytes]; None if it is unknown, too large or recursive."""
         found = self._extent(kind, depth)
         return None if found is None else found[0]
 
     def _extent(self, kind: bytes, depth: int) -> tuple[int, int] | None:
-        """Return the bytes of a type and how many numbers they are; each type is looked into once for each depth."""
+        """Return the size of a type [bytes] and its number of values, cached by depth."""
         if kind.decode() in SIZES:
             return SIZES[kind.decode()], 1
         if depth == 0 or kind not in self._fields:
@@ -143,12 +143,12 @@ class Formats:
 
 
 def could_be(kind: int, raw: bytearray, begin: int, end: int) -> tuple[bool, int]:
-    """Return whether bytes may be the body of a message, without copying them, and how many were looked at.
+    """Return whether bytes may be the body of a message, and the number of examined bytes, without a copy.
 
     Args:
-        kind: of the message
+        kind: message type
         raw: any bytes
-        begin, end: of the body in them
+        begin, end: range of the body in them
     """
     if kind == ord("F"):
         text = _FORMAT_TEXT.match(raw, begin, end)
@@ -166,7 +166,7 @@ def could_be(kind: int, raw: bytearray, begin: int, end: int) -> tuple[bool, int
 
 
 def _short(kind: int, raw: bytearray, begin: int, end: int) -> bool:
-    """Tell at a glance whether a body may be a subscription, a value or a mark."""
+    """Return whether a body may be a subscription, a value or a marker, by a quick test."""
     if kind == ord("A"):
         return 3 < end - begin <= 3 + _LONGEST_NAME
     if kind in b"ORSB":
@@ -178,5 +178,5 @@ def _short(kind: int, raw: bytearray, begin: int, end: int) -> bool:
 
 
 def _parts(fields: bytes) -> list[bytes]:
-    """Cut the fields of a format apart; the semicolon after the last may be missing."""
+    """Split the fields of a format; the last semicolon is optional."""
     return fields.removesuffix(b";").split(b";")

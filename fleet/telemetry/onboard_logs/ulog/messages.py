@@ -1,4 +1,4 @@
-"""What a ULog says besides rows: who the aircraft is, its modes, its transitions, and what time it was."""
+"""Extract identity, modes, transitions and date of a ULog."""
 
 from collections.abc import Mapping
 from types import SimpleNamespace
@@ -11,21 +11,21 @@ from fleet.telemetry.mavlink.onboard_log import Said
 from fleet.telemetry.onboard_logs.ulog.topic import Topic
 from fleet.telemetry.tables.ulog import ARMED, AUTOSTART, TRANSITIONS, VEHICLE_TYPE, mode
 
-_EARLIEST_US, _LATEST_US = 1.2e15, 4e15  # believable satellite time: 2008 to 2096
+_EARLIEST_US, _LATEST_US = 1.2e15, 4e15  # plausible GPS time: 2008 to 2096
 _GRADES = ((192, " RC"), (128, " beta"), (64, " alpha"))  # last byte of ver_sw_release; 255 is a release
-_INFO = 6  # severity of what we word ourselves
+_INFO = 6  # severity of generated texts
 
 Topics = Mapping[str, Topic]
 
 
 def system(params: Mapping[str, float], topics: Topics) -> int:
-    """Return the MAVLink system id, 1 where the log does not say."""
+    """Return the MAVLink system id, 1 if not in the log."""
     said = params.get("MAV_SYS_ID", _latest(topics, "system_id"))
     return int(said) if said is not None and 1 <= said <= 255 else 1
 
 
 def vehicle(params: Mapping[str, float], topics: Topics) -> str:
-    """Name the kind of vehicle as `Status.vehicle` does."""
+    """Return the vehicle type as in `Status.vehicle`."""
     if _latest(topics, "is_vtol"):
         return heartbeat.QUADPLANE
     for mav_type in (_latest(topics, "system_type"), params.get("MAV_TYPE")):
@@ -41,13 +41,13 @@ def vehicle(params: Mapping[str, float], topics: Topics) -> str:
 
 
 def release(info: Mapping[str, Any]) -> tuple[int, int]:
-    """Return the release of PX4, major and minor; beyond any where the log does not say."""
+    """Return the PX4 release, (major, minor); (99, 0) if not in the log."""
     number = info.get("ver_sw_release")
     return (number >> 24 & 0xFF, number >> 16 & 0xFF) if isinstance(number, int) and number > 0 else (99, 0)
 
 
 def firmware(info: Mapping[str, Any]) -> str:
-    """Word the firmware, or leave it empty."""
+    """Return the firmware text, or an empty string."""
     number = info.get("ver_sw_release")
     if isinstance(number, int) and number > 0:
         grade = next((word for least, word in _GRADES if least <= number & 0xFF < 255), "")
@@ -56,9 +56,9 @@ def firmware(info: Mapping[str, Any]) -> str:
 
 
 def epoch(topics: Topics) -> float | None:
-    """Return fleet time minus log time [s] as the satellites told it; late by a receiver's delay, 0.1 s.
+    """Return fleet time minus log time [s] from GPS time; late by the receiver delay of 0.1 s.
 
-    `time_ref_utc` is no help: it is the time zone the logger was set to.
+    `time_ref_utc` is not usable: it is the time zone of the logger.
     """
     for name in ("vehicle_gps_position", "sensor_gps"):
         if name in topics and hasattr(topics[name], "time_utc_usec"):
@@ -70,7 +70,7 @@ def epoch(topics: Topics) -> float | None:
 
 
 def said_by_topics(topics: Topics, version: tuple[int, int]) -> list[Said]:
-    """Return modes, arming and transitions, each where it changes."""
+    """Return the changes of mode, arming and VTOL state."""
     said: list[Said] = []
     status = topics.get("vehicle_status")
     if status is not None and hasattr(status, "nav_state"):
@@ -98,11 +98,11 @@ def _changes(t: np.ndarray, values: np.ndarray) -> list[tuple[float, Any]]:
     return [(float(t[i]), values[i]) for i in at[:_MOST_CHANGES]]
 
 
-_MOST_CHANGES = 1000  # of one kind taken from one log
+_MOST_CHANGES = 1000  # maximum events of one kind per log
 
 
 def _latest(topics: Topics, field: str) -> float | None:
-    """Return what vehicle_status said most often, so that a damaged row does not decide."""
+    """Return the most common value of a vehicle_status field, to ignore damaged rows."""
     status = topics.get("vehicle_status")
     if status is None or not hasattr(status, field):
         return None

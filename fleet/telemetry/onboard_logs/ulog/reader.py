@@ -1,4 +1,4 @@
-"""A PX4 log (ULog, .ulg) as `OnboardLog`: pyulog reads it behind a sieve, the table says what its topics mean."""
+"""Reader of PX4 logs (ULog, .ulg) as `OnboardLog`: pyulog reads filtered bytes, the table maps the topics."""
 
 from collections.abc import Callable, Iterator
 from math import isfinite
@@ -16,20 +16,20 @@ from fleet.telemetry.tables.row import Row, believable
 from fleet.telemetry.tables.ulog import CALCULATED, FIELDS, FLOWS_HZ, HELD, ROWS, TOPICS
 
 CHUNK_S = 30.0
-_BLOCK = 1 << 17  # rows laid out at once
-EARLY_S = 1.0  # a row may be this much older than the log's start [s]
-_MOST_WORDS = 10_000  # texts and parameter changes taken from one log
+_BLOCK = 1 << 17  # rows processed at once
+EARLY_S = 1.0  # maximum age of a row before the log start [s]
+_MOST_WORDS = 10_000  # maximum texts and parameter changes per log
 
 
 class UlogLog:
-    """One PX4 aircraft's own log, opened; see `onboard_log.OnboardLog`."""
+    """Opened PX4 log of one aircraft; see `onboard_log.OnboardLog`."""
 
     def __init__(self, opener: Callable[[], IO[bytes]], name: str) -> None:
-        """Read the log; whatever is wrong with it is said in `skipped`.
+        """Read the log; problems are listed in `skipped`.
 
         Args:
-            opener: gives the decompressed bytes from their beginning
-            name: of the file, for sentences
+            opener: opens the decompressed bytes at the start
+            name: file name for messages
         """
         self.name, self.autopilot = name, "px4"
         self.skipped: list[str] = []
@@ -48,17 +48,17 @@ class UlogLog:
             if len(topic) > _BLOCK:
                 topic.strip()
         if not self._topics:
-            self.skipped.append("found no topic of the table in it, expected a PX4 log; check the file")
+            self.skipped.append("found no known topic, expected a PX4 log; check the file")
 
     def chunks(self) -> Iterator[Chunk]:
-        """Return the log in pieces of half a minute from its beginning; may be called again."""
+        """Return the log in chunks of 30 s from the start; may be called repeatedly."""
         times = [t.t for t in self._topics.values()]
         if not times and not self._said:
             return
         first = min([t[0] for t in times] + [self._said[0].t] if self._said else [t[0] for t in times])
         last = max([t[-1] for t in times] + [self._said[-1].t] if self._said else [t[-1] for t in times])
         told = [*times, np.array([s.t for s in self._said]), np.array([last])]
-        for number in np.unique(np.concatenate([(t - first) // CHUNK_S for t in told])):  # no chunks of a long silence
+        for number in np.unique(np.concatenate([(t - first) // CHUNK_S for t in told])):  # no chunks without data
             chunk = self._cut(first + number * CHUNK_S, first + (number + 1) * CHUNK_S)
             if chunk.rows or chunk.said or chunk.counts:
                 yield chunk
@@ -74,20 +74,20 @@ class UlogLog:
         return Chunk(rows, said, {name: n for name, n in counts.items() if n})
 
     def _sorted(self, log: ULog, start_us: int) -> dict[str, Topic]:
-        """Return the topics by name, the second instance as `name.1`, rows in order of time."""
+        """Return the topics by name, the second instance as `name.1`, rows in time order."""
         topics: dict[str, Topic] = {}
         early = 0
-        while log.data_list:  # what is copied is given back
+        while log.data_list:  # free the copied data
             data = log.data_list.pop(0)
             stamp = data.data["timestamp"].astype(np.int64)
             order = in_order(stamp)
             strays = len(stamp) - len(order)
             if strays:
-                self.skipped.append(f"{strays} rows of {data.name} with a stamp out of order were left out")
+                self.skipped.append(f"{strays} rows of {data.name} with a stamp out of order were skipped")
             stamp = stamp[order]
             before = int(np.searchsorted(stamp, start_us - EARLY_S * 1e6))
             if before and before == len(stamp) and data.name in HELD:
-                before, stamp = before - 1, np.maximum(stamp, start_us)  # still in force when the log begins
+                before, stamp = before - 1, np.maximum(stamp, start_us)  # still valid at the log start
             early += before
             if before < len(stamp):
                 kept = order[before:]
@@ -95,7 +95,7 @@ class UlogLog:
                 name = data.name if data.multi_id == 0 else f"{data.name}.{data.multi_id}"
                 topics[name] = Topic(stamp[before:] * 1e-6, fields, topics)
         if early:
-            self.skipped.append(f"{early} rows stamped more than {EARLY_S:.0f} s before the log's start were left out")
+            self.skipped.append(f"{early} rows stamped more than {EARLY_S:.0f} s before the log's start were skipped")
         return topics
 
     # --- rows ---
@@ -113,7 +113,7 @@ class UlogLog:
         return table
 
     def _best(self, field: str) -> tuple[Row, np.ndarray, np.ndarray] | None:
-        """Return the row of highest rank that flows, else the one that says most."""
+        """Return the active source of highest rank, else the one with the most rows."""
         most: tuple[Row, np.ndarray, np.ndarray] | None = None
         for row in ROWS[field]:
             if row.message not in self._topics:
@@ -143,10 +143,10 @@ class UlogLog:
         words = [s for s in (*changed, *texts) if self._t0 - 60 <= s.t <= last + 60]
         lost = len(changed) + len(texts) - len(words[:_MOST_WORDS])
         if lost:
-            self.skipped.append(f"{lost} texts or parameter changes with a stamp far off or too many were left out")
+            self.skipped.append(f"{lost} texts or parameter changes with a bad stamp or beyond the limit were skipped")
         lapses = [d.duration for d in log.dropouts]
         if lapses:
-            self.skipped.append(f"the logger itself lost {sum(lapses) * 1e-3:.2f} s in {len(lapses)} dropouts")
+            self.skipped.append(f"the logger lost {sum(lapses) * 1e-3:.2f} s in {len(lapses)} dropouts")
         return sorted(said + words[:_MOST_WORDS], key=lambda s: s.t)
 
 
@@ -155,22 +155,22 @@ def _read(opener: Callable[[], IO[bytes]], skipped: list[str]) -> tuple[ULog, in
         sieve = Sieve(opener, TOPICS, skipped)
         log = ULog(sieve, sorted(TOPICS))
         if sieve.messages == 0:
-            skipped.append("found not a single message of a ULog, expected a PX4 log; check the file")
+            skipped.append("found no ULog message, expected a PX4 log; check the file")
         return log, sieve.start_us
-    except Exception as error:  # the sieve passes nothing that should raise; a reader must not, all the same
+    except Exception as error:  # filtered bytes should not raise; a reader must never raise
         skipped.append(f"could not be read ({type(error).__name__}: {error}); check the file")
         return ULog(None), 0
 
 
 def _believed_start(log: ULog, start_us: int, skipped: list[str]) -> int:
-    """Return when the log began [us]; not the stamp in its header where that does not fit its rows."""
+    """Return the log start [us]: the header stamp, or the first row if the header is inconsistent."""
     stamps = np.concatenate([data.data["timestamp"].astype(np.int64) for data in log.data_list] or [np.zeros(0, int)])
     if len(stamps) == 0:
         return start_us if start_us < LATEST_US else 0
     early, first = float(np.mean(stamps < start_us - EARLY_S * 1e6)), int(np.quantile(stamps, 0.01))
     if early < 0.05 and first - start_us < JUMP_US:
         return start_us
-    skipped.append(f"its header says it began at {start_us * 1e-6:.1f} s, its rows do not; its first row counts")
+    skipped.append(f"start {start_us * 1e-6:.1f} s in its header contradicts its rows; the first row is used")
     return int(stamps.min())
 
 
@@ -179,9 +179,9 @@ def _is_number(value: Any) -> bool:
 
 
 def _lay(row: Row, topic: Topic) -> tuple[np.ndarray, np.ndarray, int] | None:
-    """Return times, values and how many rows were refused; None where the log lacks what the row reads.
+    """Return times, values and number of rejected rows; None if the log lacks a field of the row.
 
-    Rows are independent of each other, so a long topic is laid out in blocks, whose intermediate results need no room.
+    Rows are independent, so a long topic is processed in blocks to limit memory.
     """
     blocks = []
     for begin in range(0, max(len(topic), 1), _BLOCK):

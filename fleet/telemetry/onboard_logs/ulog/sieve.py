@@ -1,7 +1,7 @@
-"""A sieve for ULog bytes: only whole, well-formed messages of wanted topics pass; the rest is counted and said.
+"""Filter of ULog bytes: pass only complete, valid messages of wanted topics; count and report the rest.
 
-pyulog trusts what it reads: one damaged byte may cost it the rest of a file, or all of it. Behind this sieve it meets
-nothing it cannot read. Streaming: memory is one buffer of the file.
+pyulog does not validate its input: one damaged byte can lose the rest of a file, or all of it. This filter passes only
+bytes that pyulog can read. It streams: memory is one buffer of the file.
 Source: PX4 guide, "ULog file format".
 """
 
@@ -17,37 +17,37 @@ from fleet.telemetry.onboard_logs.ulog.formats import Formats, could_be, readabl
 
 MAGIC = b"ULog\x01\x12\x35"
 HEADER = 16  # bytes: magic, version, start stamp
-LARGEST = 1 << 29  # bytes read of one file; more is left unread and said
-HOPELESS = 1 << 26  # bytes without a good message after which the rest is left unread
-JUMP_US = 60_000_000  # a stamp this far from the last one is believed only in company
-LATEST_US = 1 << 52  # no stamp is later than a century of flight
-COMPANY = 20  # as many in a row that jump
+LARGEST = 1 << 29  # maximum bytes read of one file
+HOPELESS = 1 << 26  # bytes without a valid message that end reading
+JUMP_US = 60_000_000  # larger time jumps need confirmation [us]
+LATEST_US = 1 << 52  # later stamps are invalid [us]
+COMPANY = 20  # consecutive stamps that confirm a time jump
 _BLOCK = 1 << 20
-_WIDEST = 3 + 0xFFFF  # bytes of the largest message
+_WIDEST = 3 + 0xFFFF  # bytes of the longest message
 _SYNC = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
 _TYPES = frozenset(b"ABCDFILMOPQRS")
 _A_TYPE = re.compile(rb"[ABCDFILMOPQRS]")
-_PASSED = frozenset(b"ACDFILOP")  # pyulog needs no other
+_PASSED = frozenset(b"ACDFILOP")  # types that pyulog requires
 _DATA = ord("D")
 _LEVELS = frozenset(b"01234567")
 _head = struct.Struct("<HB").unpack_from
 _short = struct.Struct("<H").unpack_from
 _stamp = struct.Struct("<Q").unpack_from
-_MOST_PLACES = 8  # damaged places named
-_MOST_SLOW = 2_000_000  # messages that are no plain row; more of them are left unread
-_MOST_WANTED = 1 << 27  # bytes of rows of wanted topics that are kept: half an hour at the highest rates, else two
-_MOST_SMALL = dict.fromkeys(b"CILOP", (20000, 1 << 22))  # messages of a kind that pass, and their bytes
-_MOST_SEARCHED = 2_000_000_000  # bytes looked at in vain in search of a message, each place counted as `_PLACE` more
+_MOST_PLACES = 8  # damaged positions reported
+_MOST_SLOW = 2_000_000  # maximum number of messages parsed individually
+_MOST_WANTED = 1 << 27  # bytes of wanted rows: 30 min at the highest rates, else 2 h
+_MOST_SMALL = dict.fromkeys(b"CILOP", (20000, 1 << 22))  # maximum messages of a type and their bytes
+_MOST_SEARCHED = 2_000_000_000  # maximum search cost: bytes examined, plus `_SEARCH_COST` per position
 _PLACE = 1000
 
 
 class Sieve:
-    """The file object pyulog reads: a header, then good messages alone."""
+    """File object for pyulog: a header, then only valid messages."""
 
     def __init__(self, opener: Callable[[], IO[bytes]], wanted: frozenset[str], skipped: list[str]) -> None:
         self.start_us = 0
         self.formats = Formats(wanted)
-        self.messages = 0  # good ones seen, wanted or not
+        self.messages = 0  # valid messages, wanted or not
         self._skipped, self._file = skipped, opener()
         self._raw, self._at, self._base, self._ended = bytearray(), 0, 0, False  # base: file offset of raw[0]
         self._good, self._read_at = bytearray(), 0
@@ -57,13 +57,13 @@ class Sieve:
         self._strangers = 0
         self._dropped: Counter[str] = Counter()
         self._places = 0
-        self._damage: list[int] | None = None  # from, to
+        self._damage: list[int] | None = None  # start, end
         self._in_data = False
-        self._slow = self._wanted = self._searched = 0  # so far, as `_MOST_…`
+        self._slow = self._wanted = self._searched = 0  # running totals of the limits `_MAX_…`
         self._small: Counter[int] = Counter()
         self._small_bytes: Counter[int] = Counter()
 
-    # --- what pyulog calls ---
+    # --- file interface for pyulog ---
 
     def read(self, n: int) -> bytes:
         """Return the next `n` bytes, fewer at the end."""
@@ -71,7 +71,7 @@ class Sieve:
             batch = next(self._source, None)
             if batch is None:
                 break
-            del self._good[: max(self._read_at - _WIDEST, 0)]  # pyulog steps back over one message
+            del self._good[: max(self._read_at - _WIDEST, 0)]  # pyulog seeks back by one message
             self._read_at = min(self._read_at, _WIDEST)
             self._good += batch
         data = bytes(self._good[self._read_at : self._read_at + n])
@@ -79,22 +79,22 @@ class Sieve:
         return data
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """Step back by `offset` from here, at most one message; nothing else is asked for."""
+        """Seek relative to the current position, back by at most one message; pyulog needs no other seek."""
         self._read_at = max(self._read_at + offset, 0) if whence == 1 else self._read_at
         return self._read_at
 
     def tell(self) -> int:
-        """Return a position of no meaning."""
+        """Return the position in the buffer of passed bytes."""
         return self._read_at
 
     def close(self) -> None:
-        """Close the file beneath."""
+        """Close the file."""
         self._file.close()
 
     # --- raw bytes ---
 
     def _fill(self, need: int) -> bool:
-        """Have `need` bytes from here on, if the file has them."""
+        """Buffer at least `need` bytes from here on; return whether the file has them."""
         while len(self._raw) - self._at < need and not self._ended:
             del self._raw[: self._at]
             self._base, self._at = self._base + self._at, 0
@@ -107,9 +107,9 @@ class Sieve:
             block = self._file.read(min(_BLOCK, room)) if room > 0 else b""
         except (OSError, EOFError, lzma.LZMAError, zlib.error) as error:
             block = b""
-            self._say(f"the file itself is damaged ({error}); what came before is used")
+            self._say(f"the file is damaged ({error}); the data before are used")
         if room <= 0:
-            self._say(f"it is longer than {LARGEST >> 20} MiB, the rest was left unread; cut it")
+            self._say(f"it is longer than {LARGEST >> 20} MiB, the rest was not read; split it")
         self._ended = not block
         return block
 
@@ -117,21 +117,21 @@ class Sieve:
     def _offset(self) -> int:
         return self._base + self._at
 
-    # --- the walk ---
+    # --- parsing ---
 
     def _walk(self) -> Iterator[bytes]:
         yield self._header()
         out, good = bytearray(), self._offset
         while self._fill(3):
             if why := self._too_much():
-                self._say(f"{why} up to byte {self._offset}, the rest was left unread; cut it")
+                self._say(f"{why} up to byte {self._offset}, the rest was not read; split it")
                 break
             message = self._run()
             if not message and self._fill(3):
                 message = self._next()
             if message is None:
                 if self._offset - good > HOPELESS:
-                    self._say(f"{HOPELESS >> 20} MiB without a message from byte {good} on, the rest was left unread")
+                    self._say(f"{HOPELESS >> 20} MiB without a message from byte {good} on, the rest was not read")
                     break
                 continue
             good = self._offset
@@ -143,12 +143,12 @@ class Sieve:
         self._report()
 
     def _too_much(self) -> str:
-        """Say why no more of it is read; empty: nothing speaks against it."""
+        """Return the limit that ends reading, or an empty string."""
         if self._wanted > _MOST_WANTED:
-            return f"over {_MOST_WANTED >> 20} MiB of rows of the topics needed"
+            return f"over {_MOST_WANTED >> 20} MiB of rows of required topics"
         if self._slow > _MOST_SLOW:
-            return f"over {_MOST_SLOW:,} messages that are no rows"
-        return "too much that looks like a message and is none" if self._searched > _MOST_SEARCHED else ""
+            return f"over {_MOST_SLOW:,} messages other than rows"
+        return "too many invalid messages" if self._searched > _MOST_SEARCHED else ""
 
     def _header(self) -> bytes:
         whole = self._fill(HEADER)
@@ -162,7 +162,7 @@ class Sieve:
         return MAGIC + b"\x01" + struct.pack("<Q", self.start_us)
 
     def _run(self) -> bytes | None:
-        """Step over the rows that follow as long as all is well: nearly all of a log, so it is kept lean."""
+        """Skip valid rows and return the wanted ones; optimised, because a log is nearly all rows."""
         raw, at, end, topics, now = self._raw, self._at, len(self._raw), self.formats.topics, self._now_us
         out = bytearray()
         if self._restarts or now is None:
@@ -185,11 +185,11 @@ class Sieve:
         if at > self._at:
             self._tell_damage()
             self._at, self._now_us = at, now
-            self._strangers = 0 if out else self._strangers  # rows of unwanted topics say nothing of time
+            self._strangers = 0 if out else self._strangers  # rows of unwanted topics have no checked time
         return bytes(out)
 
     def _next(self) -> bytes | None:
-        """Step over one message, or over damage; return what may pass, empty where it may not; None for damage."""
+        """Skip one message or damage; return the bytes to pass, empty for none; None for damage."""
         self._slow += 1
         size, kind = _head(self._raw, self._at)
         end = self._offset + 3 + size
@@ -211,14 +211,14 @@ class Sieve:
         return None
 
     def _restart(self) -> bytes:
-        """Go on where data were appended after a crash; the message before was cut."""
+        """Continue at data appended after a crash; the previous message is truncated."""
         step = self._restarts.pop(0) - self._offset
         if step > 0 and self._fill(step):
             self._at += step
         return b""
 
     def _is_foreign(self, kind: int, size: int) -> bool:
-        """Tell whether it may be a good message we do not know: of a newer kind, or of a topic whose format is lost."""
+        """Return whether it may be a valid message of an unknown type, or of a topic with a lost format."""
         if kind == _DATA and size > 2 and self._fill(5):
             return _short(self._raw, self._at + 3)[0] not in self.formats.topics
         return size > 0 and kind not in _TYPES
@@ -227,7 +227,7 @@ class Sieve:
         return self._fill(length + 3) and self._raw[self._at + length + 2] in _TYPES
 
     def _resync(self) -> None:
-        """Step to the next message that is good, at most one buffer further."""
+        """Skip to the next valid message, at most one buffer further."""
         since = self._offset
         self._fill(_WIDEST)
         found = len(self._raw) - 2 if len(self._raw) - self._at > 2 else len(self._raw)
@@ -258,14 +258,14 @@ class Sieve:
         if self._damage:
             self._places += 1
             if self._places <= _MOST_PLACES:
-                self._say(f"bytes {self._damage[0]} to {self._damage[1]} are damaged and were stepped over")
+                self._say(f"bytes {self._damage[0]} to {self._damage[1]} are damaged and were skipped")
             self._damage = None
 
     def _judge(self, kind: int, body: bytes) -> bytes | None:
-        """Return the bytes that may pass: empty for a good message nobody needs, None for a bad one."""
+        """Return the bytes to pass: empty for a valid unwanted message, None for an invalid one."""
         if kind == _DATA:
             return self._data(body)
-        if kind == ord("B") and self.messages == 0 and 40 <= len(body) < 100:  # anywhere else it is damage
+        if kind == ord("B") and self.messages == 0 and 40 <= len(body) < 100:  # only valid as the first message
             self._flags(body)
             return b""
         if not _is_good(kind, body, self.formats):
@@ -283,7 +283,7 @@ class Sieve:
             self._small[kind] += 1
             self._small_bytes[kind] += len(body)
             if self._small[kind] > _MOST_SMALL[kind][0] or self._small_bytes[kind] > _MOST_SMALL[kind][1]:
-                self._dropped[f"messages of kind {chr(kind)}, more than any log has,"] += 1
+                self._dropped[f"messages of kind {chr(kind)} beyond the limit"] += 1
                 return b""
         return struct.pack("<HB", len(body), kind) + body if kind in _PASSED else b""
 
@@ -294,13 +294,13 @@ class Sieve:
         if not topic.wanted:
             return b""
         if not self._in_time(_stamp(body, 2 + topic.stamp_at)[0]):
-            self._dropped[f"rows of {topic.name} with a stamp far off"] += 1
+            self._dropped[f"rows of {topic.name} with an implausible stamp"] += 1
             return b""
         self._wanted += topic.least + 5
         return struct.pack("<HB", topic.least + 2, _DATA) + body[: topic.least + 2]
 
     def _in_time(self, stamp: int) -> bool:
-        """Return whether a stamp goes on from the last one, or many agree that time jumped."""
+        """Return whether a stamp continues from the last one; enough consecutive jumps set a new time."""
         if stamp < LATEST_US and (self._now_us is None or abs(stamp - self._now_us) < JUMP_US):
             self._now_us = stamp if self._now_us is None else max(stamp, self._now_us)
             self._strangers = 0
@@ -312,7 +312,7 @@ class Sieve:
 
     def _flags(self, body: bytes) -> None:
         if body[8] & ~1 or any(body[9:16]):
-            self._say("its flags ask for a newer reader; it was read all the same")
+            self._say("its flags require a newer reader; it was read anyway")
         if body[8] & 1:
             self._restarts = sorted(o for o in struct.unpack("<3Q", body[16:40]) if o > self._offset)
 
@@ -322,13 +322,13 @@ class Sieve:
     def _report(self) -> None:
         self._tell_damage()
         if self._places > _MOST_PLACES:
-            self._say(f"… and {self._places - _MOST_PLACES} more damaged places")
+            self._say(f"… and {self._places - _MOST_PLACES} more damaged ranges")
         for what, n in self._dropped.most_common(_MOST_PLACES):
-            self._say(f"{n} {what} left out")
+            self._say(f"{n} {what} skipped")
 
 
 def _is_good(kind: int, body: bytes, formats: Formats) -> bool:
-    """Return whether a message's bytes are what its kind must be."""
+    """Return whether the bytes are valid for their message type."""
     if kind == _DATA:
         topic = formats.topics.get(_short(body)[0]) if len(body) > 2 else None
         return topic is not None and topic.least <= len(body) - 2 <= topic.most

@@ -1,4 +1,4 @@
-"""A ULog topic as the rows of the table read it: fields as arrays, other topics at the same times."""
+"""View of a ULog topic for the table: fields as arrays, other topics interpolated to the same times."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,20 +6,20 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import median_filter
 
-BRIDGE_S = 1.5  # a value between two rows further apart than this is unknown [s]
-_STRAY_S = 1.0  # a stamp this far from its neighbours in the file is damaged [s]
+BRIDGE_S = 1.5  # maximum gap for interpolation [s]
+_STRAY_S = 1.0  # maximum difference of a stamp from its neighbours in the file [s]
 
 
 class Topic:
-    """One topic: `t` [s], and each field an attribute; `q[0]`, `q[1]` … make one tuple, `current.lat` nests."""
+    """One topic: `t` [s], and fields as attributes; `q[0]`, `q[1]` … form a tuple, `current.lat` is nested."""
 
     def __init__(self, t: np.ndarray, data: Mapping[str, np.ndarray], others: Mapping[str, "Topic"]) -> None:
         self.t, self._data, self._others = t, data, others
-        self._at: np.ndarray | None = None  # times to give values at, where not its own
+        self._at: np.ndarray | None = None  # times to interpolate to; None: own times
         self._prefix = ""
 
     def __getattr__(self, name: str) -> Any:
-        """Return a field; one the log lacks is an AttributeError, and the row that asks does not apply."""
+        """Return a field; a missing field raises AttributeError, so that the table row does not apply."""
         if name.startswith("_"):
             raise AttributeError(name)
         key = self._prefix + name
@@ -33,17 +33,17 @@ class Topic:
         raise AttributeError(name)
 
     def beside(self, name: str) -> "Topic":
-        """Return another topic with its values at the times of this one; the second instance is `name.1`."""
+        """Return another topic interpolated to the times of this one; the second instance is `name.1`."""
         if name not in self._others:
             raise AttributeError(name)
         return self._others[name]._like(self.t, "")
 
     def strip(self) -> None:
-        """Return the fields; the times stay."""
+        """Drop the fields but keep the times."""
         self._data = {}
 
     def part(self, begin: int, end: int) -> "Topic":
-        """Return some of its rows, the other topics whole."""
+        """Return a range of its rows, with the other topics complete."""
         return Topic(self.t[begin:end], {name: values[begin:end] for name, values in self._data.items()}, self._others)
 
     def __len__(self) -> int:
@@ -60,7 +60,7 @@ class Topic:
 
 
 def _between(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate; nan outside, and between rows that are too far apart."""
+    """Interpolate linearly; NaN outside and in gaps."""
     if len(t) < 2:
         return np.full(len(at), np.nan)
     k = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
@@ -69,7 +69,7 @@ def _between(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def in_order(stamp_us: np.ndarray) -> np.ndarray:
-    """Return the indices of rows in order of time, each time once, without stamps that stray."""
+    """Return row indices in time order, without duplicate or outlying stamps."""
     if len(stamp_us) < 2 or (np.diff(stamp_us) > 0).all():
         return np.arange(len(stamp_us))
     near = np.abs(stamp_us - median_filter(stamp_us, 5, mode="nearest")) < _STRAY_S * 1e6
