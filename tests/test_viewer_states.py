@@ -55,7 +55,7 @@ def test_more_uavs_than_fit_are_counted_once_each(clock: Clock, monkeypatch: pyt
         for uav in (7, 8, 5_000_000, -1, 9, 10):
             bus.publish(Status(uav=uav, t=T))
     assert len(feed.vehicles) == 3 and len(feed.away) == 4
-    assert "Too many UAVs" in notices(feed, "", "", DARK) and ", 4 more are heard" in notices(feed, "", "", DARK)
+    assert "Too many UAVs" in notices(feed, "", "", DARK) and ", 4 more are received" in notices(feed, "", "", DARK)
     assert "3 UAVs" in summary(feed.all(), feed, DARK, clock.now)
 
 

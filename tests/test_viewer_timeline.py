@@ -310,7 +310,7 @@ def test_every_button_does_something(flown) -> None:
 def laid(told: Forecast, path: np.ndarray) -> Forecast:
     """Give the same prediction with another path."""
     other = Forecast(told.message, told.place, told.heard)
-    vars(other)["_laid"] = told.ahead, path, told.tube
+    vars(other)["_scene_arrays"] = told.ahead, path, told.tube
     return other
 
 

@@ -164,7 +164,7 @@ class Tape:
         """Return the newest prediction there was at a time; of those asked for before, the laid out path is let go."""
         found = next((one for one in reversed(self.told) if one.t <= t + 0.5), None)
         if self._asked is not None and self._asked is not found:
-            vars(self._asked).pop("_laid", None)
+            vars(self._asked).pop("_scene_arrays", None)
         self._asked = found
         return found
 
