@@ -61,9 +61,7 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
     """
     # A page may close while it is drawn: its queued messages are discarded without a warning.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-    logging.getLogger("websockets.server").setLevel(
-        logging.WARNING
-    )  # it logs page requests as rejected connections
+    logging.getLogger("websockets.server").setLevel(logging.WARNING)  # it logs page requests as rejected connections
     _read_icons()
     with quiet(), _guarded({*HOME, host.strip("[]").lower(), *filter(None, [name.lower()])}, anyone=_is_any(host)):
         server = viser.ViserServer(host=host, port=port, verbose=False)
