@@ -99,7 +99,7 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
     verdict = vehicle.model.verdict if vehicle.model is not None else None
     if verdict is not None:
         colour = palette.verified if verdict.outcome is Outcome.VERIFIED else palette.identifying
-        least = f", threshold {verdict.threshold:.0f} %" if verdict.threshold > 0 else ""  # optional
+        least = f", threshold {verdict.threshold:.0f} %" if verdict.threshold > 0 else ""
         cards.append(
             f'<div class="say" style="border-color:{colour}"><b>{escape(verdict.outcome.value.replace("_", " "))}</b> '
             f'<span class="soft">newest verification, number {verdict.tries}{least}</span><br>'

@@ -77,9 +77,7 @@ class Land:
         names = " and ".join(raster.name for raster in (self._terrain, self._imagery) if raster is not None)
         extent = self._covered(place)
         if extent is None:
-            self.sentence = (
-                f"{names}: found no data within {REACH_M / 1000:.0f} km of the fleet; use files of its area."
-            )
+            self.sentence = f"{names}: found no data within {REACH_M / 1000:.0f} km of the fleet; use other files."
             return
         self._extent, self._form = np.array(extent), shape(self._terrain, place, extent, ground)
         self._contours = contours(self._form) if self._terrain is not None else self._contours
