@@ -239,7 +239,7 @@ def test_hostile_words_stay_words(page, errors: list[str]) -> None:
 
 
 def test_letters_without_end_and_places_that_are_none_break_nothing(page, errors: list[str]) -> None:
-    for uav, words in ((LONG, "y" * 400), (ABROAD, "km from the fleet's first"), (NOWHERE, "mean fit")):
+    for uav, words in ((LONG, "y" * 400), (ABROAD, "km from the scene origin"), (NOWHERE, "mean fit")):
         page.locator(f'tr[data-uav="{uav}"]').dispatch_event("pointerdown")
         selected(page, f"UAV-{uav:03d}")
         page.locator(".uav .say", has_text=words).first.wait_for(timeout=8_000)
@@ -249,7 +249,7 @@ def test_letters_without_end_and_places_that_are_none_break_nothing(page, errors
 
 def test_another_time_is_shown_and_now_again(page, errors: list[str]) -> None:
     page.get_by_role("button", name="Pause").click()
-    page.get_by_text("Not live: this is").wait_for(timeout=8_000)
+    page.get_by_text("Not live: showing").wait_for(timeout=8_000)
     at = page.locator(".time b.now")
     paused, bar = at.inner_text(), page.locator(".strip").bounding_box()
     page.mouse.click(bar["x"] + 0.5 * bar["width"], bar["y"] + 0.5 * bar["height"])
@@ -351,4 +351,4 @@ def test_a_taken_port_is_a_sentence(router: str, free_port: int) -> None:
         env = {**os.environ, "PYTHONPATH": str(ROOT)}
         ended = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=30, check=False)
     assert ended.returncode == 2 and ended.stdout == ""
-    assert untimed(ended.stderr)[0].startswith(f"viewer: --port: found {free_port} taken")
+    assert untimed(ended.stderr)[0].startswith(f"viewer: --port: found {free_port} in use")

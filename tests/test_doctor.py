@@ -67,9 +67,9 @@ def test_a_healthy_fleet_is_told_line_by_line() -> None:
         "gateways: gs: 4 aircraft on 1 links",
         "clocks: m1: within 0.2 s of this machine's",
         "clocks: m2: within 0.2 s of this machine's",
-        "versions: all 3 processes run the sources that are here",
-        f"owners: {ONE} on m1: writes for 0-1, may hold 0-9",
-        f"owners: {TWO} on m2: writes for 2-3, may hold 0-9",
+        "versions: all 3 processes have the release of this command",
+        f"owners: {ONE} on m1: owns 0-1, id range 0-9",
+        f"owners: {TWO} on m2: owns 2-3, id range 0-9",
         "orphans: none of 4 aircraft",
     ]
 
@@ -82,16 +82,16 @@ def of(*said: Claim, **more: object) -> MemoryBus:
 FOUR = range(4)
 WRONG: list[tuple[Callable[[], MemoryBus], str, str]] = [  # made when they are looked at: clocks run on
     (lambda: fleet(claim(ONE, (0, 1, 2)), claim(TWO, (2, 3))), BAD, f"uav-2: claimed by {ONE} and {TWO}; stop one"),
-    (lambda: fleet(claim(ONE, (0, 1)), claim(TWO, ())), BAD, "uav 2-3: in a worker's range, claimed by none; rest"),
-    (lambda: of(claim(ONE, (0, 1)), uavs=(0, 1, 77, 78)), BAD, "uav 77-78: in no worker's range; start"),
-    (lambda: fleet(claim(ONE, FOUR)), BAD, f"{TWO} is present and does not answer: frozen"),
-    (lambda: fleet(claim(ONE, FOUR), live=[]), BAD, f"{ONE}: claims without being present; restart"),
+    (lambda: fleet(claim(ONE, (0, 1)), claim(TWO, ())), BAD, "uav 2-3: in a worker range but not claimed; rest"),
+    (lambda: of(claim(ONE, (0, 1)), uavs=(0, 1, 77, 78)), BAD, "uav 77-78: in no worker range; start"),
+    (lambda: fleet(claim(ONE, FOUR)), BAD, f"{TWO} is live but does not answer: process or machine frozen"),
+    (lambda: fleet(claim(ONE, FOUR), live=[]), BAD, f"{ONE}: claims without a liveliness token; restart"),
     (lambda: of(claim(ONE, FOUR, bare=(2,))), NOTE, "uav 2 without past telemetry"),
-    (lambda: of(claim(ONE, FOUR, t=time.time() - 9.0)), BAD, "m1: 9.0 s behind .*; let both follow"),
+    (lambda: of(claim(ONE, FOUR, t=time.time() - 9.0)), BAD, "m1: 9.0 s behind .*; synchronise both"),
     (lambda: of(claim(ONE, FOUR, t=time.time() + 0.6)), NOTE, "m1: 0.6 s ahead of this machine's"),
-    (lambda: of(claim(ONE, FOUR, code="other")), NOTE, "twin_worker on m1: other sources .* install"),
-    (lambda: of(claim(ONE, FOUR), code="x"), NOTE, "gateway on gs: other sources than here"),
-    (lambda: fleet(live=[]), NOTE, "workers: none answers; start `twin_worker`"),
+    (lambda: of(claim(ONE, FOUR, code="other")), NOTE, "twin_worker on m1: other release .* install"),
+    (lambda: of(claim(ONE, FOUR), code="x"), NOTE, "gateway on gs: other release than here"),
+    (lambda: fleet(live=[]), NOTE, "workers: none found; start `twin_worker`"),
 ]
 
 
@@ -103,7 +103,7 @@ def test_what_is_wrong_is_found_with_its_cure(make: Callable[[], MemoryBus], gra
 
 def test_a_release_that_all_have_but_this_machine_is_not_taken_for_a_mixture() -> None:
     bus = of(claim(ONE, FOUR, code="other"), code="other")
-    assert found(bus, NOTE) == ["versions: all 2 processes are of one release, this is another; install theirs"]
+    assert found(bus, NOTE) == ["versions: all 2 processes have one release, this command another; install theirs"]
 
 
 def test_the_port_our_own_gateway_has_is_no_finding() -> None:
@@ -122,8 +122,8 @@ def test_the_clock_of_a_gateways_machine_counts_too() -> None:
 def test_two_gateways_of_one_aircraft_and_none_at_all() -> None:
     bus = of(claim(ONE, FOUR))
     bus.answer(Account, lambda *_: [(Account(t=1.0, uavs=(3, 9), machine="gs2", code=SOURCES), None)])
-    assert found(bus, BAD) == ["gateways: two publish uav 3; give one of them another offset (#offset=), or stop it"]
-    assert found(MemoryBus(), NOTE)[0].startswith("gateways: none answers; start `gateway`")
+    assert found(bus, BAD) == ["gateways: two gateways publish uav 3; change the offset of one (#offset=), or stop it"]
+    assert found(MemoryBus(), NOTE)[0].startswith("gateways: none found; start `gateway`")
 
 
 def test_a_handover_under_way_is_no_fault() -> None:
@@ -161,13 +161,15 @@ def test_certificates_are_judged_by_their_end_and_the_fleet_behind_them_is_seen(
     with open_router(Entry(at, certificates=site)):
         code, out = shown(capsys, f"--config={file}")
     assert code == 0
-    assert out.count("certificates") >= 7 and "the router's: good until" in out and "off line" in out
-    assert "gateways       none answers" in out
+    assert out.count("certificates") >= 7 and "router: valid until" in out and "offline" in out
+    assert "gateways       none found" in out
 
     soon = expired(site, "viewer", tmp_path / "soon", ended=timedelta(days=-3))
     (soon / "worker.key").chmod(0o644)
     old = {line.sentence: line.grade for line in door.papers(Entry(at, "tools", soon))}
-    assert any(g == NOTE and "viewer: ends on" in s and "renew it: certificates.sh role" in s for s, g in old.items())
+    assert any(
+        g == NOTE and "viewer: expires on" in s and "renew it: certificates.sh role" in s for s, g in old.items()
+    )
     assert any(g == BAD and "chmod 640" in s for s, g in old.items())
     gone = [
         one for one in door.papers(Entry(at, "viewer", expired(site, "viewer", tmp_path / "old"))) if one.grade == BAD
@@ -195,7 +197,7 @@ def test_why_a_router_is_not_believed_decides_what_helps(site: Path, tmp_path: P
 def test_a_network_in_the_clear_is_noted(site: Path) -> None:
     assert [one.grade for one in door.papers(Entry())] == [OK]
     (note,) = door.papers(Entry("tcp/10.1.2.3:7447", passwords=make_passwords(site)))
-    assert note.grade == NOTE and "in the clear, known by passwords; --config" in note.sentence
+    assert note.grade == NOTE and "unencrypted, password authentication; use --config" in note.sentence
 
 
 def test_findings_are_json_too(capsys: pytest.CaptureFixture[str]) -> None:

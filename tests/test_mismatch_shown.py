@@ -73,7 +73,7 @@ def test_the_viewer_says_it(shown):
     live, beside, _ = shown
     told = live.first(Found.NAMED)
     page = about(live.feed.one(UAV), DARK, live.feed._clock())
-    assert "mismatch named" in page and told.causes[0].name in page and "predicting with it" in page
+    assert "mismatch named" in page and told.causes[0].name in page and "included in the prediction model" in page
     assert "mismatch" not in about(beside.feed.one(UAV), DARK, beside.feed._clock())
 
 

@@ -244,7 +244,7 @@ def test_what_comes_over_the_bus_is_escaped_everywhere(clock: Clock) -> None:
 
 def test_who_has_no_prediction_is_told_why(clock: Clock) -> None:
     feed, _, bus = feed_of(clock, 2)
-    assert "before a model is verified" in " ".join(why(feed.vehicles[1], clock.now))
+    assert "needs a verified model" in " ".join(why(feed.vehicles[1], clock.now))
     assert "window has 41 samples" in about(feed.vehicles[1], DARK, clock.now)
     bus.publish(Status(uav=1, t=T, link=Link.LOST, sentence="no heartbeat for 6 s"))
     clock.now += 6
@@ -254,16 +254,16 @@ def test_who_has_no_prediction_is_told_why(clock: Clock) -> None:
 
 def test_the_panel_says_measured_coverage(clock: Clock) -> None:
     feed, _, _ = feed_of(clock, 1)
-    assert "90 % tube held 91 %, n = 412" in facts(feed.vehicles[0], clock.now)
+    assert "90 % region: coverage 91 %, n = 412" in facts(feed.vehicles[0], clock.now)
 
 
 def test_the_law_and_its_parameters_are_shown_by_how_each_is_known() -> None:
     shown = law(Controller(law="L<1>", received={"NAVL1_PERIOD": 17.0}, default={"TECS_TIME_CONST": 5.0}))
-    assert "L&lt;1&gt;" in shown and "told by the autopilot" in shown and "NAVL1_PERIOD 17" in shown
+    assert "L&lt;1&gt;" in shown and "received from the autopilot" in shown and "NAVL1_PERIOD 17" in shown
     assert shown.index("assumed: the autopilot&#x27;s default" if "&#x27;" in shown else "assumed") < shown.index(
         "TECS"
     )
-    assert "learnt from flight" not in shown and law(None) == ""
+    assert "identified in flight" not in shown and law(None) == ""
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 1e300])

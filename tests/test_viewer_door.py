@@ -205,7 +205,7 @@ def test_the_page_of_another_port_opens_no_websocket(server: SimpleNamespace) ->
 
 
 def test_a_taken_port_is_refused_and_not_replaced(server: SimpleNamespace) -> None:
-    with pytest.raises(OSError, match=rf"--port: found {server.port} taken"):
+    with pytest.raises(OSError, match=rf"--port: found {server.port} in use"):
         serve("127.0.0.1", server.port)
 
 

@@ -151,7 +151,7 @@ STORIES = {
     "home alone is no mission": ([Mission(uav=7, t=T, items=(Item(seq=0, command=16),), complete=True)], []),
     "an alert is raised once and withdrawn once": (
         [alert(k, AlertKind.GROUND, active=k < 3, sentence="uav-7: ground in 8 s") for k in range(5)],
-        [(0, Kind.ALERT, "ground in 8 s"), (3, Kind.EASED, "ground is over")],
+        [(0, Kind.ALERT, "ground in 8 s"), (3, Kind.EASED, "ground cleared")],
     ),
     "conflicts with two others are told apart": (
         [
@@ -184,8 +184,8 @@ STORIES = {
         [
             (0, Kind.NO_MODEL, "no model yet: below threshold"),
             (4, Kind.VERIFIED, "model verified: mean fit 88 %"),
-            (20, Kind.DOUBTED, "12 s without a sound try (diverged); an earlier model stays in force"),
-            (28, Kind.SOUND, "newest try sound again"),
+            (20, Kind.DOUBTED, "no verification for 12 s (diverged); an earlier model stays active"),
+            (28, Kind.SOUND, "model verified again"),
         ],
     ),
     "verdicts that alternate are not told one by one": (
@@ -204,18 +204,18 @@ STORIES = {
         [legs(0, 0, 3), mission(5), legs(1, 1, 2, 2)],
         [
             (2, Kind.ITEM, "item 3"),
-            (5, Kind.MISSION, "a mission on board, 3 items"),
+            (5, Kind.MISSION, "mission on board, 3 items"),
             (0, Kind.ITEM, "item 1: take-off"),
             (2, Kind.ITEM, "item 2: command 999"),
         ],
     ),
     "the same mission read twice, and another": (
         [mission(0), mission(1, frame=6, home=584.0), mission(2, complete=False, alt_m=9.0), mission(3, alt_m=70.0)],
-        [(0, Kind.MISSION, "a mission on board, 3 items"), (3, Kind.MISSION, "another mission on board, 3 items")],
+        [(0, Kind.MISSION, "mission on board, 3 items"), (3, Kind.MISSION, "new mission on board, 3 items")],
     ),
     "a mission with no number for a height is no other one every time": (
         [mission(0, alt_m=NAN), mission(10, alt_m=NAN)],
-        [(0, Kind.MISSION, "a mission on board, 3 items")],
+        [(0, Kind.MISSION, "mission on board, 3 items")],
     ),
     "times that cannot be": ([status(NAN), status(1e300, "RTL"), status(-1e11, "LAND", armed=False)], []),
 }

@@ -58,7 +58,7 @@ def test_the_flight_is_a_page_that_needs_nobody(flown) -> None:
     assert data is not None and len(base64.b64decode(data[1])) > 20_000 and len(text) < 8_000_000
     assert "<title>ParaUAV" in text and shares == sorted(shares) and shares[-1] == 1.0
     assert len(shares) == pytest.approx(50, abs=3)  # two instants a second
-    with pytest.raises(ValueError, match="export: found nothing kept of uav-9"):
+    with pytest.raises(ValueError, match="export: found no recording of uav-9"):
         Film(feed, one._tapes, DARK).html(9)
 
 
@@ -83,7 +83,7 @@ def test_what_goes_wrong_is_said_on_the_page(flown) -> None:
     client, chosen = MagicMock(), [None]
     export = Export(client, feed, one._tapes, DARK, lambda: chosen[0])
     export._hand(export._table)
-    assert "nobody selected" in export._said.content and not client.send_file_download.called
+    assert "found no selection" in export._said.content and not client.send_file_download.called
     chosen[0] = 0
     export._hand(export._table)
     name, data = client.send_file_download.call_args.args

@@ -117,7 +117,7 @@ def test_a_worker_that_died_is_not_believed_for_ever(clock: Clock) -> None:
     clock.now += ABANDONED_S + 1
     bus.publish(PretendUav(0).sample(T, T + 31))
     assert feed.all()[0].state(clock.now) is State.UNCLAIMED
-    assert "No worker has spoken" in " ".join(why(feed.all()[0], clock.now))
+    assert "No worker result for this UAV for" in " ".join(why(feed.all()[0], clock.now))
     bus.publish(FleetState(t=T + 31, rows=(FleetRow(uav=0, state=State.IDENTIFYING, verdict="", epoch=2),)))
     assert feed.all()[0].state(clock.now) is State.IDENTIFYING
 

@@ -277,4 +277,4 @@ def test_what_was_missed_is_what_happened_in_between(clock: Clock) -> None:
     assert missed(fleet, Away(T + 1, T + 60)) == [] and missed(fleet, Away(T - 60, T - 50)) == []
     page = since(fleet, Away(T - 10, T + 10), DARK, "pick({})")
     assert "<img" not in page and "pick(2@" in page
-    assert since(fleet, None, DARK, "") == "" and "nothing to tell" in since([], Away(T, T + 9), DARK, "")
+    assert since(fleet, None, DARK, "") == "" and "no events" in since([], Away(T, T + 9), DARK, "")

@@ -163,9 +163,9 @@ def test_a_worker_that_has_fallen_behind_is_told_of(clock: Clock) -> None:
         clock.now += 1.0
         bus.publish(PretendUav(0).sample(T + 10 * (k - 1), T + 10 * k))
     bus.publish(PretendUav(0).prediction(T + 40, 0.0), STAMP)  # ten times real time: 4 s behind
-    assert "fallen behind" not in about(feed.one(0), DARK, clock.now)
+    assert "overloaded" not in about(feed.one(0), DARK, clock.now)
     bus.publish(PretendUav(0).sample(T + 80, T + 99))
-    assert "59 s old: its worker has fallen behind" in about(feed.one(0), DARK, clock.now)
+    assert "59 s old: its worker is overloaded" in about(feed.one(0), DARK, clock.now)
 
 
 def test_a_slow_recording_may_breathe(clock: Clock) -> None:

@@ -55,7 +55,7 @@ def test_more_uavs_than_fit_are_counted_once_each(clock: Clock, monkeypatch: pyt
         for uav in (7, 8, 5_000_000, -1, 9, 10):
             bus.publish(Status(uav=uav, t=T))
     assert len(feed.vehicles) == 3 and len(feed.away) == 4
-    assert "Too many UAVs" in notices(feed, "", "", DARK) and ", 4 more are heard" in notices(feed, "", "", DARK)
+    assert "Too many UAVs" in notices(feed, "", "", DARK) and ", 4 more are received" in notices(feed, "", "", DARK)
     assert "3 UAVs" in summary(feed.all(), feed, DARK, clock.now)
 
 
@@ -112,7 +112,7 @@ def test_identifying_says_why_there_is_no_horizon_and_for_how_long(clock: Clock)
         bus.publish(uav.sample(T + k - 1, T + k))
         bus.publish(uav.model(T + k), STAMP)
     page = about(feed.one(1), DARK, clock.now)
-    assert "No horizon yet" in page and "window has 41 samples" in page and "heard for 45 s" in page
+    assert "No horizon yet" in page and "window has 41 samples" in page and "after 45 s of telemetry" in page
 
 
 def test_who_is_lost_is_not_said_to_have_a_slow_worker(clock: Clock) -> None:
@@ -122,10 +122,10 @@ def test_who_is_lost_is_not_said_to_have_a_slow_worker(clock: Clock) -> None:
         clock.now += 1.0
         bus.publish(PretendUav(0).sample(T + k - 1, T + k))
     behind = about(feed.one(0), DARK, clock.now)
-    assert "has fallen behind; let fewer" in behind and "recording" not in behind
+    assert "is overloaded; assign fewer" in behind and "recording" not in behind
     clock.now += 5.0
     lost = about(feed.one(0), DARK, clock.now)
-    assert "12 s old." in lost and "No sample for 5 s" in lost and "fallen behind" not in lost
+    assert "12 s old." in lost and "No sample for 5 s" in lost and "overloaded" not in lost
 
 
 def test_an_empty_page_looks_at_the_ground_and_its_first_ring() -> None:

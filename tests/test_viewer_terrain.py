@@ -106,7 +106,7 @@ def test_what_is_no_raster_is_refused_in_one_sentence(tmp_path: Path, degrees: s
     cut.write_bytes(Path(degrees).read_bytes()[:3_000])
     for text, words in (
         (str(junk), "junk.tif: found "),
-        (str(png), "plain.png: found nothing that says where it lies"),
+        (str(png), "plain.png: found no georeference"),
         (f"{png}@9,1,3,4", "found bounds 9,1,3,4"),
         (str(other), "found projection EPSG:2056"),
         (str(cut), "cut.tif: found "),
@@ -155,7 +155,7 @@ def test_a_picture_without_heights_lies_flat_and_one_of_elsewhere_is_said(tmp_pa
     assert np.allclose(page.scene.add_mesh_trimesh.call_args.args[1].vertices[:, 2], -7.1)
     abroad = Land(read(degrees, colours=False), picture)
     abroad.show(client(2), Place(HOME._replace(lat_e7=-338_000_000)), DARK, 0.0)
-    assert abroad.sentence.startswith("dem.tif and aerial.png: found nothing within 15 km")
+    assert abroad.sentence.startswith("dem.tif and aerial.png: found no data within 15 km")
 
 
 def test_contours_lie_at_whole_steps_and_are_few() -> None:

@@ -207,7 +207,7 @@ def test_the_head_says_how_much_is_kept_and_what_it_takes(flown) -> None:
     one, feed, clock = flown
     shown(one, feed, clock, 70.0)
     said = one._head(one.player.t, one._span)
-    assert "0:30 back · paused · 1:40 of 5 kept, " in said and " MB<" in said and "every 5 s" in said
+    assert "0:30 ago · paused · 1:40 of 5 UAVs recorded, " in said and " MB<" in said and "every 5 s" in said
     assert " UAVs" not in said  # the fleet's own words, which are looked for on the page
 
 
@@ -310,7 +310,7 @@ def test_every_button_does_something(flown) -> None:
 def laid(told: Forecast, path: np.ndarray) -> Forecast:
     """Give the same prediction with another path."""
     other = Forecast(told.message, told.place, told.heard)
-    vars(other)["_laid"] = told.ahead, path, told.tube
+    vars(other)["_scene_arrays"] = told.ahead, path, told.tube
     return other
 
 
@@ -335,9 +335,9 @@ def test_what_is_not_answered_yet_is_said_so(flown) -> None:
     one, feed, clock = flown
     past = shown(one, feed, clock, 98.0)[0]
     assert compare.misses(past.forecast, past.tape.path(past.then, past.then + 60), past.then) == []
-    assert "not answered yet" in strip.compared([], past.forecast.t, past.then, DARK)
-    assert "nothing was predicted" in strip.compared([], None, past.then, DARK)
-    assert "nothing was claimed 5 s ahead" in strip.compared([], past.forecast.t, past.then, DARK, 4.9)
+    assert "not yet compared" in strip.compared([], past.forecast.t, past.then, DARK)
+    assert "no prediction at this time" in strip.compared([], None, past.then, DARK)
+    assert "horizon shorter than 5 s" in strip.compared([], past.forecast.t, past.then, DARK, 4.9)
 
 
 # --- the bar ---

@@ -1,3 +1,3 @@
-"""Judgement to picture: the operator's page."""
+"""Operator page in the browser: positions, predictions and alerts of the fleet."""
 
-import fleet  # noqa: F401  before numpy and numba: it holds BLAS to one thread and names the compile cache
+import fleet  # noqa: F401  before numpy and numba: it limits BLAS to one thread and sets the compile cache

@@ -1,4 +1,4 @@
-"""The `viewer` command: serve the operator's page."""
+"""Command `viewer`: serve the operator page."""
 
 import argparse
 import gc
@@ -15,8 +15,8 @@ from viewer.scene.terrain.land import Land
 from viewer.scene.terrain.raster import read
 from viewer.server.app import App
 
-RARELY = 50_000, 10, 10  # of a crowd some ten thousand objects come and go every second, and next to none in circles
-LARGE = 48 * 1024  # less than the bus receives into: one message that waits keeps all of such a block [bytes]
+RARELY = 50_000, 10, 10  # a large fleet allocates 10,000 objects per second, almost none in cycles
+LARGE = 48 * 1024  # smaller than a receive buffer of the bus, which one queued message keeps allocated [bytes]
 EXAMPLES = """
   viewer
   viewer --port 8081 --light
@@ -27,26 +27,30 @@ EXAMPLES = """
 
 def main(argv: list[str] | None = None) -> int:
     """Run `viewer`."""
-    parser = parser_for("viewer", "Show the fleet in a browser: flown, predicted, and how far to trust it.", EXAMPLES)
+    parser = parser_for(
+        "viewer", "Show the fleet in a browser: flown paths, predictions and their confidence.", EXAMPLES
+    )
     parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080)")
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to serve on (default 127.0.0.1: this machine only; there is no password, so put an "
-        "authenticating reverse proxy before anything wider)",
+        help="address to serve on (default 127.0.0.1: this machine only; the page has no password: "
+        "use an authenticating reverse proxy for remote access)",
     )
     router_arguments(parser)
     log_arguments(parser)
     parser.add_argument(
         "--name",
         default="",
-        help="host name under which a reverse proxy shows the page; any other but this machine's own is refused",
+        help="host name of the page behind a reverse proxy; other remote host names are refused",
     )
     parser.add_argument(
-        "--terrain", metavar="FILE", help="heights of the ground in metres: GeoTIFF, or FILE@south,west,north,east"
+        "--terrain", metavar="FILE", help="ground elevation in metres: GeoTIFF, or FILE@south,west,north,east"
     )
-    parser.add_argument("--imagery", metavar="FILE", help="picture of the ground: GeoTIFF, PNG or JPEG, likewise")
-    parser.add_argument("--light", action="store_true", help="light colours, for bright surroundings")
+    parser.add_argument(
+        "--imagery", metavar="FILE", help="ground imagery: GeoTIFF, PNG or JPEG, or FILE@south,west,north,east"
+    )
+    parser.add_argument("--light", action="store_true", help="light theme, for bright surroundings")
     return guarded("viewer", run, parser.parse_args(argv))
 
 
@@ -54,17 +58,17 @@ def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C or SIGTERM.
 
     Raises:
-        ValueError: when the port is no port.
-        OSError: when the port is taken.
+        ValueError: when the port is out of range.
+        OSError: when the port is in use.
     """
     if not 0 < args.port < 65536:
-        raise ValueError(f"--port: found {args.port}, expected 1 to 65535; name another")
+        raise ValueError(f"--port: found {args.port}, expected 1 to 65535; choose another port")
     stop = stop_on_signal()
     gc.set_threshold(*RARELY)
     give_back(LARGE)
     terrain = read(args.terrain, colours=False) if args.terrain else None
     land = Land(terrain, read(args.imagery, colours=True) if args.imagery else None)
-    with connect(entry(args, VIEWER), patient=True) as bus:  # no router yet is said on the page
+    with connect(entry(args, VIEWER), patient=True) as bus:  # the page shows a missing router
         server = serve(args.host, args.port, args.name)
         try:
             app = App(bus, server, light=args.light, land=land)

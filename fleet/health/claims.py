@@ -1,4 +1,4 @@
-"""The fleet behind the router: its clocks and sources, who writes for which aircraft, which have none, which two."""
+"""Fleet checks: clocks, versions, owners of aircraft, unclaimed and doubly claimed aircraft."""
 
 import threading
 import time
@@ -12,20 +12,20 @@ from fleet.contract import Account, Claim, Status
 from fleet.health.finding import BAD, NOTE, OK, Finding
 from fleet.report.report_text import spans
 
-APART_S = 0.2  # clocks of machines further apart are said [s]
-FAR_S = 1.0  # clocks further apart confuse epochs and ages [s]
-SETTLE_S = 1.5  # a handover takes less: what is wrong twice so far apart is wrong [s]
+APART_S = 0.2  # a larger clock offset is a note [s]
+FAR_S = 1.0  # a larger clock offset breaks epochs and ages [s]
+SETTLE_S = 1.5  # longer than a handover: a problem that persists is real [s]
 
 
 class Seen:
-    """What was answered at one moment.
+    """Answers of the fleet at one time.
 
     Attributes:
-        claims: by worker
-        accounts: of gateways
-        known: ids of aircraft that gateways hear
-        late: our clock minus theirs, by machine, half the way taken off [s]
-        live: ids each present worker may hold, by worker
+        claims: claims by worker
+        accounts: accounts of gateways
+        uavs: ids of aircraft that gateways receive
+        clock_offsets: local minus remote clock, by machine, corrected for half the round trip [s]
+        live_ranges: id range of each live worker, by worker
     """
 
     def __init__(self, bus: Bus, live: dict[str, range]) -> None:
@@ -49,12 +49,12 @@ class Seen:
         return {uav: workers for uav, workers in holders.items() if len(workers) > 1}
 
     def orphans(self) -> set[int]:
-        """Return the aircraft that are heard and claimed by nobody."""
+        """Return the aircraft that are received and not claimed."""
         return self.known - {uav for claim in self.claims.values() for uav, _ in claim.held}
 
 
 def look(bus: Bus) -> Iterator[Finding]:
-    """Look twice where something is wrong: what a handover explains is gone the second time."""
+    """Check the fleet; repeat after a problem, as a handover resolves itself."""
     live: dict[str, range] = {}
     lock = threading.Lock()
 
@@ -77,7 +77,7 @@ def look(bus: Bus) -> Iterator[Finding]:
 
 def _present(seen: Seen) -> Iterator[Finding]:
     if not seen.accounts:
-        yield Finding(NOTE, "gateways", "none answers; start `gateway` with a --link to the aircraft")
+        yield Finding(NOTE, "gateways", "none found; start `gateway` with a --link to the aircraft")
     for account in seen.accounts:
         where = f"{account.machine or 'one'}: {len(account.uavs)} aircraft on {len(account.links)} links"
         sent = f", {account.unsent} messages unsent" if account.unsent else ""
@@ -85,13 +85,15 @@ def _present(seen: Seen) -> Iterator[Finding]:
     heard = Counter(uav for account in seen.accounts for uav in account.uavs)
     if both := sorted(uav for uav, count in heard.items() if count > 1):
         yield Finding(
-            BAD, "gateways", f"two publish uav {spans(both)}; give one of them another offset (#offset=), or stop it"
+            BAD,
+            "gateways",
+            f"two gateways publish uav {spans(both)}; change the offset of one (#offset=), or stop it",
         )
     if not seen.claims and not seen.live:
-        yield Finding(NOTE, "workers", "none answers; start `twin_worker` with a range of ids (--uavs)")
+        yield Finding(NOTE, "workers", "none found; start `twin_worker` with a range of ids (--uavs)")
     for worker in sorted(set(seen.live) - set(seen.claims)):
         yield Finding(
-            BAD, "workers", f"{worker} is present and does not answer: frozen, or its machine is; stop it (kill -9)"
+            BAD, "workers", f"{worker} is live but does not answer: process or machine frozen; stop it (kill -9)"
         )
 
 
@@ -102,7 +104,7 @@ def _clocks(seen: Seen) -> Iterator[Finding]:
             continue
         which = "behind" if late > 0 else "ahead of"
         grade = BAD if abs(late) > FAR_S else NOTE
-        cure = "let both follow one time server (chrony, systemd-timesyncd)"
+        cure = "synchronise both with one time server (chrony, systemd-timesyncd)"
         yield Finding(grade, "clocks", f"{machine}: {abs(late):.1f} s {which} this machine's; {cure}")
 
 
@@ -112,27 +114,27 @@ def _sources(seen: Seen) -> Iterator[Finding]:
     strange = sorted({f"{what} on {machine or 'a machine'}" for what, machine, code in told if code != SOURCES})
     if strange and len(strange) == len(told) and len({code for *_, code in told}) == 1:
         yield Finding(
-            NOTE, "versions", f"all {len(told)} processes are of one release, this is another; install theirs"
+            NOTE, "versions", f"all {len(told)} processes have one release, this command another; install theirs"
         )
     elif strange:
-        cure = "twins are not handed over between them; install the same release everywhere, and restart"
-        yield Finding(NOTE, "versions", f"{', '.join(strange)}: other sources than here; {cure}")
+        cure = "twins are not handed over between releases; install the same release everywhere and restart"
+        yield Finding(NOTE, "versions", f"{', '.join(strange)}: other release than here; {cure}")
     elif told:
-        yield Finding(OK, "versions", f"all {len(told)} processes run the sources that are here")
+        yield Finding(OK, "versions", f"all {len(told)} processes have the release of this command")
 
 
 def _owners(before: Seen, seen: Seen) -> Iterator[Finding]:
     for worker, claim in sorted(seen.claims.items()):
         may = seen.live.get(worker)
-        words = f"{worker} on {claim.machine or 'a machine'}: writes for {spans(u for u, _ in claim.held) or 'none'}"
-        words += f", may hold {may.start}-{may.stop - 1}" if may is not None else ""
+        words = f"{worker} on {claim.machine or 'a machine'}: owns {spans(u for u, _ in claim.held) or 'none'}"
+        words += f", id range {may.start}-{may.stop - 1}" if may is not None else ""
         words += ", is leaving" if claim.leaving else ""
         yield Finding(OK, "owners", words)
         if may is None:
-            yield Finding(BAD, "owners", f"{worker}: claims without being present; restart it")
+            yield Finding(BAD, "owners", f"{worker}: claims without a liveliness token; restart it")
         if claim.bare:
             yield Finding(
-                NOTE, "owners", f"{worker}: uav {spans(claim.bare)} without past telemetry; is the gateway's there?"
+                NOTE, "owners", f"{worker}: uav {spans(claim.bare)} without past telemetry; check its gateway"
             )
     for uav, workers in sorted(seen.twice().items()):
         if uav in before.twice():
@@ -144,9 +146,11 @@ def _orphans(orphans: Iterable[int], seen: Seen) -> Iterator[Finding]:
     beyond = sorted(uav for uav in orphans if not any(uav in may for may in seen.live.values()))
     if beyond:
         yield Finding(
-            BAD, "orphans", f"uav {spans(beyond)}: in no worker's range; start `twin_worker --uavs` with them in it"
+            BAD,
+            "orphans",
+            f"uav {spans(beyond)}: in no worker range; start `twin_worker --uavs` with these ids",
         )
     if left := sorted(set(orphans) - set(beyond)):
-        yield Finding(BAD, "orphans", f"uav {spans(left)}: in a worker's range, claimed by none; restart that worker")
+        yield Finding(BAD, "orphans", f"uav {spans(left)}: in a worker range but not claimed; restart that worker")
     if not beyond and not left and seen.known:
         yield Finding(OK, "orphans", f"none of {len(seen.known)} aircraft")

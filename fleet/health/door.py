@@ -1,4 +1,4 @@
-"""The way onto the bus: what we would show there, who is there, and until when that is good."""
+"""Checks of bus access: local certificates, router, and their expiry."""
 
 import socket
 import ssl
@@ -20,13 +20,13 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 def papers(at: Entry) -> Iterator[Finding]:
-    """Look at every certificate in the folder: its key is there and private, and it has not ended."""
+    """Check every certificate in the folder: key present and private, not expired."""
     if at.certificates is None:
         where = "on loopback" if endpoint(at.at)[0] in LOOPBACK else "over the network"
         grade = OK if where == "on loopback" else NOTE
-        known = "known by passwords" if at.passwords else "anyone may join"
-        cure = "" if grade == OK else "; --config with certificates encrypts it: deploy/README.md"
-        yield Finding(grade, "certificates", f"none are used: {where}, in the clear, {known}{cure}")
+        known = "password authentication" if at.passwords else "no authentication"
+        cure = "" if grade == OK else "; use --config with certificates to encrypt: deploy/README.md"
+        yield Finding(grade, "certificates", f"not used: {where}, unencrypted, {known}{cure}")
         yield from _passwords(at)
         return
     roles = [role for role in (*ROLES, ROUTER_ROLE) if (at.certificates / f"{role}.pem").is_file()]
@@ -44,7 +44,7 @@ def papers(at: Entry) -> Iterator[Finding]:
 
 
 def _passwords(at: Entry) -> Iterator[Finding]:
-    """Say what is wrong with the file of passwords, if anything is."""
+    """Check the password file."""
     if at.passwords is not None:
         try:
             private(at.passwords)
@@ -58,7 +58,9 @@ def _authority(folder: Path) -> Finding:
     except (ValueError, OSError) as error:
         return Finding(BAD, "certificates", str(error).removeprefix("certificates: "))
     if found.grade == OK and (folder / "ca.key").exists():
-        return Finding(NOTE, "certificates", f"{folder / 'ca.key'} can make any role; keep it on one machine, off line")
+        return Finding(
+            NOTE, "certificates", f"{folder / 'ca.key'} can issue any role; store it offline, on one machine"
+        )
     return found
 
 
@@ -69,14 +71,16 @@ def _until(whose: str, path: Path, cure: str) -> Finding:
 def _judged(whose: str, end: datetime, cure: str) -> Finding:
     left = end - datetime.now(UTC)
     if left < timedelta(0):
-        return Finding(BAD, "certificates", f"{whose}: ended on {end:%Y-%m-%d %H:%M} UTC; renew it: {cure}")
+        return Finding(BAD, "certificates", f"{whose}: expired on {end:%Y-%m-%d %H:%M} UTC; renew it: {cure}")
     if left < SOON:
-        return Finding(NOTE, "certificates", f"{whose}: ends on {end:%Y-%m-%d}, in {left.days} days; renew it: {cure}")
-    return Finding(OK, "certificates", f"{whose}: good until {end:%Y-%m-%d}")
+        return Finding(
+            NOTE, "certificates", f"{whose}: expires on {end:%Y-%m-%d}, in {left.days} days; renew it: {cure}"
+        )
+    return Finding(OK, "certificates", f"{whose}: valid until {end:%Y-%m-%d}")
 
 
 def router(at: Entry) -> Generator[Finding, None, bool]:
-    """Look who is at the router's endpoint; return whether one is there and lets us in."""
+    """Check the router endpoint; return whether a router answers and accepts the connection."""
     try:
         there = answers(at)
     except (ValueError, OSError) as error:
@@ -92,17 +96,17 @@ def router(at: Entry) -> Generator[Finding, None, bool]:
         yield Finding(OK, "router", f"{at.at} is free; `fleet up` will open a router there")
     else:
         yield Finding(
-            BAD, "router", f"{at.at} neither answers nor is free; start `zenohd` there or name another --router"
+            BAD, "router", f"{at.at} is in use and does not answer; start `zenohd` there or choose another --router"
         )
     return False
 
 
 def _shown(at: Entry, folder: Path) -> Iterator[Finding]:
-    """Read the router's own certificate off a handshake; that it is to be believed was seen before."""
+    """Check the expiry of the router certificate from a TLS handshake; it was verified before."""
     context = ssl.create_default_context(cafile=str(folder / "ca.pem"))
     context.verify_flags &= ~ssl.VERIFY_X509_STRICT
     try:
-        if (own := at.papers()) is not None:  # or the router complains of us in its log
+        if (own := at.papers()) is not None:  # avoids an error in the router log
             context.load_cert_chain(*own)
         with (
             socket.create_connection(endpoint(at.at), timeout=3.0) as plain,
@@ -113,4 +117,4 @@ def _shown(at: Entry, folder: Path) -> Iterator[Finding]:
         return
     if shown:
         end = x509.load_der_x509_certificate(shown).not_valid_after_utc
-        yield _judged("the router's", end, "certificates.sh router FOLDER NAME..., and restart it")
+        yield _judged("router", end, "certificates.sh router FOLDER NAME..., and restart it")

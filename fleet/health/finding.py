@@ -1,4 +1,4 @@
-"""What one look found: a grade, what it is about, and a sentence that ends in the cure where one is needed."""
+"""Result of one check: grade, subject, and a sentence that ends with the remedy when one is needed."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ OK, NOTE, BAD = "ok", "note", "BAD"
 
 
 class Finding(NamedTuple):
-    """`ok`, `note` (something optional is missing, or will go wrong) or `BAD` (the fleet cannot run as it should)."""
+    """Grade `ok`, `note` (optional part missing, or future problem) or `BAD` (the fleet cannot run correctly)."""
 
     grade: str
     what: str

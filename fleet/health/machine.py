@@ -1,4 +1,4 @@
-"""This machine: Python, packages, caches, ports, browser."""
+"""Checks of this machine: Python, packages, caches, ports, browser."""
 
 import importlib.metadata
 import os
@@ -17,7 +17,7 @@ MAVLINK_PORT = 14550
 
 
 def look() -> Iterator[Finding]:
-    """Look at everything."""
+    """Run all checks of the machine."""
     yield python()
     yield from packages()
     yield compile_cache()
@@ -26,7 +26,7 @@ def look() -> Iterator[Finding]:
 
 
 def python() -> Finding:
-    """Name the interpreter; one older than 3.11 does not get as far as this line."""
+    """Report the Python version; one older than 3.11 cannot import this module."""
     return Finding("ok", "python", ".".join(map(str, sys.version_info[:3])))
 
 
@@ -35,12 +35,12 @@ def packages() -> Iterator[Finding]:
     try:
         wanted = importlib.metadata.requires("parauav") or []
     except importlib.metadata.PackageNotFoundError:
-        yield Finding("note", "packages", "parauav itself is not installed, only on the path; make setup")
+        yield Finding("note", "packages", "parauav is on the path but not installed; run make setup")
         return
     names = [line.split(";")[0].strip() for line in wanted if "extra ==" not in line]
     missing = [name for name in names if not _installed(name)]
     if missing:
-        yield Finding("BAD", "packages", f"missing {', '.join(missing)}; make setup")
+        yield Finding("BAD", "packages", f"missing {', '.join(missing)}; run make setup")
     else:
         yield Finding("ok", "packages", ", ".join(f"{name} {_installed(name)}" for name in names))
 
@@ -53,19 +53,19 @@ def _installed(name: str) -> str:
 
 
 def compile_cache() -> Finding:
-    """Check that numba may keep what it compiles, and that nobody else may change it."""
+    """Check that the numba cache is writable, and by this user only."""
     place = Path(os.environ["NUMBA_CACHE_DIR"])
     try:
         found, foreign = private_files.trouble(place), private_files.strangers(place)
     except OSError as error:
-        return Finding("BAD", "compile cache", f"{error}; name another folder in PARAUAV_CACHE")
+        return Finding("BAD", "compile cache", f"{error}; set another folder in PARAUAV_CACHE")
     if found:
         return Finding("BAD", "compile cache", f"{place}: found {found}")
     if foreign:
-        cure = f"they could run code as you; rm -r {place}"
-        return Finding("BAD", "compile cache", f"{place}: found {len(foreign)} files of other users in it; {cure}")
+        cure = f"they could execute code as this user; rm -r {place}"
+        return Finding("BAD", "compile cache", f"{place}: found {len(foreign)} files of other users; {cure}")
     if not os.access(place, os.W_OK):
-        return Finding("BAD", "compile cache", f"may not write {place}; name another folder in PARAUAV_CACHE")
+        return Finding("BAD", "compile cache", f"{place} is not writable; set another folder in PARAUAV_CACHE")
     if fleet.CACHE_NOTE:
         return Finding("note", "compile cache", f"{place}: {fleet.CACHE_NOTE}")
     count = sum(1 for _ in place.rglob("*.nbc"))
@@ -74,7 +74,7 @@ def compile_cache() -> Finding:
 
 
 def onboard_cache() -> Iterator[Finding]:
-    """Check the folder of what aircraft told before, where there is one."""
+    """Check the folder of cached parameters and missions, when there is one."""
     try:
         place = private_files.onboard_folder()
         found = private_files.trouble(place)
@@ -87,17 +87,17 @@ def onboard_cache() -> Iterator[Finding]:
 
 
 def mavlink_port(links: Collection[str] = ()) -> Finding:
-    """Check that aircraft could reach us at the usual UDP port; links: those a gateway of this machine has open."""
+    """Check that the default MAVLink UDP port is free; `links` are open links of local gateways."""
     if any(f":{MAVLINK_PORT}" in link for link in links):
-        return Finding("ok", "mavlink", f"udp port {MAVLINK_PORT} is our gateway's")
+        return Finding("ok", "mavlink", f"udp port {MAVLINK_PORT} is used by the gateway")
     if free(socket.SOCK_DGRAM, "0.0.0.0", MAVLINK_PORT):
         return Finding("ok", "mavlink", f"udp port {MAVLINK_PORT} is free")
-    cure = "well where a gateway's container has it, else name another: --link udpin:0.0.0.0:14551"
-    return Finding("note", "mavlink", f"udp port {MAVLINK_PORT} is taken; {cure}")
+    cure = "correct for a gateway container, else use another: --link udpin:0.0.0.0:14551"
+    return Finding("note", "mavlink", f"udp port {MAVLINK_PORT} is in use; {cure}")
 
 
 def free(kind: socket.SocketKind, host: str, port: int) -> bool:
-    """Return whether a port of this machine can be had."""
+    """Return whether a local port is free."""
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, kind) as s:
             if kind == socket.SOCK_STREAM:
@@ -109,15 +109,19 @@ def free(kind: socket.SocketKind, host: str, port: int) -> bool:
 
 
 def chromium() -> Finding:
-    """Look for a browser; only the viewer's tests and screenshots need one."""
+    """Check for a browser, needed by viewer tests and screenshots only."""
     found = os.environ.get("PARAUAV_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
-        return Finding("note", "chromium", "none, so no browser tests; apt-get install chromium, or PARAUAV_CHROMIUM")
+        return Finding(
+            "note",
+            "chromium",
+            "not found, no browser tests; apt-get install chromium, or set PARAUAV_CHROMIUM",
+        )
     return Finding("ok", "chromium", found)
 
 
 def recordings() -> Finding:
-    """Look for recorded flights; only some tests need them."""
+    """Check for recorded flights, needed by some tests only."""
     named = os.environ.get("PARAUAV_RECORDINGS")
     if not named or not Path(named).is_dir():
         return Finding(

@@ -1,4 +1,4 @@
-"""The ground track on the page: flown path in mode colours, route, waypoints, wind."""
+"""Ground track of the report: flown path in mode colours, route, waypoints, wind."""
 
 from typing import Any
 
@@ -25,14 +25,14 @@ from fleet.telemetry.inspection.survey import Survey, airborne, spells
 from fleet.telemetry.inspection.thinned import inside
 
 _CIRCLES = (LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT)
-_FAR = 2.0  # waypoints further out than this times the flown extent are not shown [-]
+_FAR = 2.0  # waypoints beyond this multiple of the flown extent are not shown [-]
 _HALO = [withStroke(linewidth=2.0, foreground="white")]
-_USUAL_RADIUS = 60.0  # ArduPlane's default WP_LOITER_RAD [m]
+_USUAL_RADIUS = 60.0  # default WP_LOITER_RAD of ArduPlane [m]
 
 
 def ground_track(ax: Any, known: Survey, told: Findings, colours: dict[str, str]) -> None:
-    """Draw the map; says so where there is no position."""
-    ax.set_title("Ground track, from its first position", loc="left")
+    """Draw the ground track, or a note without positions."""
+    ax.set_title("Ground track, relative to the first position", loc="left")
     t, x = known.rows["position"].rows()
     origin = known.origin()
     if origin is None:
@@ -51,14 +51,14 @@ def ground_track(ax: Any, known: Survey, told: Findings, colours: dict[str, str]
     ]
     _route(ax, near, known)
     if len(near) < len(legs):
-        ax.text(0.02, 0.02, f"{len(legs) - len(near)} waypoints lie further out", transform=ax.transAxes, color=MUTED)
+        ax.text(0.02, 0.02, f"{len(legs) - len(near)} waypoints outside the map", transform=ax.transAxes, color=MUTED)
     _frame(ax, np.vstack([p[seen, :2], *[leg[None, P_N : P_E + 1] for leg in near]]))
     _ends(ax, p[seen])
     _wind(ax, told)
 
 
 def _flown(ax: Any, known: Survey, t: np.ndarray, p: np.ndarray, colours: dict[str, str]) -> None:
-    """Draw the path mode by mode; what was flown before any mode was told, or in none, in grey."""
+    """Draw the path in mode colours; grey without a mode."""
     ax.plot(p[:, 1], p[:, 0], color=GRID, lw=2.0, zorder=1)
     named: set[str] = set()
     for span, mode in spells(known):
@@ -72,7 +72,7 @@ def _flown(ax: Any, known: Survey, t: np.ndarray, p: np.ndarray, colours: dict[s
 
 
 def _legs(known: Survey, origin: Origin) -> list[np.ndarray]:
-    """Unroll the route once: each mission item at most one leg."""
+    """Return the legs of the route, at most one per mission item."""
     seen: dict[int, np.ndarray] = {}
     first = FIRST.get(known.status.autopilot, 1) if known.status else 1
     for leg in route(known.items, seq=first, origin=origin, params=known.values, first=first).legs:
@@ -89,7 +89,7 @@ def _route(ax: Any, legs: list[np.ndarray], known: Survey) -> None:
     written: set[tuple[int, int]] = set()
     for leg in legs:
         at = (round(leg[P_E] / 20), round(leg[P_N] / 20))
-        offset = (4, 4) if at not in written else (4, -9)  # two items on one spot stay readable
+        offset = (4, 4) if at not in written else (4, -9)  # separate labels of items at one position
         written.add(at)
         ax.annotate(
             str(int(leg[SEQ])),
@@ -121,9 +121,9 @@ def _frame(ax: Any, p: np.ndarray) -> None:
 
 
 def _ends(ax: Any, p: np.ndarray) -> None:
-    """Mark where the flight begins and ends, and which way it goes."""
-    ax.plot(p[0, 1], p[0, 0], "o", color=INK, ms=5, mfc="white", zorder=6, label="begins")
-    ax.plot(p[-1, 1], p[-1, 0], "s", color=INK, ms=4.5, zorder=6, label="ends")
+    """Mark start, end and direction of the flight."""
+    ax.plot(p[0, 1], p[0, 0], "o", color=INK, ms=5, mfc="white", zorder=6, label="start")
+    ax.plot(p[-1, 1], p[-1, 0], "s", color=INK, ms=4.5, zorder=6, label="end")
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p[:, :2], axis=0), axis=1))])
     for k in np.searchsorted(way, np.linspace(0, way[-1], 10)[1:-1]):
         back = max(int(np.searchsorted(way, way[k] - 0.004 * way[-1])) - 1, 0)
@@ -133,7 +133,7 @@ def _ends(ax: Any, p: np.ndarray) -> None:
 
 
 def _wind(ax: Any, told: Findings) -> None:
-    """Draw where the wind blows to, in the corner."""
+    """Draw the wind arrow in the corner."""
     if told.wind is None or told.wind.speed < 0.1:
         return
     to = np.radians(told.wind.from_deg + 180)

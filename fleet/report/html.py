@@ -1,4 +1,4 @@
-"""A self-contained page: one file that fetches nothing and runs nothing."""
+"""Self-contained HTML page without scripts and external resources."""
 
 from html import escape
 from pathlib import Path
@@ -6,12 +6,12 @@ from pathlib import Path
 from fleet.process.sanitise import plain
 from fleet.report.ink import BAD, GOOD, GRID, INK, LINES, MUTED, ROUTE
 
-_GUARD = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # nothing is fetched, nothing runs
+_GUARD = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"  # no external resources, no scripts
 _COLOURS = {"ink": INK, "muted": MUTED, "line": GRID, "good": GOOD, "bad": BAD, "doubt": LINES[3], "odd": ROUTE}
 
 
 def document(title: str, body: str) -> str:
-    """Return a page in the house's style; `title` is text, `body` is HTML."""
+    """Return a page in the project style; `title` is text, `body` is HTML."""
     colours = "".join(f"--{name}:{colour};" for name, colour in _COLOURS.items())
     style = f":root{{{colours}}}\n" + Path(__file__).with_name("page.css").read_text(encoding="utf-8")
     head = (
@@ -25,5 +25,5 @@ def document(title: str, body: str) -> str:
 
 
 def safe(text: str) -> str:
-    """Escape what came with the data: a flight is named after its file."""
+    """Escape untrusted text, such as a file name."""
     return escape(plain(text))

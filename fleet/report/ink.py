@@ -1,4 +1,4 @@
-"""Colours and lines of the page; the colours go with the light theme of the viewer."""
+"""Colours and lines of the report, matching the light theme of the viewer."""
 
 from collections.abc import Iterable
 
@@ -23,23 +23,23 @@ _MODES = {
     "STABILIZE": "#A67C00",
 }
 _OTHERS = ("#56B4E9", "#D55E9B", "#2BC49A", "#8C6D46", "#334155", "#9A8FD0")
-_MOST_POINTS = 3_000  # of one line; more would not be seen
+_MOST_POINTS = 3_000  # points of one line; more are not visible
 
 
 def mode_colours(modes: Iterable[str]) -> dict[str, str]:
-    """Return every mode its colour; the usual ones keep theirs on every page."""
+    """Return a colour for every mode; common modes have the same colour on every page."""
     names = list(dict.fromkeys(modes))
     free = [name for name in names if name not in _MODES]
     return {name: _MODES.get(name) or _OTHERS[free.index(name) % len(_OTHERS)] for name in names}
 
 
 def drawn(t: np.ndarray, y: np.ndarray, widest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Make a line of few points that keeps every peak and is broken by nan where an interval is wider than `widest`.
+    """Downsample a line, keep its extremes, and insert NaN where an interval exceeds `max_interval`.
 
     Args:
         t: times, (n,) [s]
         y: values, (n,)
-        widest: an interval wider than this is no line [s]
+        max_interval: longest interval joined by a line [s]
     """
     if len(t) > _MOST_POINTS:
         parts = np.array_split(np.arange(len(t)), _MOST_POINTS // 2)
@@ -51,7 +51,7 @@ def drawn(t: np.ndarray, y: np.ndarray, widest: float) -> tuple[np.ndarray, np.n
 
 
 def spread(values: np.ndarray, room: float = 0.08, least: float = 1.0) -> tuple[float, float]:
-    """Return the limits of an axis that shows all values with some room."""
+    """Return axis limits that contain all values with a margin."""
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     more = max(room * (high - low), 0.5 * least)
     return low - more, high + more

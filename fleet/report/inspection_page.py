@@ -1,4 +1,4 @@
-"""A page for every aircraft of a recording: map, panels over time, strips, what the twin can do. For desk and wall."""
+"""Printable page for each aircraft of a recording: map, time panels, strips, applicable twin functions."""
 
 import textwrap
 import warnings
@@ -45,29 +45,29 @@ _STYLE: Any = {
 }
 _HEADINGS = ("link", "modes", "mission", "parameters", "servo map", "airspeed", "wind")
 _TROUBLE = ("text", "clock", "link", "gap")
-_WIDTH = 62  # letters of a line of the text beside the map
-_MOST_LINES = 3  # of one fact
-_LEFT = 0.585  # where that text begins [share of the page]
+_WIDTH = 62  # characters per line of the text beside the map
+_MOST_LINES = 3  # lines of one entry
+_LEFT = 0.585  # left edge of that text [share of the page width]
 _SMALL: Any = {"size": 6.6, "va": "top", "parse_math": False}
 
 
 class Sheet(NamedTuple):
-    """What one page shows: an aircraft of a recording."""
+    """Data of one page: one aircraft of a recording."""
 
     known: Survey
     told: Findings
     facts: Facts
-    name: str  # of the recording
+    name: str  # name of the recording
 
 
 def write(path: Path, sheets: Sequence[Sheet]) -> list[Path]:
-    """Write the pages: one .pdf for all; .png and .svg one file each, named after recording and aircraft if several.
+    """Write the pages: one .pdf for all, or one .png or .svg each, named after recording and aircraft if several.
 
     Returns:
         the files written
     """
     with matplotlib.rc_context(_STYLE), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # a letter no font has is a box, not an error
+        warnings.simplefilter("ignore", UserWarning)  # missing glyphs are drawn as boxes
         if path.suffix == ".pdf":
             with PdfPages(path) as pdf:
                 for sheet in sheets:
@@ -121,22 +121,24 @@ def _over_time(figure: Figure, sheet: Sheet, colours: dict[str, str]) -> None:
     for ax in axes[:-1]:
         ax.tick_params(axis="x", labelbottom=False)
     axes[0].set_xlim(0.0, max(known.newest - known.begun, 1.0))
-    axes[-1].set_xlabel("time since the recording began [s]        strip: blue the usual rate, paler less, red a gap")
+    axes[-1].set_xlabel("time since start of recording [s]        strip: blue nominal rate, paler lower rate, red gap")
     figure.align_ylabels(axes[:4])
 
 
 def _facts(figure: Figure, told: Findings, said: dict[str, str]) -> None:
-    """Write what is in the recording and what the twin can do beside the map."""
+    """Write the recording summary and the applicable twin functions beside the map."""
     y = 0.916
     facts = {heading: said[heading] for heading in _HEADINGS}
     if any(not kind.rows for kind in told.rows.values()):
         facts["no rows of"] = said["no rows of"]
-    facts["trouble"] = "; ".join(f"{e.t_s:.0f} s {e.text}" for e in told.events if e.kind in _TROUBLE) or "none told"
+    facts["problems"] = (
+        "; ".join(f"{e.t_s:.0f} s {e.text}" for e in told.events if e.kind in _TROUBLE) or "none reported"
+    )
     for heading, words in facts.items():
         figure.text(_LEFT, y, heading, color=MUTED, weight="bold", **_SMALL)
         y = _words(figure, y, _LEFT + 0.083, plain(words), _WIDTH - 16)
     y -= 0.007
-    figure.text(_LEFT, y, "What the twin can do with it", weight="bold", **_SMALL)
+    figure.text(_LEFT, y, "Applicable twin functions", weight="bold", **_SMALL)
     y -= 0.0125
     for why, same in groupby(told.abilities, key=lambda can: (can.can, can.why)):
         names = ", ".join(can.name for can in same)
@@ -146,7 +148,7 @@ def _facts(figure: Figure, told: Findings, said: dict[str, str]) -> None:
 
 
 def _words(figure: Figure, y: float, x: float, words: str, width: int) -> float:
-    """Write words in lines from `y` down, with an end where there are too many; return where the next may begin."""
+    """Write wrapped text downwards from `y`, truncated to `_MAX_LINES`; return the next `y`."""
     found = textwrap.wrap(words, width)
     if len(found) > _MOST_LINES:
         found = [*found[: _MOST_LINES - 1], found[_MOST_LINES - 1][: width - 2] + " …"]
@@ -157,7 +159,7 @@ def _words(figure: Figure, y: float, x: float, words: str, width: int) -> float:
 
 
 def _free(path: Path, sheet: Sheet, taken: Sequence[Path]) -> Path:
-    """Name one page of several, never twice the same."""
+    """Return an unused file name for one of several pages."""
     stem = f"{path.stem}-{sheet.name.split('.')[0]}-uav{sheet.told.uav}"
     found, number = path.with_name(stem + path.suffix), 1
     while found in taken:

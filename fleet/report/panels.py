@@ -1,4 +1,4 @@
-"""The panels over time: altitude, speeds, angles, servos, the strip of modes and events, the strip of rates."""
+"""Time panels: altitude, speeds, angles, servos, strip of modes and events, strip of rates."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from fleet.telemetry.inspection.findings import Facts, Findings, happened
 from fleet.telemetry.inspection.survey import Survey, airborne, spells
 from fleet.telemetry.inspection.thinned import inside
 
-_MARKS = {  # of the events: marker and colour
+_MARKS = {  # marker and colour of each event kind
     "armed": ("^", "#00795A"),
     "disarmed": ("v", "#00795A"),
     "text": ("X", BAD),
@@ -30,7 +30,7 @@ def altitude(ax: Any, known: Survey) -> None:
         return _none(ax, "altitude")
     there = inside(t, airborne(known))
     ax.set_ylim(*spread((x[there] if there.any() else x)[:, 2] * 1e-3, least=10.0))
-    _label(ax, "altitude\n[m above sea]", columns=0)
+    _label(ax, "altitude\n[m above MSL]", columns=0)
     return None
 
 
@@ -49,18 +49,18 @@ def speeds(ax: Any, known: Survey) -> None:
 
 
 def angles(ax: Any, known: Survey) -> None:
-    """Draw roll and pitch, and what was asked of them."""
+    """Draw roll, pitch and commanded roll."""
     if not _line(ax, known, "attitude", 0, scale=180 / np.pi, label="roll"):
         return _none(ax, "attitude")
     _line(ax, known, "attitude", 1, scale=180 / np.pi, colour=LINES[1], label="pitch")
-    _line(ax, known, "command", 0, scale=180 / np.pi, colour=INK, label="roll asked", ls=(0, (1, 1)), lw=0.7)
+    _line(ax, known, "command", 0, scale=180 / np.pi, colour=INK, label="roll commanded", ls=(0, (1, 1)), lw=0.7)
     ax.axhline(0, color=MUTED, lw=0.5)
     _label(ax, "angle\n[deg]")
     return None
 
 
 def servos(ax: Any, known: Survey, told: Findings) -> None:
-    """Draw the pulses of the channels that move; the throttle where there are none."""
+    """Draw the pulse widths of moving channels, or the throttle without them."""
     moving = [servo for servo in told.servos if servo.moves]
     low, high = 3_000.0, 0.0
     for servo in moving:
@@ -69,7 +69,7 @@ def servos(ax: Any, known: Survey, told: Findings) -> None:
         low, high = min(low, servo.low_us), max(high, servo.high_us)
         _line(ax, known, "servo", servo.channel - 1, colour=colour, label=label, lw=0.8)
     if moving:
-        ax.set_ylim(*spread(np.array([low, high])))  # of the flight: before it some say 0
+        ax.set_ylim(*spread(np.array([low, high])))  # in flight: before it some channels are 0
         return _label(ax, "servo\n[us]", columns=8)
     if not _line(ax, known, "air", 1, scale=100.0, label="throttle"):
         return _none(ax, "servo" if not told.servos else "moving servo")
@@ -106,7 +106,7 @@ def happenings(ax: Any, known: Survey, facts: Facts, colours: dict[str, str]) ->
 
 
 def rates(ax: Any, known: Survey, told: Findings) -> None:
-    """Draw the strip of rates: full colour is the usual rate of the kind, white nothing, red a gap."""
+    """Draw the strip of rates: full colour is the nominal rate, white no rows, red a gap."""
     from matplotlib.colors import LinearSegmentedColormap
 
     names = [name for name in COLUMNS if known.rows[name].count]
@@ -118,7 +118,7 @@ def rates(ax: Any, known: Survey, told: Findings) -> None:
     ax.imshow(share, cmap=blues, vmin=0, vmax=1, aspect="auto", extent=extent, interpolation="nearest")
     for row, name in enumerate(names):
         for gap in known.rows[name].gaps():
-            wide = max(gap.seconds, length / _BINS)  # a short one is still to be seen
+            wide = max(gap.seconds, length / _BINS)  # a short gap stays visible
             ax.barh(row, wide, left=gap.start - known.begun, height=0.8, color=BAD, lw=0)
     ax.set(yticks=range(len(names)), yticklabels=[f"{name} {told.rows[name].rate_hz:.3g} Hz" for name in names])
     ax.tick_params(axis="y", length=0, labelsize=6.5)
@@ -128,7 +128,7 @@ def rates(ax: Any, known: Survey, told: Findings) -> None:
 
 
 def _share(known: Survey, name: str, centres: np.ndarray, width: float) -> np.ndarray:
-    """Return the rate around each centre over the usual rate, (n,) 0..1."""
+    """Return the rate around each centre relative to the nominal rate, (n,) 0..1."""
     rows = known.rows[name]
     t = rows.rows()[0]
     usual = rows.rate_hz / max(rows.stride, 1)
@@ -140,7 +140,7 @@ def _share(known: Survey, name: str, centres: np.ndarray, width: float) -> np.nd
 def _line(
     ax: Any, known: Survey, name: str, column: int, *, scale: float = 1.0, colour: str = LINES[0], **style: Any
 ) -> bool:
-    """Draw one column over time; False where there are no rows."""
+    """Draw one column over time; return False without rows."""
     t, x = known.rows[name].rows()
     if len(t):
         points = drawn(t, x[:, column] * scale, _widest(known, name))

@@ -1,4 +1,4 @@
-"""Show how far recordings have come: a bar each on a terminal, a line now and then elsewhere."""
+"""Progress display: bars on a terminal, periodic lines otherwise."""
 
 import threading
 import time
@@ -12,35 +12,35 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from fleet.process.interrupt import deferred
 
 REFRESH_S = 0.5
-PLAIN_S = 10.0  # between lines where the output is no terminal [s]
+PLAIN_S = 10.0  # interval of lines without a terminal [s]
 
 
 class Played(Protocol):
-    """Something that is worked through."""
+    """Source of progress."""
 
     @property
     def name(self) -> str:
-        """Name it."""
+        """Return its name."""
 
     @property
     def share(self) -> float:
-        """Tell how far it has come, 0..1."""
+        """Return the progress, 0..1."""
 
     def words(self) -> str:
-        """Say what else there is to say."""
+        """Return additional text."""
 
 
 @contextmanager
 def shown(
     played: Sequence[Played], say: Callable[[str], None], console: Console | None = None, *, leave: bool = True
 ) -> Iterator[None]:
-    """Show progress for as long as the block lasts.
+    """Show progress while the block runs.
 
     Args:
-        played: what is worked through; read on a thread of this block
-        say: takes a line where there is no terminal
-        console: where the bars go (standard output)
-        leave: let the bars stand at the end
+        sources: sources of progress; read on another thread
+        write_line: receives lines without a terminal
+        console: output of the bars (default: standard output)
+        leave: keep the bars at the end
     """
     console = console or Console()
     if not played:
@@ -53,7 +53,7 @@ def shown(
 
 @contextmanager
 def alongside(show: Callable[[threading.Event], None]) -> Iterator[None]:
-    """Run `show` on a thread for as long as the block lasts; the event it is given tells it to end."""
+    """Run `show` on a thread while the block runs; its event argument is set at the end."""
     done = threading.Event()
     thread = threading.Thread(target=show, args=(done,), name="shown")
 
@@ -71,7 +71,7 @@ def alongside(show: Callable[[threading.Event], None]) -> Iterator[None]:
         finally:
             end()
     finally:
-        end()  # Ctrl-C may have come before the first one began; a thread left behind would keep the process alive
+        end()  # Ctrl-C may interrupt the first call; a remaining thread would block process exit
 
 
 def _bars(

@@ -1,4 +1,4 @@
-"""What a recording says, as tables for people; the same figures as the JSON."""
+"""Text tables of an inspected recording, with the same figures as the JSON output."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -23,12 +23,12 @@ _NEWS = (
     "armed",
     "mission",
     "mode",
-)  # worst first; items stand beside the mission
-_MANY = 12  # items in a row that are still listed
+)  # most severe first; mission items are listed with the mission
+_MANY = 12  # most mission items listed
 
 
 def table(file: File) -> RenderableType:
-    """Lay out one recording, aircraft by aircraft."""
+    """Return the tables of one recording, one per aircraft."""
     parts: list[RenderableType] = [Text(f"{plain(file.file)}  {file.bytes / 1e6:.1f} MB", style="bold")]
     parts += [Text(f"  {plain(sentence)}", style="red") for sentence in file.sentences]
     for told in file.aircraft:
@@ -39,20 +39,23 @@ def table(file: File) -> RenderableType:
 
 
 def lines(told: Findings) -> list[tuple[str, str]]:
-    """Say everything but events and abilities: (heading, words)."""
+    """Return the summary without events and abilities: (heading, text)."""
     return [
         ("aircraft", _who(told)),
         ("time", _time(told)),
         ("link", _link(told)),
-        ("modes", ", ".join(f"{name} {seconds:.0f} s" for name, seconds in mode_seconds(told).items()) or "none told"),
+        (
+            "modes",
+            ", ".join(f"{name} {seconds:.0f} s" for name, seconds in mode_seconds(told).items()) or "none reported",
+        ),
         ("rows", ", ".join(f"{name} {kind.rate_hz:.1f} Hz" for name, kind in told.rows.items() if kind.rows)),
         (
             "no rows of",
-            ", ".join(name for name, kind in told.rows.items() if not kind.rows) or "no kind, all are there",
+            ", ".join(name for name, kind in told.rows.items() if not kind.rows) or "none missing",
         ),
         ("gaps", _gaps(told.rows)),
         ("mission", _mission(told)),
-        ("parameters", f"{told.params:,}" + (", all of them" if told.params_complete else ", not all")),
+        ("parameters", f"{told.params:,}" + (", complete" if told.params_complete else ", incomplete")),
         ("servo map", told.servo_map),
         ("servos", _servos(told)),
         ("airspeed", _airspeed(told)),
@@ -70,14 +73,14 @@ def _aircraft(told: Findings, twin: str) -> Table:
         out.add_row("  events" if number == 0 else "", Text(f"{when:>8} {plain(words)}"))
     for number, can in enumerate(told.abilities):
         mark, style = ("yes", "green") if can.can else ("no ", "yellow")
-        out.add_row("  the twin" if number == 0 else "", Text.assemble((mark, style), f" {can.name}: {plain(can.why)}"))
+        out.add_row("  twin can" if number == 0 else "", Text.assemble((mark, style), f" {can.name}: {plain(can.why)}"))
     if twin:
-        out.add_row("  it did", Text(plain(twin)))
+        out.add_row("  twin result", Text(plain(twin)))
     return out
 
 
 def events(told: Findings, most: int) -> list[tuple[str, str]]:
-    """Return the events that tell most, in time order, and how many more there are: (when, words)."""
+    """Return the most severe events in time order and the number of others: (time, text)."""
     chosen = sorted(
         (event for event in told.events if event.kind != "item"), key=lambda event: (_NEWS.index(event.kind), event.t_s)
     )[:most]
@@ -93,12 +96,12 @@ def events(told: Findings, most: int) -> list[tuple[str, str]]:
 
 def _who(told: Findings) -> str:
     kind = told.vehicle.replace("_", " ")
-    return f"uav-{told.uav}, {kind}, {told.autopilot}, {told.firmware or 'firmware not told'}"
+    return f"uav-{told.uav}, {kind}, {told.autopilot}, {told.firmware or 'firmware unknown'}"
 
 
 def _time(told: Findings) -> str:
     begun = datetime.fromtimestamp(min(max(told.begun, 0.0), 4e9), UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    height = f", {told.altitude_m[0]:.0f} to {told.altitude_m[1]:.0f} m above the sea" if told.altitude_m else ""
+    height = f", {told.altitude_m[0]:.0f} to {told.altitude_m[1]:.0f} m above MSL" if told.altitude_m else ""
     flown = (
         f"{told.airborne_s:.0f} s in the air, {told.distance_m / 1e3:.1f} km" if told.airborne_s else "never in the air"
     )
@@ -122,9 +125,11 @@ def _gaps(rows: dict[str, Kind]) -> str:
 def _mission(told: Findings) -> str:
     flown = told.mission.flown
     shown = " ".join(map(str, flown[:_MANY])) + (f" … {flown[-1]}" if len(flown) > _MANY else "")
-    sequence = f"in force {shown}" if flown else "no item in force told"
-    what = f"{told.mission.items} items" + ("" if told.mission.complete else ", not all") if told.mission.items else ""
-    again = f"{told.mission.uploads} lists" if told.mission.uploads > 1 else ""
+    sequence = f"active {shown}" if flown else "no active item reported"
+    what = (
+        f"{told.mission.items} items" + ("" if told.mission.complete else ", incomplete") if told.mission.items else ""
+    )
+    again = f"{told.mission.uploads} uploads" if told.mission.uploads > 1 else ""
     return "; ".join(filter(None, (what, told.mission.sentence, again, sequence)))
 
 
@@ -133,16 +138,16 @@ def _servos(told: Findings) -> str:
     for servo in told.servos:
         name = f"{servo.channel} {servo.surface}".strip()
         if not servo.moves:
-            said.append(f"{name} still at {servo.low_us:.0f}")
+            said.append(f"{name} constant at {servo.low_us:.0f}")
             continue
-        end = f" ({servo.saturated:.0%} at its end)" if servo.saturated >= 0.005 else ""
+        end = f" ({servo.saturated:.0%} saturated)" if servo.saturated >= 0.005 else ""
         said.append(f"{name} {servo.low_us:.0f} to {servo.high_us:.0f} us{end}")
     return ", ".join(said) or "no rows"
 
 
 def _airspeed(told: Findings) -> str:
     air = told.airspeed
-    sensor = {"yes": "sensor", "no": "no sensor"}.get(air.sensor, "sensor not told")
+    sensor = {"yes": "sensor", "no": "no sensor"}.get(air.sensor, "sensor unknown")
     if air.median is None:
         return f"{sensor} ({air.how}), no rows"
     constant = ", constant" if air.constant else ""
@@ -151,15 +156,15 @@ def _airspeed(told: Findings) -> str:
 
 def _wind(told: Findings) -> str:
     if told.wind is None:
-        return "the autopilot says nothing of it"
+        return "not reported by the autopilot"
     wind = told.wind
     return (
-        f"the autopilot says {wind.speed:.1f} m/s from {wind.from_deg:.0f} deg, {wind.low:.1f} to {wind.high:.1f} m/s"
+        f"autopilot estimate {wind.speed:.1f} m/s from {wind.from_deg:.0f} deg, {wind.low:.1f} to {wind.high:.1f} m/s"
     )
 
 
 def _twin(answer: dict[str, Any] | None, uav: int) -> str:
-    """Say what a twin made of this aircraft, or nothing."""
+    """Describe the twin results of this aircraft; empty without any."""
     told = (answer or {}).get(str(uav))
     if not isinstance(told, dict):
         return ""
@@ -180,7 +185,7 @@ def _within(told: dict[str, Any]) -> list[str]:
 
 
 def spans(uavs: Iterable[int]) -> str:
-    """Write ids with their ranges: 0-3, 7."""
+    """Format ids as ranges: 0-3, 7."""
     parts: list[list[int]] = []
     for uav in sorted(uavs):
         if parts and parts[-1][1] == uav - 1:

@@ -1,4 +1,4 @@
-"""The browser of one page: its connection, what it remembers, and in which colours it is to be drawn."""
+"""Browser of one page: connection, stored preferences and theme."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +9,7 @@ from viewer.theme.palette import DARK, LIGHT, Palette
 
 
 class Browser:
-    """What stays of a page when it is drawn anew."""
+    """State of a page that survives a redraw."""
 
     def __init__(self, client: Any, palette: Palette, wake: Callable[[], None]) -> None:
         self.client, self._usual, self._wake = client, palette, wake
@@ -17,11 +17,11 @@ class Browser:
 
     @property
     def palette(self) -> Palette:
-        """Return the colours to draw in: those this browser chose, else those the viewer was started with."""
+        """Return the theme chosen in this browser, else the default theme."""
         light = self.remembered.light
         return self._usual if light is None else LIGHT if light else DARK
 
     def paint(self, *, light: bool) -> None:
-        """Draw in light colours from now on, or in dark ones."""
+        """Select the light or the dark theme."""
         self.remembered.light = light
         self._wake()

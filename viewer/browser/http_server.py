@@ -1,4 +1,4 @@
-"""The door of the page: who may come in, and what they are given first. All that bends the page library is here."""
+"""HTTP server of the page: access checks, security headers, loading page. All patches of viser are here."""
 
 import asyncio
 import contextlib
@@ -19,12 +19,12 @@ from viser import Icon, _icons, _messages
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-HOME = ("localhost", "127.0.0.1", "::1")  # names of this machine, for itself
-POLICY = (  # nothing is fetched from anywhere else, and nobody may frame the page
+HOME = ("localhost", "127.0.0.1", "::1")  # loopback names
+POLICY = (  # no external resources, no framing by other sites
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' ws: wss: data: blob:; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
 )
-ICONS = (  # of the page's tabs, buttons and commands
+ICONS = (  # icons of tabs, buttons and commands
     Icon.ADJUSTMENTS,
     Icon.ALERT_TRIANGLE,
     Icon.CAMERA,
@@ -35,14 +35,14 @@ ICONS = (  # of the page's tabs, buttons and commands
     Icon.MOVIE,
     Icon.TABLE,
 )
-PORTS = {"http": "80", "https": "443"}  # a browser leaves these out
-REFUSED = (  # messages that no page of ours sends
+PORTS = {"http": "80", "https": "443"}  # default ports, omitted by browsers
+REFUSED = (  # messages that this page never sends
     _messages.FileTransferStartUpload,
     _messages.FileTransferPart,
     _messages.ShareUrlRequest,
     _messages.ShareUrlDisconnect,
 )
-VIOLATION = 1008  # close code of a connection that broke a rule (RFC 6455, 7.4.1)
+VIOLATION = 1008  # close code for a policy violation (RFC 6455, 7.4.1)
 Answering = Callable[[Any, Request], Response | None]
 Handling = Callable[[Any], Awaitable[None]]
 
@@ -54,14 +54,14 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
 
     Args:
         host: address to bind
-        port: TCP port; 0 takes any free one
-        name: host name that a reverse proxy shows the page under; empty: none does
+        port: TCP port; 0 selects a free one
+        name: host name of the page behind a reverse proxy; empty: no proxy
     Raises:
-        OSError: when the port is taken; viser itself would silently take the next one.
+        OSError: when the port is in use; viser alone would use the next one without notice.
     """
-    # A page may close while it is drawn: what was on its way to it then goes nowhere, which is no news.
+    # A page may close while it is drawn: its queued messages are discarded without a warning.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-    logging.getLogger("websockets.server").setLevel(logging.WARNING)  # to it each page fetched is a connection rejected
+    logging.getLogger("websockets.server").setLevel(logging.WARNING)  # it logs page requests as rejected connections
     _read_icons()
     with quiet(), _guarded({*HOME, host.strip("[]").lower(), *filter(None, [name.lower()])}, anyone=_is_any(host)):
         server = viser.ViserServer(host=host, port=port, verbose=False)
@@ -70,12 +70,14 @@ def serve(host: str, port: int, name: str = "") -> viser.ViserServer:
     if port and server.get_port() != port:
         with quiet():
             server.stop()
-        raise OSError(f"--port: found {port} taken by another program, expected a free one; stop it or name another")
+        raise OSError(
+            f"--port: found {port} in use by another program, expected a free port; stop it or choose another"
+        )
     return server
 
 
 def _read_icons() -> None:
-    """Read our icons out of the library's archive of thousands at once: it opens it anew for each, 25 ms a time."""
+    """Read all icons from the archive of viser at once; viser reopens it for each icon (25 ms)."""
     with zipfile.ZipFile(_icons.ICONS_DIR / "tabler-icons.zip") as archive:
         once = SimpleNamespace(ZipFile=lambda _: contextlib.nullcontext(archive))
         original, _icons.zipfile = _icons.zipfile, once  # type: ignore[assignment]
@@ -87,18 +89,18 @@ def _read_icons() -> None:
 
 
 def quiet() -> contextlib.redirect_stdout:
-    """Keep the library's own banner off our output."""
+    """Suppress the banner that viser prints."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 def _is_any(host: str) -> bool:
-    """Return whether an address means every interface: then we cannot know by what name we are called."""
+    """Return whether an address binds every interface; then the host name is unknown."""
     return host in ("", "0.0.0.0", "::", "[::]")
 
 
 @contextlib.contextmanager
 def _guarded(names: set[str], *, anyone: bool) -> Iterator[None]:
-    """Put our own doorman before the library's, while it opens its server."""
+    """Install the request filter and message checks while viser opens its server."""
     original = sockets.serve
 
     def guarded(handler: Handling, *args: Any, process_request: Answering, **options: Any) -> Any:
@@ -113,17 +115,17 @@ def _guarded(names: set[str], *, anyone: bool) -> Iterator[None]:
 
 
 def doorman(inner: Answering, names: set[str], *, anyone: bool) -> Answering:
-    """Wrap what answers a request: strangers are refused, the page carries its rules and its first words.
+    """Return a request handler that refuses foreign requests and adds security headers and the loading page.
 
-    A page of another site that runs in the operator's browser may neither open our socket (scheme, host and port of its
-    `Origin` are not those of the page asked for) nor reach us under a name of its own (its `Host` is none of ours).
-    The scheme is the one a reverse proxy names in `X-Forwarded-Proto`, which no script of a page can set; without it,
-    http, and under `--name` https as well.
+    A page of another site in the operator's browser cannot open the websocket (scheme, host and port of its `Origin`
+    must equal those of the requested page) and cannot use DNS rebinding (`Host` must be in `names`). The scheme is
+    `X-Forwarded-Proto` of a reverse proxy, which page scripts cannot set; without it http, and with `--name`
+    also https.
 
     Args:
-        inner: the library's own answer
-        names: host names we are known by
-        anyone: take any host name, as when bound to every interface
+        inner: request handler of viser
+        names: accepted host names
+        any_host: accept any host name, as when bound to every interface
     """
     page = _page()
 
@@ -131,9 +133,11 @@ def doorman(inner: Answering, names: set[str], *, anyone: bool) -> Answering:
         host = _name(request.headers.get("Host", ""))
         origin = request.headers.get("Origin")
         if not anyone and host not in names:
-            return _refusal(f"viewer: found host {host[:80]!r}, expected {sorted(names)}; start it with --name")
+            return _refusal(f"viewer: found host {host[:80]!r}, expected {sorted(names)}; start the viewer with --name")
         if origin is not None and not _is_own(origin, request, proxied=host in names and host not in HOME):
-            return _refusal("viewer: found a request of another site, expected this page's own; open the page itself")
+            return _refusal(
+                "viewer: found a request of another site, expected one of this page; open the page directly"
+            )
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return inner(connection, request)
         if request.path.partition("?")[0] in ("/", "/index.html"):
@@ -144,12 +148,12 @@ def doorman(inner: Answering, names: set[str], *, anyone: bool) -> Answering:
 
 
 def _is_own(origin: str, request: Request, *, proxied: bool) -> bool:
-    """Return whether an origin is that of the page asked for.
+    """Return whether an origin equals that of the requested page.
 
     Args:
-        origin: scheme://host[:port] of the page that asks
-        request: what it asks
-        proxied: whether the page may be shown by a reverse proxy that does not name its scheme
+        origin: scheme://host[:port] of the requesting page
+        request: the request
+        proxied: whether a reverse proxy without `X-Forwarded-Proto` may serve the page
     """
     scheme, _, address = origin.lower().partition("://")
     host = request.headers.get("Host", "").lower()
@@ -159,13 +163,13 @@ def _is_own(origin: str, request: Request, *, proxied: bool) -> bool:
 
 
 def _with_port(address: str, scheme: str) -> tuple[str, str]:
-    """Return host and port; the port of the scheme where there is none."""
-    rest = address.rpartition("]")[2]  # of an IPv6 address in brackets
+    """Return host and port; without a port the default of the scheme."""
+    rest = address.rpartition("]")[2]  # IPv6 address in brackets
     return _name(address), rest.partition(":")[2] or PORTS[scheme]
 
 
 def checked(handler: Handling) -> Handling:
-    """Wrap what serves a websocket: a message that is malformed or refused ends its connection, with one log line."""
+    """Return a websocket handler that closes the connection on a malformed or refused message and logs it."""
 
     async def serve_one(connection: Any) -> None:
         asyncio.get_running_loop().set_exception_handler(_log_defect)
@@ -176,7 +180,7 @@ def checked(handler: Handling) -> Handling:
             if fault := _fault(raw):
                 _log.warning("page: found %s, expected a message of this page; connection closed", fault)
                 await connection.close(VIOLATION, "viewer: message refused")
-                return await receive(*args, **options)  # raises: it is closed
+                return await receive(*args, **options)  # raises: connection closed
             return raw
 
         connection.recv = receive_checked
@@ -186,32 +190,32 @@ def checked(handler: Handling) -> Handling:
 
 
 def _fault(raw: object) -> str:
-    """Say what is wrong with a message; nothing: an empty string."""
+    """Describe the fault of a message; empty when it is valid."""
     if not isinstance(raw, bytes):
         return "text"
     try:
         message = _messages.Message.deserialize(raw)
-    except Exception as error:  # made by a stranger: whatever the library meets in it
-        return f"{len(raw)} bytes that are no message ({type(error).__name__})"
+    except Exception as error:  # untrusted input: any exception of the library
+        return f"{len(raw)} malformed bytes ({type(error).__name__})"
     return f"a {type(message).__name__}" if isinstance(message, REFUSED) else ""
 
 
 def _log_defect(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Log in one line what a task of the library met: the values in a message may be a stranger's."""
+    """Log an exception of a viser task in one line, as it may contain untrusted values."""
     del loop
     error = context.get("exception")
     _log.warning("page: %s", f"a message failed ({type(error).__name__}: {error})" if error else context["message"])
 
 
 def _name(address: str) -> str:
-    """Take the port off `name:port` or `[::1]:port`."""
+    """Return the host of `name:port` or `[::1]:port`."""
     if address.startswith("["):
         return address[1:].partition("]")[0].lower()
     return address.partition(":")[0].lower()
 
 
 def _page() -> bytes:
-    """Return the library's page, gzipped, with our title and with words for a browser that cannot draw."""
+    """Return the page of viser, gzipped, with title and a text for browsers without WebGL."""
     source = Path(viser.__file__).with_name("client") / "build" / "index.html"
     text, first = source.read_text(encoding="utf-8"), Path(__file__).with_name("first.html").read_text(encoding="utf-8")
     at = text.index("<body")

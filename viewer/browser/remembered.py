@@ -1,4 +1,4 @@
-"""What the browser of a page remembers for it: who was selected, and in which colours. A page that reloads asks."""
+"""Page preferences in the local storage of the browser: selected UAV and theme."""
 
 import contextlib
 import json
@@ -6,16 +6,16 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-KEY = "parauav-page"  # in the browser's own store
+KEY = "parauav-page"  # in the local storage of the browser
 
 
 class Remembered:
-    """Knows what one page showed when it was last open; what the browser says is a stranger's text."""
+    """Preferences of one page; text from the browser is untrusted."""
 
     def __init__(self, client: Any, told: Callable[[], None]) -> None:
         self._client, self._told = client, told
-        self.uav: int | None = None  # who was selected, until somebody is selected anew
-        self.light: bool | None = None  # in light colours; None: never chosen
+        self.uav: int | None = None  # stored selection, until a UAV is selected
+        self.light: bool | None = None  # light theme; None: not chosen
         self._kept, self._ready = "", False
         threading.Thread(target=self._ask, name="viewer-remembered", daemon=True).start()
 
@@ -26,7 +26,7 @@ class Remembered:
         self._told()
 
     def read(self, text: str) -> None:
-        """Take over what was written down; anything else is nothing."""
+        """Parse stored preferences; ignore invalid text."""
         with contextlib.suppress(ValueError, RecursionError):
             said = json.loads(text[:200])
             if isinstance(said, dict):
@@ -35,7 +35,7 @@ class Remembered:
                 self.light = light if isinstance(light, bool) else None
 
     def keep(self, uav: int | None) -> None:
-        """Let the browser write down who is selected, and in which colours, where that is news and it was asked."""
+        """Store selection and theme in the browser when they changed and were loaded before."""
         text = json.dumps({"uav": uav if self.uav is None else self.uav, "light": self.light})
         if self._ready and text != self._kept:
             self._kept = text

@@ -1,1 +1,1 @@
-"""What can be taken away from the page: a picture of the view, a flight that plays anywhere, the numbers of a UAV."""
+"""Exports of the page: view as PNG, flight as HTML, data of a UAV as CSV."""

@@ -1,4 +1,4 @@
-"""A stretch of flight as one HTML file that plays anywhere: the scene of the page, without any server."""
+"""Export a flight as one self-contained HTML file with the 3-D scene."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,29 +19,29 @@ from viewer.theme.palette import Palette
 from viewer.timeline.past import Past, as_it_was, remember
 from viewer.timeline.recordings import Tapes
 
-FRAMES, FRAME_S = 400, 0.1  # of a film at most, and how long each is shown [s]
-ASPECT = 1.6  # the shape of window its camera is set for [-]
+FRAMES, FRAME_S = 400, 0.1  # most frames of an animation, and duration of each [s]
+ASPECT = 1.6  # aspect ratio for the camera [-]
 
 
 class Film:
-    """Draws every instant on a server of its own that nobody sees, and keeps what was drawn."""
+    """Render every frame on a hidden server and serialise the scene."""
 
     def __init__(self, feed: Feed, tapes: Tapes, palette: Palette) -> None:
         self._feed, self._tapes, self._palette = feed, tapes, palette
 
     def html(self, selected: int, told: Callable[[float], None] = lambda _: None) -> str:
-        """Film all that is kept on the clock of one UAV.
+        """Return the recording as HTML, on the clock of one UAV.
 
         Args:
             selected: the UAV
-            told: called with how far it is, 0..1
+            on_progress: called with the progress, 0..1
         Raises:
-            ValueError: when nothing is kept of it yet; wait for its first sample.
+            ValueError: when there is no recording of it yet; wait for its first sample.
         """
         fleet = [one for one in self._feed.all() if len(self._tapes.of.get(one.uav, ()))]
         lead = next((one for one in fleet if one.uav == selected), None)
         if lead is None:
-            raise ValueError(f"export: found nothing kept of uav-{selected}, expected a flight; wait for its samples")
+            raise ValueError(f"export: found no recording of uav-{selected}, expected a flight; wait for its samples")
         span, shift = self._tapes.measure(lead, fleet)
         times = np.linspace(span.begin, span.end, int(np.clip((span.end - span.begin) / 0.5, 2, FRAMES)))
         server = serve("127.0.0.1", 0)
@@ -66,7 +66,7 @@ class Film:
 
 
 class _Stage:
-    """The scene of the film."""
+    """Scene of the animation."""
 
     def __init__(self, server: Any, feed: Feed, palette: Palette, selected: int) -> None:
         self._server, self._feed, self._selected = server, feed, selected
@@ -75,7 +75,7 @@ class _Stage:
         self._sight = Sight(np.zeros(3), np.ones(3), float(FOV), ASPECT)
 
     def look_at(self, pasts: list[Past]) -> None:
-        """Set the camera to what will be seen: all places and paths."""
+        """Frame all positions and paths."""
         paths = [past.tape.path(-np.inf, np.inf)[:, 1:] for past in pasts]
         cloud = near(np.vstack([*paths, np.zeros((0, 3))]), IN_VIEW_M / UNIT_M)
         ground = min(float(cloud[:, 2].min()) - 0.5, 0.0)
@@ -85,7 +85,7 @@ class _Stage:
         self._sight = Sight(*frame(cloud, ASPECT), float(FOV), ASPECT)
 
     def draw(self, pasts: list[Past]) -> None:
-        """Draw one instant."""
+        """Draw one frame."""
         flock, scene, sight = self._flock, self._scene, self._sight
         remember(flock, pasts, 0.0)
         if not flock.uavs:

@@ -1,4 +1,4 @@
-"""The buttons that take something away from the page."""
+"""Export buttons of the page."""
 
 from collections.abc import Callable
 from html import escape
@@ -16,7 +16,7 @@ from viewer.timeline.recordings import Tapes
 
 
 class Export:
-    """Three buttons on one page; each makes a file and hands it to the browser that asked."""
+    """Three buttons on one page; each creates a file and sends it to the browser."""
 
     def __init__(
         self, client: Any, feed: Feed, tapes: Tapes, palette: Palette, chosen: Callable[[], int | None]
@@ -32,8 +32,8 @@ class Export:
         self._said = gui.add_html("")
 
     def _hand(self, make: Callable[[], tuple[str, bytes]]) -> None:
-        """Make a file and send it; what goes wrong is said on the page."""
-        self._say("making it …")
+        """Create a file and send it; show errors on the page."""
+        self._say("exporting …")
         try:
             name, data = make()
         except (ValueError, OSError) as error:
@@ -46,7 +46,7 @@ class Export:
 
     def _uav(self) -> int:
         if (uav := self._chosen()) is None:
-            raise ValueError("export: found nobody selected, expected a UAV; click a row or an aircraft")
+            raise ValueError("export: found no selection, expected a UAV; click a row or an aircraft")
         return uav
 
     def _picture(self) -> tuple[str, bytes]:
@@ -55,17 +55,17 @@ class Export:
     def _film(self) -> tuple[str, bytes]:
         uav = self._uav()
         film = Film(self._feed, self._tapes, self._palette)
-        text = film.html(uav, lambda share: self._say(f"making it: {share:.0%}"))
+        text = film.html(uav, lambda share: self._say(f"exporting: {share:.0%}"))
         return f"{self._name(f'uav-{uav}')}.html", text.encode()
 
     def _table(self) -> tuple[str, bytes]:
         uav, place = self._uav(), self._tapes.place
         tape = self._tapes.of.get(uav)
         if tape is None or place is None or not len(tape):
-            raise ValueError(f"export: found nothing kept of uav-{uav}, expected a flight; wait for its samples")
+            raise ValueError(f"export: found no recording of uav-{uav}, expected a flight; wait for its samples")
         return f"{self._name(f'uav-{uav}')}.csv", table(tape, place).encode()
 
     def _name(self, what: str) -> str:
-        """Name a file after what is in it and the newest data time."""
+        """Return a file name with its content and the newest data time."""
         newest = max((tape.t[-1] for tape in list(self._tapes.of.values()) if len(tape)), default=0.0)
         return f"parauav-{what}-{stamp(float(newest))}".replace(":", "").replace(" ", "-").replace("+", "")

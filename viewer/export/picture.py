@@ -1,4 +1,4 @@
-"""The view of one page as a PNG: what the browser drew, before the sky of the page."""
+"""View of one page as PNG: browser rendering over the sky background."""
 
 import io
 from typing import Any
@@ -8,15 +8,15 @@ from PIL import Image
 
 from viewer.theme.palette import Palette, rgb
 
-WIDEST = 2_560  # of a picture: a browser gives up on more [pixels]
-PATIENCE_S = 20.0  # a browser that draws in software takes its time [s]
+WIDEST = 2_560  # longest side of an image that browsers render [pixels]
+PATIENCE_S = 20.0  # software rendering is slow [s]
 
 
 def picture(client: Any, palette: Palette) -> bytes:
-    """Ask a page for its view.
+    """Request the rendered view of a page.
 
     Args:
-        client: whose page it is
+        client: client of the page
         palette: its colours
     Raises:
         TimeoutError: when the page does not answer; keep it in the foreground.
@@ -29,7 +29,7 @@ def picture(client: Any, palette: Palette) -> bytes:
 
 
 def png(drawn: np.ndarray, palette: Palette) -> bytes:
-    """Lay a drawn view (h, w, 3 or 4) upon the sky and pack it."""
+    """Blend a rendered view (h, w, 3 or 4) with the sky and encode it as PNG."""
     top, bottom = rgb(palette.sky[0]), rgb(palette.sky[1])
     w = (np.linspace(0, 1, len(drawn)) ** 1.2)[:, None, None]
     sky = np.broadcast_to(top * (1 - w) + bottom * w, (*drawn.shape[:2], 3))

@@ -1,4 +1,4 @@
-"""The numbers of one UAV as CSV: where it was, how it flew, how it stood, what was predicted."""
+"""Data of one UAV as CSV: position, attitude, state and predictions."""
 
 import csv
 import io
@@ -15,15 +15,15 @@ COLUMNS = (
     *("t_s", "utc", "lat_deg", "lon_deg", "alt_m", "phi_deg", "theta_deg", "psi_deg", "Va_m_s"),
     *("state", "mode", "armed", "link", "fit_percent", "horizon_s", "predicted_at_s", "alerts"),
 )
-FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a spreadsheet would run a word that begins so
+FORMULA = ("=", "+", "-", "@", "\t", "\r")  # first characters of a formula in a spreadsheet
 
 
 def table(tape: Tape, place: Place) -> str:
-    """Write every row kept of a UAV, and what was known at its time.
+    """Return every recorded row of a UAV with its state at that time.
 
     Args:
-        tape: what is kept of it
-        place: the frame of the scene
+        recording: its recording
+        scene_frame: frame of the scene
     Returns:
         CSV with a header; times in seconds since 1970, angles in degrees
     """
@@ -53,5 +53,5 @@ def _known(tape: Tape, t: float) -> list[str]:
 
 
 def plain(word: str) -> str:
-    """Keep a word from outside a word: no spreadsheet shall take it for a formula."""
+    """Prefix received text with an apostrophe when a spreadsheet would read it as a formula."""
     return f"'{word}" if word.startswith(FORMULA) and not word.lstrip("+-").replace(".", "", 1).isdecimal() else word

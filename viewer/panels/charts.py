@@ -1,4 +1,4 @@
-"""The charts of the selected UAV: what was told of the last minute, and what is predicted, over data time."""
+"""Charts of the selected UAV: errors, fit and altitude of the last minute, and the prediction."""
 
 from typing import Any
 
@@ -13,11 +13,11 @@ from viewer.text.mismatch_text import within
 from viewer.theme.palette import Palette
 
 AHEAD_S = 5.0  # look-ahead whose error is shown over time [s]
-PAST_S = 60.0  # how far the histories reach back [s]
+PAST_S = 60.0  # length of the histories [s]
 
 
 class Charts:
-    """Four charts of the selected UAV; built once, their data replaced."""
+    """Four charts of the selected UAV; created once, then updated."""
 
     def __init__(self, gui: Any, palette: Palette) -> None:
         self._gui, p = gui, palette
@@ -30,7 +30,7 @@ class Charts:
         self._error = self._chart(
             f"Error {AHEAD_S:.0f} s ahead, m", (("measured", p.muted), ("located mismatch", p.mismatch)), (two,) * 3
         )
-        self._fit = self._chart("Mean fit of each verdict, %", (("fit", p.verified),), (two, two))
+        self._fit = self._chart("Mean fit per verdict, %", (("fit", p.verified),), (two, two))
         self._alt = self._chart("Altitude, m", (("flown", p.flown), ("predicted", p.predicting)), (two,) * 3)
 
     def _chart(self, title: str, lines: tuple, data: tuple) -> tuple[Any, Any]:
@@ -51,7 +51,7 @@ class Charts:
         return head, plot
 
     def draw(self, vehicle: Vehicle | None, feed: Feed, now: float) -> None:
-        """Replace the data; a chart without any is hidden."""
+        """Update the data; hide a chart without data."""
         if vehicle is None:
             for chart in (self._band, self._error, self._fit, self._alt):
                 _put(chart, None)
@@ -65,7 +65,7 @@ class Charts:
 
 
 def _put(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None, *, from_zero: bool = False) -> None:
-    """Show data, x first. The y scale is given: a gap (not a number) would spoil the chart's own."""
+    """Show data, x first. The y range is explicit, as NaN gaps break automatic scaling."""
     for part in chart:
         part.visible = data is not None
     if data is None:
@@ -76,13 +76,13 @@ def _put(chart: tuple[Any, Any], data: tuple[np.ndarray, ...] | None, *, from_ze
         "x": {"time": False, "range": (float(x0), float(x1))},
         "y": {"range": scale(np.concatenate([*data[1:], *zero]))},
     }
-    if chart[1].scales != scales:  # a new scale builds the chart anew: rarely, please
+    if chart[1].scales != scales:  # a new scale recreates the chart
         chart[1].scales = scales
     chart[1].data = data
 
 
 def scale(y: np.ndarray) -> tuple[float, float]:
-    """Choose a range for y that holds its finite values and seldom changes: whole multiples of 1, 2 or 5 times 10^k."""
+    """Return a y range over the finite values in multiples of 1, 2 or 5 times 10^k, so that it rarely changes."""
     y = y[np.isfinite(y)]
     low, high = (float(y.min()), float(y.max())) if len(y) else (0.0, 1.0)
     rough = max(high - low, 0.02 * abs(high), 1e-3) / 2
@@ -92,11 +92,11 @@ def scale(y: np.ndarray) -> tuple[float, float]:
 
 
 def band(vehicle: Vehicle | None, off: np.ndarray) -> tuple[np.ndarray, ...] | None:
-    """Return the measured error and the band's widest half-axis against look-ahead, and an upright line at the horizon.
+    """Return measured error and largest half-axis of the band against look-ahead, and a vertical horizon line.
 
     Args:
-        vehicle: whose
-        off: as `errors` gives it, (k, 30) [m]
+        vehicle: the UAV
+        distances: from `prediction_errors`, (k, 30) [m]
     Returns:
         x [s], measured, band, horizon [m]
     """
@@ -119,7 +119,7 @@ def band(vehicle: Vehicle | None, off: np.ndarray) -> tuple[np.ndarray, ...] | N
 
 
 def over_time(made: np.ndarray, off: np.ndarray, vehicle: Vehicle) -> tuple[np.ndarray, ...] | None:
-    """Return the error at one look-ahead against seconds ago, and once more where a mismatch was located."""
+    """Return the error at one look-ahead over time, and separately where a mismatch was located."""
     at = int(AHEAD_S - AHEADS_S[0])
     known = np.isfinite(off[:, at])
     if known.sum() < 2:
@@ -130,7 +130,7 @@ def over_time(made: np.ndarray, off: np.ndarray, vehicle: Vehicle) -> tuple[np.n
 
 
 def _history(rows: np.ndarray, column: int) -> tuple[np.ndarray, ...] | None:
-    """Return the last minute of one column against seconds ago: (x, y); None where there are fewer than two points."""
+    """Return the last minute of one column over time: (x, y); None for fewer than two points."""
     if len(rows) < 2:
         return None
     x = rows[:, 0] - rows[-1, 0]
@@ -139,7 +139,7 @@ def _history(rows: np.ndarray, column: int) -> tuple[np.ndarray, ...] | None:
 
 
 def _altitude(vehicle: Vehicle | None, trail: np.ndarray, now: float) -> tuple[np.ndarray, ...] | None:
-    """Join flown and predicted altitude: (x, flown, predicted) [s from now, m above mean sea level]."""
+    """Return flown and predicted altitude: (x, flown, predicted) [s from now, m above mean sea level]."""
     flown = _history(trail, 3)
     if vehicle is None or flown is None:
         return None

@@ -1,4 +1,4 @@
-"""The command palette (Ctrl+K) of one page: what one can do, and whom one can select."""
+"""Command palette (Ctrl+K) of one page: actions and UAVs to select."""
 
 from collections.abc import Callable
 from functools import partial
@@ -8,11 +8,11 @@ import viser
 
 from viewer.store.vehicle import Vehicle
 
-MOST = 200  # UAVs offered; the search field finds the others
+MOST = 200  # UAVs in the palette; the search field finds the others
 
 
 class Commands:
-    """What the palette offers."""
+    """Commands of the palette."""
 
     def __init__(self, gui: Any, choose: Callable[[int], None], actions: dict[str, Callable[[], None]]) -> None:
         self._gui, self._choose = gui, choose
@@ -21,7 +21,7 @@ class Commands:
             gui.add_command(label).on_trigger(partial(self._act, act))
 
     def offer(self, fleet: list[Vehicle]) -> None:
-        """Offer to select the first UAVs."""
+        """Add selection commands for the first `MAX_OFFERED` UAVs."""
         for vehicle in fleet[:MOST]:
             if vehicle.uav not in self._offered and len(self._offered) < MOST:
                 command = self._gui.add_command(f"Select {vehicle.name}", icon=viser.Icon.DRONE)

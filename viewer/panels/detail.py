@@ -1,4 +1,4 @@
-"""What the page says about the selected UAV: status, trust, verdict, figures."""
+"""Texts of the selected UAV: status, confidence, verdict, figures."""
 
 from html import escape
 from math import isfinite
@@ -10,12 +10,12 @@ from viewer.text import mismatch_text
 from viewer.text.words import CLAIMS_S, ago, fit, horizon_s, standing
 from viewer.theme.palette import Palette
 
-LETTERS = 500  # of a sentence from outside
-REFUSED_S = 10.0  # how long a refused message is spoken of [s]
+LETTERS = 500  # characters of a received text
+REFUSED_S = 10.0  # how long a rejected message is reported [s]
 
 
 def about(vehicle: Vehicle, palette: Palette, now: float) -> str:
-    """Say how the UAV and its twin stand. Strings of the bus are escaped here."""
+    """Return the status of the UAV and its twin as HTML. Received texts are escaped here."""
     one = standing(vehicle, palette, now)
     return (
         f'<div class="uav"><div class="head"><h1>{vehicle.name}</h1><b style="color:{one.colour}">'
@@ -24,7 +24,7 @@ def about(vehicle: Vehicle, palette: Palette, now: float) -> str:
 
 
 def facts(vehicle: Vehicle, now: float) -> str:
-    """List the figures behind it."""
+    """Return fits, figures and controller as HTML."""
     return f'<div class="uav">{_fits(vehicle)}{_facts(vehicle, now)}{law(vehicle.controller)}</div>'
 
 
@@ -46,29 +46,25 @@ def _cards(vehicle: Vehicle) -> str:
 
 
 def why(vehicle: Vehicle, now: float) -> list[str]:
-    """Say why there is no prediction, or what limits it; plain text, not yet escaped."""
+    """Return why there is no prediction, or what limits it; plain text, not escaped."""
     state, said = vehicle.state(now), []
     if vehicle.ended:
-        said.append("The recording is over: what is shown is its last instant.")
+        said.append("The recording has ended; the page shows its last instant.")
     elif state is State.LINK_LOST:
-        ghost = (
-            "the twin flies on alone; what moves is its prediction" if vehicle.forecast is not None else "no twin yet"
-        )
+        ghost = "the position shown is predicted by the twin" if vehicle.forecast is not None else "no twin yet"
         said.append(f"No sample for {ago(vehicle.age(now))}: {ghost}.")
     elif state in (State.WAITING, State.UNCLAIMED) and vehicle.model is None:
-        said.append("No worker has judged this UAV yet; check that `twin_worker` runs on this router.")
+        said.append("No worker result for this UAV yet; check that `twin_worker` runs on this router.")
     elif state is State.UNCLAIMED:
         said.append(
-            f"No worker has spoken of this UAV for {ago(now - vehicle.believed)}: what is shown is its last word; "
+            f"No worker result for this UAV for {ago(now - vehicle.believed)}; the page shows the last one; "
             "check that `twin_worker` runs on this router."
         )
     elif vehicle.forecast is None:
-        said.append(
-            f"No horizon yet, heard for {ago(_known_s(vehicle, now))}: nothing is claimed before a model is verified."
-        )
+        said.append(f"No horizon yet after {ago(_known_s(vehicle, now))} of telemetry; it needs a verified model.")
     if late := vehicle.late(now):
         slower = "play the recording more slowly, or " if vehicle.recorded else ""
-        behind = f": its worker has fallen behind; {slower}let fewer UAVs share a worker"
+        behind = f": its worker is overloaded; {slower}assign fewer UAVs to each worker"
         said.append(f"The newest prediction is {ago(late)} old{'' if state is State.LINK_LOST else behind}.")
     if vehicle.prediction is not None and vehicle.prediction.sentence:
         said.append(vehicle.prediction.sentence)
@@ -82,13 +78,13 @@ def why(vehicle: Vehicle, now: float) -> list[str]:
 
 
 def _known_s(vehicle: Vehicle, now: float) -> float:
-    """Return for how long its flight has been heard, in data time [s]."""
+    """Return the data time since the start of its track [s]."""
     rows = vehicle.track.rows()
     return vehicle.clock(now) - float(rows[0, 0]) if len(rows) else 0.0
 
 
 def clip(text: str) -> str:
-    """Cut what came from outside and is longer than anybody reads."""
+    """Truncate received text to `MAX_TEXT` characters."""
     return text if len(text) <= LETTERS else text[: LETTERS - 1] + "…"
 
 
@@ -103,10 +99,10 @@ def _sentences(vehicle: Vehicle, palette: Palette, now: float) -> str:
     verdict = vehicle.model.verdict if vehicle.model is not None else None
     if verdict is not None:
         colour = palette.verified if verdict.outcome is Outcome.VERIFIED else palette.identifying
-        least = f", threshold {verdict.threshold:.0f} %" if verdict.threshold > 0 else ""  # some judge without one
+        least = f", threshold {verdict.threshold:.0f} %" if verdict.threshold > 0 else ""
         cards.append(
             f'<div class="say" style="border-color:{colour}"><b>{escape(verdict.outcome.value.replace("_", " "))}</b> '
-            f'<span class="soft">newest try, number {verdict.tries}{least}</span><br>'
+            f'<span class="soft">newest verification, number {verdict.tries}{least}</span><br>'
             f"{escape(clip(verdict.sentence))}</div>"
         )
     elif vehicle.row is not None and not any(vehicle.row.verdict in text for text in ("", *said)):
@@ -127,29 +123,29 @@ def _fits(vehicle: Vehicle) -> str:
     )
     return (
         f'<div class="soft">fit per state over {verdict.horizon_s:.1f} s, %</div><table><tr><th></th>{head}</tr>'
-        f"<tr><td>model</td>{ours}</tr><tr class=soft><td>hold</td>{hold}</tr></table>"
+        f"<tr><td>model</td>{ours}</tr><tr class=soft><td>persistence</td>{hold}</tr></table>"
     )
 
 
 def coverage(vehicle: Vehicle) -> str:
-    """Say how often the tube held so far."""
+    """Describe the measured coverage of the prediction region."""
     told = vehicle.prediction
     if told is None or told.held_n <= 0 or not isfinite(told.held):
         return "not measured yet"
-    return f"{told.quantile * 100:.0f} % tube held {told.held * 100:.0f} %, n = {told.held_n}"
+    return f"{told.quantile * 100:.0f} % region: coverage {told.held * 100:.0f} %, n = {told.held_n}"
 
 
 HOW = {
-    "received": "told by the autopilot",
-    "identified": "learnt from flight",
-    "default": "assumed: the autopilot's default",
-    "asked": "supposed",
+    "received": "received from the autopilot",
+    "identified": "identified in flight",
+    "default": "assumed: autopilot default",
+    "asked": "what-if value",
 }
-MOST = 40  # parameters shown of each kind
+MOST = 40  # parameters shown per provenance
 
 
 def law(controller: Controller | None) -> str:
-    """Show the law in force and the parameters it flies with, apart by how each is known."""
+    """Return the active control law and its parameters by provenance as HTML."""
     if controller is None:
         return ""
     parts = [(how, getattr(controller, how)) for how in HOW]
@@ -160,7 +156,7 @@ def law(controller: Controller | None) -> str:
         for how, given in parts
         if given
     )
-    head = f'<div class="soft">law in force: <b class="law">{escape(controller.law[:100])}</b></div>'
+    head = f'<div class="soft">active law: <b class="law">{escape(controller.law[:100])}</b></div>'
     return f'{head}<table class="law">{rows}</table>'
 
 
@@ -169,12 +165,12 @@ def _facts(vehicle: Vehicle, now: float) -> str:
     at = vehicle.clock(now)
     figures = {
         "coverage": coverage(vehicle),
-        "trust": told.calibration or "–" if told is not None else "–",
+        "calibration": told.calibration or "–" if told is not None else "–",
         "method": f"{told.method} · {told.law or 'no law'}" if told is not None else "–",
         "mode": f"{status.mode or '–'} · {status.autopilot} · {'armed' if status.armed else 'disarmed'}"
         if status is not None
         else "–",
-        "link": f"{status.received} received, {status.missed} missed, {status.rejected} refused"
+        "link": f"{status.received} received, {status.missed} missed, {status.rejected} rejected"
         if status is not None
         else "–",
         "recorded" if vehicle.recorded else "data time": stamp(at)

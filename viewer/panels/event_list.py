@@ -1,4 +1,4 @@
-"""The list of events of one UAV, as HTML: newest first, each with its data time, glyph and colour."""
+"""Event list of one UAV as HTML: newest first, with data time, glyph and colour."""
 
 from html import escape
 
@@ -6,16 +6,16 @@ from viewer.store.received.datatime import day, moment, stamp
 from viewer.theme.events import Event
 from viewer.theme.palette import MARK, Palette
 
-ROWS = 40  # shown; how many came before is said
+ROWS = 40  # events shown; earlier ones are counted
 
 
 def listing(events: tuple[Event, ...], palette: Palette, seek: str = "") -> str:
-    """List events, oldest first in, newest first out; their words are escaped here.
+    """Return the events as HTML, newest first; texts are escaped here.
 
     Args:
-        events: what happened
+        events: oldest first
         palette: colours
-        seek: the page's code that shows the time in its place `{}`; empty: rows cannot be pressed
+        seek: page code that seeks to the time inserted at `{}`; empty: rows are not clickable
     """
     if not events:
         return '<div class="uav"><b>Events</b> <span class="soft">none yet</span></div>'

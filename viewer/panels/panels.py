@@ -1,4 +1,4 @@
-"""The panels: left the fleet, its alerts and what to show; right the selected UAV."""
+"""Panels of the page: fleet, alerts and display options on the left, selected UAV on the right."""
 
 from collections.abc import Callable
 from html import escape
@@ -20,12 +20,12 @@ from viewer.text.missed_events import since
 from viewer.text.words import MAX_ROWS, alerts, empty, legend, severity, summary, table
 from viewer.theme.palette import WORD, Palette, triple
 
-STALE = "The viewer has stopped sending: this picture is old. Restart it; the page comes back by itself."
-NOBODY = "–"  # of the menu that selects where rows cannot be clicked
+STALE = "No data from the viewer: this page is out of date. Restart the viewer; the page reconnects automatically."
+NOBODY = "–"  # menu entry without a selection
 
 
 class Panels:
-    """All that is not 3-D, on one page."""
+    """All panels of one page."""
 
     def __init__(
         self,
@@ -39,8 +39,8 @@ class Panels:
         self._commands = Commands(self._gui, choose, actions)
         self._beat = False
         self._router = Router()
-        self.ground_said = ""  # what is wrong with the files of the ground
-        self.seek = ""  # the page's code that shows the time of an event
+        self.ground_said = ""  # error of the terrain files
+        self.seek = ""  # page code that seeks to the time of an event
         self._gui.configure_theme(
             dark_mode=palette.dark, show_logo=False, show_share_button=False, brand_color=triple(palette.predicting)
         )
@@ -66,7 +66,7 @@ class Panels:
             self._picked = gui.add_text("picked", "", visible=False)
         with tabs.add_tab("Alerts", viser.Icon.ALERT_TRIANGLE):
             self._since = gui.add_html("")
-            self._read = gui.add_button("I have read it", visible=False)
+            self._read = gui.add_button("Mark as read", visible=False)
             self._alerts = gui.add_html("")
         with tabs.add_tab("Display", viser.Icon.ADJUSTMENTS):
             self.predicted = gui.add_checkbox("Predicted paths", True)
@@ -94,12 +94,12 @@ class Panels:
         panel.set_width(350)
 
     def _pick(self, text: str) -> None:
-        """Take what a click wrote into the hidden input."""
+        """Select the UAV that a click wrote into the hidden input."""
         if (found := clicked(text)) is not None:
             self._choose(*found)
 
     def say_broken(self, sentence: str) -> None:
-        """Say that this page could not be drawn, and why; an empty sentence takes it back."""
+        """Show a drawing error; an empty sentence removes it."""
         said = (
             f'<div class="uav"><div class="say" style="border-color:{self._palette.mismatch}">{escape(sentence)}</div>'
         )
@@ -108,7 +108,7 @@ class Panels:
             self._broken.content = said
 
     def draw(self, fleet: list[Vehicle], feed: Feed, now: float, selected: int | None) -> None:
-        """Write everything anew; call it about once a second, and when the selection changes."""
+        """Update all panels; call it about once per second and when the selection changes."""
         self._beat, palette, pick = not self._beat, self._palette, self._handler()
         chosen = next((vehicle for vehicle in fleet if vehicle.uav == selected), None)
         kept = [vehicle for vehicle in fleet if self._passes(vehicle, now, selected)]
@@ -125,21 +125,21 @@ class Panels:
             (self._alerts, alerts(fleet, feed, palette, pick)),
             (self._facts, facts(chosen, now) if chosen is not None else ""),
         )
-        with self._browser.client.atomic():  # made first: while it lasts, nothing else is sent
+        with self._browser.client.atomic():  # contents first: the block delays all other messages
             for html, text in said:
                 html.content = text
             self._list(kept)
             self._read.visible = bool(missed)
             self.show(chosen, now)
             told = listing(chosen.events, palette, self.seek) if chosen is not None else ""
-            if told != self._events.content:  # written anew, a list somebody scrolls would jump to its top
+            if told != self._events.content:  # an unchanged list keeps its scroll position
                 self._events.content = told
         self._charts.draw(chosen, feed, now)
         self._commands.offer(fleet)
 
     def show(self, chosen: Vehicle | None, now: float) -> None:
-        """Say who is selected and how it stands."""
-        nobody = '<div class="uav soft">Nobody is selected: click a row or an aircraft, or press Ctrl+K.</div>'
+        """Show the status of the selected UAV."""
+        nobody = '<div class="uav soft">No UAV selected: click a row or an aircraft, or press Ctrl+K.</div>'
         said = about(chosen, self._palette, now) if chosen is not None else nobody
         if said != self._about.content:
             self._about.content = said
@@ -156,12 +156,12 @@ class Panels:
         return all(word in text for word in wanted)
 
     def _handler(self) -> str:
-        """Return the handler of a table row: it sets the hidden input, as if someone had typed the id there."""
+        """Return the click handler of a table row: it writes the id into the hidden input."""
         message = f"{{{{type:'GuiUpdateMessage',uuid:'{self._picked._impl.uuid}',updates:{{{{value:'{{}}'}}}}}}}}"
         return f"var m=window.__viserMutable;m&&m.sendMessage({message})"
 
     def _list(self, kept: list[Vehicle]) -> None:
-        """Offer the rows of the table in the menu, too."""
+        """List the rows of the table in the menu."""
         names = NOBODY, *(vehicle.name for vehicle in kept)
         if self._menu.options != names:
             self._menu.options = names

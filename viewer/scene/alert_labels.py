@@ -1,4 +1,4 @@
-"""Words in 3-D for those who need an eye: supervision is by exception."""
+"""Labels in 3-D for UAVs with an alert, a mismatch or a lost link."""
 
 import numpy as np
 
@@ -10,11 +10,11 @@ from viewer.text.mismatch_text import in_force, short
 from viewer.text.words import ago, severity
 from viewer.theme.palette import GLYPH
 
-MOST = 6  # named at once; those that do not fit are left out
+MOST = 6  # most labels at once; overlapping ones are omitted
 
 
 def callouts(flock: Flock, selected: int | None, unit: float) -> list[Tag]:
-    """Name the worst few where they fly; `unit` is the drawn span of an aircraft [10 m]."""
+    """Return labels at the most severe UAVs; `unit` is the drawn span of an aircraft [10 m]."""
     needy = [(v, i) for v, i in flock.needy if v.uav != selected and not v.ended]
     rows = sorted(needy, key=lambda one: severity(one[0], flock.now))[:MOST]
     above = np.array([0.0, 0.0, 0.9 * unit])
@@ -30,7 +30,7 @@ def callouts(flock: Flock, selected: int | None, unit: float) -> list[Tag]:
 
 
 def caption(vehicle: Vehicle, now: float) -> str:
-    """Say in few words what is wrong with a UAV."""
+    """Describe the problems of a UAV in a short label."""
     if vehicle.state(now) is State.LINK_LOST:
         return f"{GLYPH[State.LINK_LOST]} {vehicle.name} link lost {ago(vehicle.age(now))}"
     kinds = ", ".join(dict.fromkeys(alert.kind.value.replace("_", " ") for alert in vehicle.alerts.values()))

@@ -1,4 +1,4 @@
-"""The whole fleet as arrays, once for all who look: who, where, how each stands, and a minute of trail."""
+"""Fleet as arrays, shared by all pages: ids, positions, statuses and one minute of trail."""
 
 import numpy as np
 
@@ -9,15 +9,15 @@ from viewer.store.store import Feed
 from viewer.store.vehicle import Vehicle
 from viewer.text.mismatch_text import in_force
 
-CHUNKS, STEPS = 5, 12  # the trail: chunks of 12 s, and a head of up to 12 s, one point a second
-MINUTE = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # how long ago each point of the trail is, (73,) [s]
-COARSE = ((60, 1), (CROWD, 2))  # of a fleet up to so many, seconds between the drawn points of a trail; else 4
-TURNS = 5  # calls in which the places of a crowd are all read once
-COAST_S, STALE_S = 1.5, 2.5  # so long one goes on unheard; a speed over a longer gap is none [s]
-FASTEST = 30.0  # what went faster has leapt [10 m/s]
-LEAP_M = 1_000.0  # farther within a second is no flight but another one (a recording begun anew): a new trail [m]
-HOVER = ("multirotor", "helicopter")  # kinds of vehicle drawn with rotors
-LOOKS = ("muted", "predicting", "verified", "identifying", "lost", "mismatch")  # names of colours
+CHUNKS, STEPS = 5, 12  # the trail: chunks of 12 s and a head of up to 12 s, one point per second
+MINUTE = np.arange(float(CHUNKS + 1) * STEPS, -1.0, -1.0)  # age of each trail point, (73,) [s]
+COARSE = ((60, 1), (CROWD, 2))  # (most UAVs, seconds between drawn trail points); else 4
+TURNS = 5  # calls in which all positions of a large fleet are decoded once
+COAST_S, STALE_S = 1.5, 2.5  # longest extrapolation; longest interval for a velocity [s]
+FASTEST = 30.0  # a higher speed is a jump [10 m/s]
+LEAP_M = 1_000.0  # a larger step in one second restarts the trail, as for a restarted recording [m]
+HOVER = ("multirotor", "helicopter")  # vehicle types drawn with rotors
+LOOKS = ("muted", "predicting", "verified", "identifying", "lost", "mismatch")  # palette colour of each display status
 WAITING, PREDICTING, VERIFIED, IDENTIFYING, LOST, MISMATCH = range(len(LOOKS))
 _OF_STATE = {
     State.PREDICTING: PREDICTING,
@@ -28,7 +28,7 @@ _OF_STATE = {
 
 
 def look(vehicle: Vehicle, now: float) -> int:
-    """Tell how a UAV looks: an index into `LOOKS`; a mismatch or an alert wins over all but a lost link."""
+    """Return the display status of a UAV; a mismatch or an alert takes precedence over all but a lost link."""
     state = vehicle.state(now)
     if vehicle.ended:
         return WAITING
@@ -38,30 +38,30 @@ def look(vehicle: Vehicle, now: float) -> int:
 
 
 class Flock:
-    """Who is drawn, in the order of their ids; arrays of n."""
+    """Drawn UAVs in the order of their ids; arrays of length n."""
 
     def __init__(self) -> None:
-        self.fleet: list[Vehicle] = []  # copies, as of the last second
-        self._shown: list[Vehicle] = []  # those who are drawn
-        self.now = 0.0  # when that was, monotonic [s]
+        self.fleet: list[Vehicle] = []  # snapshots of the last second
+        self._shown: list[Vehicle] = []  # drawn UAVs
+        self.now = 0.0  # time of the snapshots, monotonic [s]
         self.uavs: tuple[int, ...] = ()
-        self._rows: dict[int, int] = {}  # the row of each
-        self.looks = np.zeros(0, int)  # indices into LOOKS
-        self.hover = np.zeros(0, bool)  # who has rotors instead of wings
+        self._rows: dict[int, int] = {}  # row of each UAV
+        self.looks = np.zeros(0, int)  # indices into STATUS_COLOURS
+        self.hover = np.zeros(0, bool)  # rotors instead of wings
         self.at = np.zeros((0, 3))  # scene ENU [10 m]
         self.quat = np.zeros((0, 4))  # orientation, scalar first
-        self.changes = 0  # of who is drawn, and of trails begun anew
+        self.changes = 0  # counts changes of the drawn UAVs and restarted trails
         self.beats = 0  # seconds of trail
         self.ring = np.zeros((0, len(MINUTE), 3))  # a minute of trail, newest last
-        self._ghosts: list[tuple[int, Vehicle]] = []  # whose place is predicted, for they are not heard
-        self._turn = 0  # which part of a crowd was read last
-        self._told = np.zeros((0, 3))  # of a crowd: where each was when it was last read [10 m]
-        self._heard = np.zeros(0)  # when that was heard, monotonic [s]
-        self._speed = np.zeros((0, 3))  # how fast each went by then [10 m/s]
+        self._ghosts: list[tuple[int, Vehicle]] = []  # UAVs without telemetry, drawn at a predicted or last position
+        self._turn = 0  # part of a large fleet decoded last
+        self._told = np.zeros((0, 3))  # large fleet: last decoded positions [10 m]
+        self._heard = np.zeros(0)  # their arrival, monotonic [s]
+        self._speed = np.zeros((0, 3))  # velocities at that time [10 m/s]
 
     @property
     def crowd(self) -> bool:
-        """Return whether there are too many to draw everything of each: exceptions alone keep predicted paths."""
+        """Return whether the fleet is large: then only exceptional UAVs have predicted paths."""
         return len(self.uavs) > CROWD
 
     @property
@@ -71,25 +71,25 @@ class Flock:
 
     @property
     def chunks(self) -> int:
-        """Return how many closed chunks of trail are drawn."""
+        """Return the number of closed trail chunks to draw."""
         return CHUNKS if len(self.uavs) <= COARSE[0][0] else 2 if self.crowd else 3
 
     @property
     def exceptions(self) -> np.ndarray:
-        """Tell who needs an eye, (n,)."""
+        """Return a mask of UAVs with an alert, mismatch or lost link, (n,)."""
         return (self.looks == MISMATCH) | (self.looks == LOST)
 
     @property
     def needy(self) -> list[tuple[Vehicle, int]]:
-        """Return who needs an eye, with their rows."""
+        """Return UAVs with an alert, mismatch or lost link, and their rows."""
         return [(self._shown[i], i) for i in np.flatnonzero(self.exceptions).tolist()]
 
     def index(self, uav: int | None) -> int | None:
-        """Return the row of a UAV; None where it is not drawn."""
+        """Return the row of a UAV; None when it is not drawn."""
         return self._rows.get(uav) if uav is not None else None
 
     def meet(self, fleet: list[Vehicle], now: float) -> None:
-        """Take over who is there and how they stand; call it once a second."""
+        """Update UAVs and statuses; call it once per second."""
         self.fleet, self.now = fleet, now
         shown = [(vehicle, at) for vehicle in fleet if (at := vehicle.where(now)) is not None]
         self._shown = [vehicle for vehicle, _ in shown]
@@ -106,7 +106,7 @@ class Flock:
                 self._told[i] = shown[i][1]
 
     def _enlist(self, uavs: tuple[int, ...], at: np.ndarray) -> None:
-        """Begin with another set of UAVs; those who stay keep their trails."""
+        """Replace the set of UAVs; remaining UAVs keep their trails."""
         ring = np.repeat(at[:, None], len(MINUTE), axis=1)
         for i, uav in enumerate(uavs):
             if uav in self._rows:
@@ -117,10 +117,10 @@ class Flock:
         self._told, self._heard, self._speed = at.copy(), np.full(len(uavs), -np.inf), np.zeros_like(at)
 
     def pose(self, feed: Feed, now: float) -> None:
-        """Take over where everybody is; call it as often as the picture moves.
+        """Update positions and attitudes; call it once per frame.
 
-        Of a crowd a part is read at each call, in between everybody goes on as before; who needs an eye or is selected
-        is read every time.
+        Of a large fleet each call decodes a part and extrapolates the others; exceptional and selected UAVs are
+        decoded every time.
         """
         if not self.uavs:
             return
@@ -138,7 +138,7 @@ class Flock:
         self.at = self._told + self._speed * np.clip(now - self._heard, 0.0, COAST_S)[:, None]
 
     def _take_all(self, feed: Feed, now: float) -> None:
-        """Read where everybody is; whose place is predicted goes on by that."""
+        """Read all poses; UAVs without telemetry use the predicted position."""
         places, turns, _ = feed.poses(self.uavs)
         heard = np.isfinite(places[:, 0])
         heard[[i for i, _ in self._ghosts]] = False
@@ -149,7 +149,7 @@ class Flock:
         self.quat = scene_quat(*turns.T)
 
     def _take(self, feed: Feed, rows: np.ndarray) -> None:
-        """Read where some of a crowd are, rows (k,), and how fast they went since they were last read."""
+        """Read the poses of some rows (k,) and update their velocities."""
         places, turns, heard = feed.poses(tuple(self.uavs[i] for i in rows))
         new = np.isfinite(places[:, 0]) & (heard > self._heard[rows])
         self.quat[rows] = scene_quat(*turns.T)
@@ -160,10 +160,10 @@ class Flock:
         self._told[rows], self._heard[rows] = places, heard
 
     def beat(self, played: dict[int, np.ndarray]) -> None:
-        """Remember where everyone is, once a second.
+        """Append the positions to the trails, once per second.
 
         Args:
-            played: of UAVs whose seconds are others than ours, the places `MINUTE` ago, (n, 3) [10 m]
+            played: trails of UAVs that are not in real time, positions `TRAIL_AGES_S` ago, (n, 3) [10 m]
         """
         if not self.uavs:
             return
@@ -182,7 +182,7 @@ class Flock:
         return self.ring[:, last - STEPS : last + 1 : self.stride]
 
     def head(self) -> np.ndarray:
-        """Return the newest stretch of trail up to where each is now, (n, k, 3): an array of fixed size."""
+        """Return the newest stretch of trail up to the current position, (n, k, 3), k constant."""
         run = self.beats % STEPS
         points = self.ring[:, len(MINUTE) - 1 - run :: self.stride]
         missing = STEPS // self.stride + 2 - points.shape[1]

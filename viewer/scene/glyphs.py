@@ -1,4 +1,4 @@
-"""The aircraft of one page: a batch for each shape, each aircraft as large as it takes to be seen from where one is."""
+"""Aircraft of one page: one mesh batch per shape, scaled to the camera distance."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,26 +10,26 @@ from viewer.scene.labels import Sight
 from viewer.theme.palette import Palette, mesh_colour, rgb
 from viewer.theme.shapes import aircraft, dart, rotorcraft
 
-SHARE, LEAST_SHARE = 0.042, 0.016  # of the height of the picture that an aircraft spans in its middle [-]
-FEW = 60  # in view, up to which aircraft are as large as that; of more each is smaller
-NEARNESS = 0.5  # 1: all look equally large, however far; 0: as perspective has it [-]
-EXCEPTION, CHOSEN = 1.7, 1.25  # how much larger who needs an eye in a crowd, and who is selected
-QUIET = 0.62  # in a crowd the colour of who is well is so much its own, the rest the ground's [-]
+SHARE, LEAST_SHARE = 0.042, 0.016  # share of the image height that an aircraft spans at its centre [-]
+FEW = 60  # visible aircraft up to which they have that size; more are drawn smaller
+NEARNESS = 0.5  # 1: same apparent size at any distance; 0: perspective [-]
+EXCEPTION, CHOSEN = 1.7, 1.25  # scale of exceptional UAVs in a large fleet, and of the selected UAV
+QUIET = 0.62  # large fleet: colour share of nominal UAVs, the rest is ground colour [-]
 
 
 class Glyphs:
-    """One batch per shape; a batch is made anew when others take part in it."""
+    """One batch per shape, rebuilt when its UAVs change."""
 
     def __init__(self, scene: Any, palette: Palette, clicked: Callable[[int], None]) -> None:
         self._scene, self._palette, self._clicked = scene, palette, clicked
         self._colours = np.array([rgb(colour) for colour in palette.looks()])
-        self._batches: list[tuple[Any, np.ndarray]] = []  # each with the rows of the flock it shows
+        self._batches: list[tuple[Any, np.ndarray]] = []  # batch and the fleet rows it shows
         self._known: tuple[int, int, bool] = (-1, -1, False)
         self._looks = np.zeros(0, int)
-        self.unit = 1.0  # drawn span of an aircraft in the middle of the picture [10 m]
+        self.unit = 1.0  # drawn span of an aircraft at the centre of the image [10 m]
 
     def draw(self, flock: Flock) -> None:
-        """Place every aircraft; call it at the full rate."""
+        """Update positions and orientations; call it at the full rate."""
         members = (hash(flock.uavs), hash(flock.hover.tobytes()), flock.crowd)
         if members != self._known:
             self._make(flock)
@@ -39,13 +39,13 @@ class Glyphs:
             batch.batched_wxyzs = flock.quat[rows]
 
     def look(self, flock: Flock, sight: Sight, *, selected: int | None, size: float) -> None:
-        """Colour and size them; call it a few times a second.
+        """Update colours and sizes; call it a few times per second.
 
         Args:
-            flock: who is drawn
-            sight: what the camera sees
-            selected: the UAV of this page
-            size: as the operator wishes, 1 is usual [-]
+            fleet_arrays: drawn UAVs
+            camera_view: view of the camera
+            selected: selected UAV of this page
+            size: scale set by the operator, 1 is the default [-]
         """
         if not self._batches or not len(flock.looks):
             return
@@ -68,7 +68,7 @@ class Glyphs:
                 batch.batched_colors = mesh_colour(colours[rows] * 0.85)
 
     def colours(self, flock: Flock) -> np.ndarray:
-        """Return the colour of each, (n, 3) [0..255]: in a crowd those who are well stand back."""
+        """Return the colours, (n, 3) [0..255]; in a large fleet nominal UAVs are muted."""
         colours = self._colours[flock.looks]
         if not flock.crowd:
             return colours

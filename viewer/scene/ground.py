@@ -1,4 +1,4 @@
-"""What everything stands on: grid, range rings with their distances, sky."""
+"""Ground of the scene: grid, range rings with distances, sky."""
 
 from typing import Any
 
@@ -11,18 +11,18 @@ from viewer.theme.numerals import written
 from viewer.theme.palette import Palette, rgb
 
 RINGS_M = (500, 1000, 2000, 5000, 10_000)
-NETS = ((100, 1_200, 0.5), (500, 6_000, 1.0), (5_000, 30_000, 1.0))  # lines so far apart, so far out [m], how strong
-PARTS = 6  # a line of the grid fades in so many steps
+NETS = ((100, 1_200, 0.5), (500, 6_000, 1.0), (5_000, 30_000, 1.0))  # spacing [m], extent [m], strength [-]
+PARTS = 6  # segments of a fading grid line
 
 
 class Ground:
-    """The ground of one page: its height follows what is known of it."""
+    """Ground grid of one page at the estimated ground height."""
 
     def __init__(self, scene: Any, palette: Palette) -> None:
         self.height = 0.0  # scene [10 m]
         scene.set_background_image(_sky(palette), format="png")
         scene.configure_default_lights(True, cast_shadow=False)
-        # No fog: with it the client fails to draw the outline of an aircraft under the mouse, and then the whole frame.
+        # No fog: with fog the client fails to draw the outline of a hovered aircraft and loses the frame.
         self._node = scene.add_frame("/env", show_axes=False)
         lines, colours = zip(*[_grid(palette, *net) for net in NETS], strict=True)
         self.grid = Strokes(scene, "/env/grid", 1.0)
@@ -38,18 +38,19 @@ class Ground:
 
 
 def _sky(palette: Palette) -> np.ndarray:
-    """Paint the background: sky above, the colour of the ground from the upper third down, (256, 2, 3)."""
+    """Return the background: sky in the upper third, ground colour below, (256, 2, 3)."""
     share = np.clip(np.linspace(0, 3, 256), 0, 1)[:, None, None] ** 0.7
     return np.repeat(rgb(palette.sky[0]) * (1 - share) + rgb(palette.ground) * share, 2, axis=1).astype(np.uint8)
 
 
 def _grid(palette: Palette, apart: float, reach: float, strong: float) -> tuple[np.ndarray, np.ndarray]:
-    """Lay a net of lines that fade outwards, as the renderer's own grid would take most of a software renderer's time.
+    """Return grid lines that fade outwards; the built-in grid is too slow for software rendering.
 
     Args:
         palette: colours
-        apart, reach: of the lines, [m]
-        strong: share of the full colour in the middle [-]
+        spacing: of the lines [m]
+        reach: of the lines [m]
+        strength: share of the full colour at the centre [-]
     Returns:
         segments (n, 2, 3) [10 m] and the colours of their ends (n, 2, 3)
     """
@@ -64,6 +65,6 @@ def _grid(palette: Palette, apart: float, reach: float, strong: float) -> tuple[
 
 
 def _distance(metres: int) -> np.ndarray:
-    """Write how far a ring is, flat on the ground inside its southern edge: (n, 2, 3)."""
+    """Return the strokes of a ring's distance, inside its southern edge: (n, 2, 3)."""
     tall = 0.035 * metres / UNIT_M + 0.8
     return written(f"{metres / 1000:g} km", tall) + np.array([0.4 * tall, -metres / UNIT_M + 0.4 * tall, 0.02])

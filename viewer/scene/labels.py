@@ -1,22 +1,22 @@
-"""At most eight labels in 3-D, those that matter most, and none upon another: labels do not make room by themselves."""
+"""Up to eight labels in 3-D by priority, without overlap."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
 MOST = 8
-SCALE = 0.82  # of the font, of every label: the page draws each letter once for each size, and slowly
-LETTER, LINE = 0.0068 * SCALE, 0.020 * SCALE  # width and height of a letter over the height of the picture [-]
-EDGE = 0.02  # a label keeps this far from the edge of the picture [heights of it]
+SCALE = 0.82  # font scale of every label: one size, as the page rasterises each size separately
+LETTER, LINE = 0.0068 * SCALE, 0.020 * SCALE  # character width and line height over image height [-]
+EDGE = 0.02  # margin to the image edge [image heights]
 _SHIFT = {"bottom-center": (-0.5, 0.0), "bottom-left": (0.0, 0.0), "top-center": (-0.5, -1.0), "top-left": (0.0, -1.0)}
 _SHIFT |= {"bottom-right": (-1.0, 0.0), "top-right": (-1.0, -1.0)}
-_OTHER_SIDE = {"bottom-left": "bottom-right", "top-left": "top-right"}  # where there is no room beside its place
+_OTHER_SIDE = {"bottom-left": "bottom-right", "top-left": "top-right"}  # fallback anchor at the image edge
 
 
 class Tag(NamedTuple):
-    """Words at a place."""
+    """Label text at a position."""
 
-    key: str  # what it is, so that it keeps its node while it is shown
+    key: str  # identity, so that the label keeps its node
     text: str
     at: np.ndarray  # (3,) [10 m]
     anchor: str = "top-center"
@@ -33,7 +33,7 @@ class Labels:
         self._held: dict[str, Any] = {}  # key -> node
 
     def draw(self, tags: list[Tag], sight: "Sight") -> None:
-        """Show the first that fit, most important first."""
+        """Show the labels that fit, in order of priority."""
         shown = fitting(tags, sight)
         keys = {tag.key for tag in shown}
         for key in [key for key in self._held if key not in keys]:
@@ -48,7 +48,7 @@ class Labels:
 
 
 class Sight(NamedTuple):
-    """What a camera sees: from where, which way, how wide."""
+    """View of a camera: position, direction and field of view."""
 
     eye: np.ndarray  # (3,) [10 m]
     look_at: np.ndarray  # (3,) [10 m]
@@ -56,7 +56,7 @@ class Sight(NamedTuple):
     aspect: float  # width over height [-]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Give where points (n, 3) are, right and up of the picture's middle in heights of it, (n, 2), and how deep."""
+        """Project points (n, 3): right and up of the image centre in image heights, (n, 2), and depth (n,)."""
         right, up = self.axes()
         off = points - self.eye
         depth = off @ np.cross(up, right)
@@ -64,7 +64,7 @@ class Sight(NamedTuple):
         return flat / (2 * np.tan(self.fov / 2) * np.maximum(depth, 1e-3)[:, None]), depth
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the directions right and up in the picture, two (3,)."""
+        """Return the image directions right and up, two (3,)."""
         ahead = (self.look_at - self.eye) / (np.linalg.norm(self.look_at - self.eye) or 1.0)
         right = np.cross(ahead, [0.0, 0.0, 1.0])
         right = right / (np.linalg.norm(right) or 1.0)
@@ -72,7 +72,7 @@ class Sight(NamedTuple):
 
 
 def fitting(tags: list[Tag], sight: Sight) -> list[Tag]:
-    """Choose the labels that are in the picture and clear of those before them, at most `MOST`."""
+    """Return the labels inside the image without overlap, at most `MAX_LABELS`."""
     if not tags:
         return []
     spots, depth = sight.project(np.array([tag.at for tag in tags]))
@@ -93,7 +93,7 @@ def fitting(tags: list[Tag], sight: Sight) -> list[Tag]:
 
 
 def _box(tag: Tag, spot: np.ndarray) -> np.ndarray:
-    """Return the corners of a label in the picture, (2, 2) [heights of it]."""
+    """Return the corners of a label in the image, (2, 2) [image heights]."""
     size = np.array([LETTER * len(tag.text), LINE])
     low = spot + np.array(_SHIFT[tag.anchor]) * size
     return np.stack([low, low + size])

@@ -1,4 +1,4 @@
-"""A mismatch in the scene: the stretches of the flown path where it was located, and where it began."""
+"""Mismatch in the scene: located stretches of the flown path and onset position."""
 
 from math import isfinite
 
@@ -13,11 +13,11 @@ MOST_POINTS = 200  # points of a segment
 
 
 def lines(found: Mismatch | None, track: np.ndarray) -> np.ndarray:
-    """Return the stretches of the flown path where it was located, as segments (n, 2, 3) [10 m].
+    """Return the located stretches of the flown path as segments (n, 2, 3) [10 m].
 
     Args:
-        found: what was said last
-        track: the flown path: fleet time [s], scene ENU [10 m], (m, 4)
+        mismatch: the latest mismatch
+        track: flown path: data time [s], scene ENU [10 m], (m, 4)
     """
     parts = [np.zeros((0, 2, 3))]
     if found is None or found.outcome is Found.NONE or len(track) < 2:
@@ -31,7 +31,7 @@ def lines(found: Mismatch | None, track: np.ndarray) -> np.ndarray:
 
 
 def place(found: Mismatch | None, track: np.ndarray) -> np.ndarray | None:
-    """Return where on the flown path the first cause began, (3,) [10 m]; None where that is not known."""
+    """Return the position of the mismatch onset, (3,) [10 m]; None when it is unknown."""
     if found is None or found.outcome is Found.NONE or found.onset is None or not isfinite(found.onset):
         return None
     (spot,) = placed(track, np.array([found.onset]))

@@ -1,4 +1,4 @@
-"""A mission as lines: navigation items in order, loiters as circles; all else an aircraft may upload is survived."""
+"""Mission as lines: navigation items in order, loiters as circles; other or invalid items are skipped."""
 
 from typing import NamedTuple
 
@@ -35,19 +35,19 @@ AT_A_PLACE = {
 }
 RADIUS_IN = {LOITER_UNLIM: "param3", LOITER_TURNS: "param3", LOITER_TIME: "", LOITER_TO_ALT: "param2"}
 ABSOLUTE = {0, 5}  # MAV_FRAME: GLOBAL, GLOBAL_INT; every other altitude counts from home
-RADIUS_M = 60.0  # where an item names no loiter radius: the default of ArduPlane's WP_LOITER_RAD [m]
-MAX_M = 50_000.0  # altitudes and radii beyond are not drawn [m]
+RADIUS_M = 60.0  # default loiter radius: WP_LOITER_RAD of ArduPlane [m]
+MAX_M = 50_000.0  # larger altitudes and radii are not drawn [m]
 
 
 class Route(NamedTuple):
-    """What to draw of a mission, scene ENU [10 m]."""
+    """Lines of a mission, scene ENU [10 m]."""
 
     legs: np.ndarray  # straight legs, (n, 2, 3)
     back: np.ndarray  # jumps and returns, drawn dashed, (m, 2, 3)
     circles: np.ndarray  # loiter circles as segments, (k, 2, 3)
-    points: np.ndarray  # where items sit, (p, 3)
-    items: np.ndarray  # the number of each, (p,)
-    ends: np.ndarray  # the number of the item each leg ends at, (n,)
+    points: np.ndarray  # positions of the items, (p, 3)
+    items: np.ndarray  # their numbers, (p,)
+    ends: np.ndarray  # number of the item at the end of each leg, (n,)
 
 
 _NO_LINES, _NO_ITEMS = np.zeros((0, 2, 3)), np.zeros(0, int)
@@ -55,7 +55,7 @@ NOTHING = Route(_NO_LINES, _NO_LINES, _NO_LINES, np.zeros((0, 3)), _NO_ITEMS, _N
 
 
 def home_alt_m(mission: Mission | None) -> float | None:
-    """Return home's altitude [m above mean sea level]: item 0 of an ArduPilot mission; None where there is none."""
+    """Return the home altitude [m above mean sea level]: item 0 of an ArduPilot mission; None without home."""
     if mission is None or len(mission.items) < 2:
         return None
     first, rest = mission.items[0], mission.items[1:]
@@ -64,12 +64,12 @@ def home_alt_m(mission: Mission | None) -> float | None:
 
 
 def route(mission: Mission | None, place: Place, ground: float) -> Route:
-    """Unroll a mission into lines.
+    """Convert a mission to lines.
 
     Args:
-        mission: as it came over the bus; nothing in it is trusted
-        place: the scene's frame
-        ground: height of the ground where the mission has no home, scene [10 m]
+        mission: as received, untrusted
+        scene_frame: frame of the scene
+        ground: height of the ground, used without home, scene [10 m]
     """
     if mission is None:
         return NOTHING
@@ -114,7 +114,7 @@ def route(mission: Mission | None, place: Place, ground: float) -> Route:
 
 
 def circle(centre: np.ndarray, radius: float, sides: int = 48) -> np.ndarray:
-    """Draw a level circle as segments: (sides, 2, 3)."""
+    """Return a horizontal circle as segments: (sides, 2, 3)."""
     turn = np.linspace(0, 2 * np.pi, sides + 1)
     ring = centre + radius * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
     return np.stack([ring[:-1], ring[1:]], axis=1)
@@ -125,7 +125,7 @@ def _usable(item: Item) -> bool:
 
 
 def _spot(item: Item, place: Place, base: float, last: np.ndarray | None) -> np.ndarray:
-    """Place an item in the scene: (1, 3), or (0, 3) where it names no place. Latitude and longitude 0 mean "here"."""
+    """Return the scene position of an item, (1, 3), or (0, 3) without one; 0, 0 is the previous position."""
     up = (item.alt_m - place.origin.alt_mm * 1e-3) / UNIT_M if item.frame in ABSOLUTE else base + item.alt_m / UNIT_M
     if item.lat_e7 == 0 and item.lon_e7 == 0:
         return np.zeros((0, 3)) if last is None else np.array([[last[0], last[1], up]])

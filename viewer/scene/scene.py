@@ -1,4 +1,4 @@
-"""The fleet in 3-D on one page: about fifteen nodes whatever its size, never one per UAV."""
+"""Fleet in 3-D on one page: about fifteen nodes, independent of its size."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,14 +13,14 @@ from viewer.scene.strokes import Strokes, chain, dash_lines, faded, rounded
 from viewer.store.vehicle import Vehicle
 from viewer.theme.palette import Palette, mix, rgb
 
-DASHES, FEW = 30, 60  # dashes of one predicted path; half as many, and no feet, where there are more than a few
-LOOK_S = 60.0  # how far ahead the others' paths are drawn at most: many long ones are a thicket [s]
-PARTS = 3  # of a second of trail, where there are few: it is a curve
-ALERT_DASHES = 18  # dashes of the ring on the ground under who needs an eye
+DASHES, FEW = 30, 60  # dashes of one predicted path; half as many, without ground marks, in a larger fleet
+LOOK_S = 60.0  # longest look-ahead drawn for UAVs that are not selected [s]
+PARTS = 3  # points per second of trail in a small fleet
+ALERT_DASHES = 18  # dashes of the alert ring on the ground
 
 
 class Scene:
-    """The nodes of the fleet: ground, aircraft, trails, predicted paths, stems, alert rings, routes."""
+    """Nodes of the fleet: ground, aircraft, trails, predicted paths, stems, alert rings, routes."""
 
     def __init__(self, scene: Any, palette: Palette, clicked: Callable[[int], None]) -> None:
         self._palette = palette
@@ -32,18 +32,18 @@ class Scene:
         self.stems = Strokes(scene, "/fleet/stems", 1.2)
         self.routes = Strokes(scene, "/fleet/routes", 1.4)
         self.alert = Strokes(scene, "/alert", 2.2)
-        self._drawn: tuple = (None, -1)  # who, and how many closed chunks there were, when trails were last drawn
-        self._looks = np.zeros(0, int)  # the looks they were coloured by
+        self._drawn: tuple = (None, -1)  # revision and selection, and closed chunks, when the trails were last drawn
+        self._looks = np.zeros(0, int)  # statuses they were coloured by
         self._head_looks = np.zeros(0, int)
 
     def draw_trails(self, flock: Flock, selected: int | None) -> None:
-        """Draw what is new of the closed chunks: one when a chunk closes, all when who is drawn or selected changes."""
+        """Draw changed chunks: one when a chunk closes, all when the drawn UAVs or the selection change."""
         closed, recoloured = flock.beats // STEPS, not np.array_equal(flock.looks, self._looks)
         changes, before = self._drawn
         if (who := (flock.changes, selected)) == changes and closed == before and not recoloured:
             return
         fresh = range(CHUNKS) if who != changes or closed > before + 1 else range(closed - before)
-        if fresh == range(1):  # the oldest is drawn anew as the newest; the others only fade
+        if fresh == range(1):  # the node of the oldest chunk draws the newest; the others only fade
             self.trails = [self.trails[-1], *self.trails[:-1]]
         colours, parts = self.glyphs.colours(flock), _parts(flock)
         for age, strokes in enumerate(self.trails):
@@ -59,7 +59,7 @@ class Scene:
         self._drawn, self._looks = (who, closed), flock.looks.copy()
 
     def draw_heads(self, flock: Flock, selected: int | None) -> None:
-        """Draw the newest stretch of every trail up to where the aircraft is: an array of fixed size."""
+        """Draw the newest stretch of every trail up to the aircraft; the array size is constant."""
         lines = chain(rounded(_bare(flock, flock.head(), selected), _parts(flock)))
         if np.array_equal(flock.looks, self._head_looks):
             return self.head.draw(lines)
@@ -69,7 +69,7 @@ class Scene:
         self.head.draw(lines, np.repeat(colours, lines.shape[1], axis=0))
 
     def draw_predicted(self, flock: Flock, now: float, selected: int | None) -> None:
-        """Draw the predicted paths dashed, to the horizon or for a minute; the selected one has its tube instead."""
+        """Draw the predicted paths dashed, up to the horizon or 60 s; the selected UAV has its tube instead."""
         who = [v for v in predicted(flock) if v.uav != selected]
         if not who:
             return self.predicted.draw(NOTHING.legs)
@@ -82,7 +82,7 @@ class Scene:
         self.predicted.draw(np.concatenate(lines), shades[looks].reshape(-1, 2, 3))
 
     def draw_stems(self, flock: Flock) -> None:
-        """Drop a stem from every aircraft to a small foot on the ground; in a crowd none."""
+        """Draw vertical stems from aircraft to the ground; none in a large fleet."""
         if flock.crowd or not flock.uavs:
             return self.stems.draw(NOTHING.legs)
         foot = flock.at * [1, 1, 0] + [0, 0, self.ground.height + 0.05]
@@ -92,7 +92,7 @@ class Scene:
         self.stems.draw(lines.reshape(-1, 2, 3), np.repeat(tints[flock.looks], lines.shape[1], axis=0))
 
     def draw_alerts(self, flock: Flock) -> None:
-        """Ring the ground under who needs an eye, with a stem up to the aircraft; lost links only in a small fleet."""
+        """Draw a ground ring and a stem under exceptional UAVs; lost links only in a small fleet."""
         who = flock.looks == MISMATCH if flock.crowd else flock.exceptions
         at, looks = flock.at[who], flock.looks[who]
         foot = at * [1, 1, 0] + [0, 0, self.ground.height + 0.1]
@@ -102,13 +102,13 @@ class Scene:
         self.alert.draw(lines.reshape(-1, 2, 3), np.repeat(colours, ALERT_DASHES + 1, axis=0))
 
     def draw_routes(self, routes: list[Route]) -> None:
-        """Draw routes of others than the selected UAV, faintly."""
+        """Draw the routes of the other UAVs in a muted colour."""
         lines = [part for r in routes for part in (r.legs, r.circles, dash_lines(r.back, 4.0))]
         self.routes.draw(np.concatenate([*lines, NOTHING.legs]), mix(self._palette.route, self._palette.ground, 0.45))
 
 
 def _bare(flock: Flock, points: np.ndarray, selected: int | None) -> np.ndarray:
-    """Take away the trail of the selected UAV, points (n, k, 3): it has its own, finer path."""
+    """Collapse the trail of the selected UAV in points (n, k, 3), as it has a finer path."""
     if (row := flock.index(selected)) is not None:
         points = points.copy()
         points[row] = points[row, :1]
@@ -116,27 +116,28 @@ def _bare(flock: Flock, points: np.ndarray, selected: int | None) -> np.ndarray:
 
 
 def _parts(flock: Flock) -> int:
-    """Return into how many parts a stretch of trail is cut."""
+    """Return the number of curve points per trail step."""
     return PARTS if len(flock.uavs) <= FEW else 1
 
 
 def predicted(flock: Flock) -> list[Vehicle]:
-    """Choose whose predicted paths are drawn: all, in a crowd those who need an eye."""
+    """Return the UAVs with drawn predictions: all, in a large fleet the exceptional ones."""
     if not flock.crowd:
         return [v for v in flock.fleet if v.forecast is not None and flock.index(v.uav) is not None]
     return [v for v, _ in flock.needy if v.forecast is not None]
 
 
 def cut_at_horizon(ahead: np.ndarray, path: np.ndarray, start: float, until: float, dashes: int = DASHES) -> np.ndarray:
-    """Cut a path into dashes of the same duration between two look-aheads, at most `LOOK_S` of it.
+    """Cut a path into dashes of equal duration between two look-aheads, at most `MAX_AHEAD_S`.
 
     Args:
-        ahead: look-ahead of each point, rising, (n,) [s]
+        ahead: look-ahead of each point, increasing, (n,) [s]
         path: positions, (n, 3)
-        start, until: where drawing begins, and the horizon where it must end [s]
-        dashes: how many
+        start: first look-ahead [s]
+        horizon_s: last look-ahead [s]
+        dashes: number of dashes
     Returns:
-        (dashes, 2, 3); without length where nothing may be claimed any more
+        (dashes, 2, 3); zero length beyond the horizon
     """
     at = np.minimum(max(start, 0.0) + np.linspace(0.0, LOOK_S, 2 * dashes), until)
     points = np.stack([np.interp(at, ahead, path[:, i]) for i in range(3)], axis=-1)

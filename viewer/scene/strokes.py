@@ -1,4 +1,4 @@
-"""Lines: one node of many segments, coloured per vertex, redrawn in place."""
+"""Line segments: one node of many segments, coloured per vertex, updated in place."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from viewer.theme.palette import line_colour
 
-_NONE = np.zeros((1, 2, 3), np.float32)  # the page wants at least one segment; this one has no length
+_NONE = np.zeros((1, 2, 3), np.float32)  # viser requires at least one segment; this one has zero length
 
 
 class Strokes:
@@ -40,12 +40,12 @@ class Strokes:
 
 
 def chain(points: np.ndarray) -> np.ndarray:
-    """Join neighbours: (..., n, 3) -> (..., n - 1, 2, 3)."""
+    """Return the segments between neighbours: (..., n, 3) -> (..., n - 1, 2, 3)."""
     return np.stack([points[..., :-1, :], points[..., 1:, :]], axis=-2)
 
 
 def rounded(points: np.ndarray, parts: int) -> np.ndarray:
-    """Lay a smooth curve through points (..., n, 3), each stretch in so many parts: (..., (n - 1) parts + 1, 3)."""
+    """Interpolate points (..., n, 3) smoothly in `parts` per step: (..., (n - 1) parts + 1, 3)."""
     if parts < 2 or points.shape[-2] < 2:
         return points
     slope = np.gradient(points, axis=-2)
@@ -58,7 +58,7 @@ def rounded(points: np.ndarray, parts: int) -> np.ndarray:
 
 
 def dashed(points: np.ndarray) -> np.ndarray:
-    """Join every second pair of neighbours: (n, 3) -> (n // 2, 2, 3)."""
+    """Return every second segment between neighbours: (n, 3) -> (n // 2, 2, 3)."""
     return chain(points)[::2]
 
 
@@ -72,18 +72,18 @@ def dash_lines(segments: np.ndarray, length: float) -> np.ndarray:
 
 
 def faded(colour: np.ndarray, ground: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Fade a line along its segments: colour (..., 3), shares (n + 1,) of it at the joints -> (..., n, 2, 3)."""
+    """Return fading segment colours: colour (..., 3), shares (n + 1,) at the points -> (..., n, 2, 3)."""
     joints = colour[..., None, :] * shares[:, None] + ground * (1 - shares[:, None])
     return chain(joints)
 
 
 def closed(ring: np.ndarray) -> np.ndarray:
-    """Join the corners of rings (..., sides, 3) into closed loops: (..., sides, 2, 3)."""
+    """Return the closed loops of corners (..., sides, 3): (..., sides, 2, 3)."""
     return np.stack([ring, np.roll(ring, -1, axis=-2)], axis=-2)
 
 
 def disc(centre: np.ndarray, radius: float, sides: int = 40) -> np.ndarray:
-    """Lay the corners of a level circle round a place (3,): (sides, 3)."""
+    """Return the corners of a horizontal circle around a point (3,): (sides, 3)."""
     turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     return centre + radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(sides)], axis=-1)
 
@@ -101,5 +101,5 @@ class Sheaf:
         self._colours.append(np.broadcast_to(colour, (len(self._lines[-1]), 3)))
 
     def all(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return what was added, for `Strokes.draw`."""
+        """Return all segments and colours for `Strokes.draw`."""
         return np.concatenate(self._lines), np.concatenate(self._colours)

@@ -1,4 +1,4 @@
-"""The server of the page: one feed, one render thread, a view for each who looks."""
+"""Viewer process: one store, one render thread and one view per client."""
 
 import contextlib
 import logging
@@ -29,12 +29,12 @@ from viewer.timeline.recordings import Tapes
 _log = logging.getLogger(__name__)
 TICK_S = 0.1
 SECOND = 10  # ticks of a second
-MOST_CLOSE = 50  # UAVs of a crowd that need an eye and are read every time
-SLOW_S = 10.0  # how often what is missing is asked for again [s]
+MOST_CLOSE = 50  # UAVs of a large fleet with alerts that are decoded every time
+SLOW_S = 10.0  # interval between requests for missing messages [s]
 
 
 class App:
-    """Draws what the feed knows: aircraft ten times a second, in a crowd five, the rest more slowly."""
+    """Draw the store: aircraft at 10 Hz, in a large fleet at 5 Hz, everything else more slowly."""
 
     def __init__(self, bus: Bus, server: viser.ViserServer, *, light: bool = False, land: Land | None = None) -> None:
         self._palette = LIGHT if light else DARK
@@ -48,7 +48,7 @@ class App:
         start_at(server)
 
     def run(self, stop: threading.Event) -> None:
-        """Draw until told to stop."""
+        """Draw until `stop` is set."""
         asker = threading.Thread(target=self._ask, args=(stop,), name="viewer-ask", daemon=True)
         asker.start()
         tick, due = 0, time.monotonic()
@@ -64,7 +64,7 @@ class App:
         asker.join(timeout=5)
 
     def _ask(self, stop: threading.Event) -> None:
-        """Ask for what was said before we came, and again while something is missing."""
+        """Request messages published before the start, repeatedly while some are missing."""
         while not stop.is_set():
             fleet = self.feed.all()
             if not fleet or any(v.mission is None or v.model is None for v in fleet):
@@ -76,12 +76,12 @@ class App:
                     return
 
     def tick(self, tick: int) -> None:
-        """Draw what is due at this tick."""
+        """Draw the content due at this tick."""
         if not (self.flock.crowd and tick % 2):
             self.feed.listen()
         self._welcome()
         if tick % SECOND and not self.views:
-            return  # nobody looks: once a second keeps the trails
+            return  # no client: 1 Hz is enough for the trails
         now = time.monotonic()
         if tick % SECOND == 0 or not self.flock.uavs:
             self._second(now)
@@ -94,14 +94,14 @@ class App:
             guarded(view, partial(self._draw, view, now, tick))
 
     def _draw(self, view: View, now: float, tick: int) -> None:
-        """Draw what is due on one page."""
+        """Draw the content due on one page."""
         if tick % SECOND == view.offset or view.dirty:
             self._settle(view, now)
         if self.flock.uavs:
             view.move(self.flock, now, tick)
 
     def _settle(self, view: View, now: float) -> None:
-        """Draw what changes slowly on one page."""
+        """Draw the slow content of one page."""
         self._land.show(view.client, self.feed.place, view.palette, self._ground)
         view.panels.ground_said = self._land.sentence
         view.scene.ground.grid.show(not self._land.lies)
@@ -110,14 +110,14 @@ class App:
             view.frame(self._cloud, self._news(), self._ground)
 
     def answer(self) -> None:
-        """Draw at once who was just selected; lists and charts follow at the next tick."""
+        """Draw new selections immediately; lists and charts follow at the next tick."""
         now = time.monotonic()
         for view in list(self.views.values()):
             if view.dirty:
                 guarded(view, partial(view.turn, self.flock, now, self._ground))
 
     def _welcome(self) -> None:
-        """Open a view for who has come, forget who has gone, draw anew who wants other colours."""
+        """Open views for new clients, remove those of closed clients, redraw after a theme change."""
         clients = self._server.get_clients()
         for gone in self.views.keys() - clients.keys():
             del self.views[gone]
@@ -129,7 +129,7 @@ class App:
                 self._open(number, view.browser, view)
 
     def _open(self, number: int, browser: Browser, before: View | None = None) -> None:
-        """Open a view, in place of the one before; a page for which that fails is left alone until it comes anew."""
+        """Open a view, or replace one; after a failure the page stays closed until it reconnects."""
         try:
             with browser.client.atomic():
                 if before is not None:
@@ -137,10 +137,10 @@ class App:
                     browser.client.gui.reset()
                     self._land.forget(number)
                 view = View(browser, self.feed, self.tapes, browser.palette, self._wake.set)
-        except Exception:  # a defect met by one page must not end the others
+        except Exception:  # an error on one page must not end the others
             self._unfit.add(number)
             self.views.pop(number, None)
-            _log.exception("page %d could not be opened; the others go on; reload it", number)
+            _log.exception("page %d could not be opened; other pages continue; reload it", number)
             return
         view.offset = number * 4 % SECOND
         if before is not None:
@@ -148,7 +148,7 @@ class App:
         self.views[number] = view
 
     def _second(self, now: float) -> None:
-        """Take stock of who is there and how they stand; remember where they are."""
+        """Update the fleet, its states and trails; called once per second."""
         fleet, place = self.feed.all(), self.feed.place
         self.tapes.take(self.feed, lambda: fleet, now)
         if not self.flock.uavs:
@@ -171,29 +171,29 @@ class App:
             start_at(self._server, self._cloud)
 
     def _off_beat(self, fleet: list[Vehicle]) -> list[tuple[Vehicle, np.ndarray]]:
-        """Return the paths of those whose seconds are not ours, or whose past has just come."""
+        """Return the tracks of UAVs that are not in real time or were just backfilled."""
         early, few = self._bygone.news(), len(fleet) <= FEW
         found = [v for v in fleet if not v.recorded and (v.uav in early or (few and v.time.pace != 1.0))]
         return [(v, rows) for v in found if len(rows := self.feed.track(v))]
 
     def _news(self) -> tuple:
-        """Return what makes another picture of the fleet, whatever its extent."""
+        """Return the values whose change requires new framing."""
         fleet, place = self.flock.fleet, self.feed.place
         told = sum(v.forecast is not None for v in fleet)
         return place.origin if place else None, len(self.flock.uavs), told, sum(v.ended for v in fleet)
 
 
 def guarded(view: View, draw: Callable[[], None]) -> None:
-    """Draw something on one page; a defect met there is said there and in the log, and ends no other page."""
+    """Draw on one page; show and log an error there without affecting other pages."""
     try:
         draw()
     except Exception as error:
         if view.stumble(f"{type(error).__name__}: {error}"):
-            _log.exception("page %d could not be drawn; the others go on", view.client.client_id)
+            _log.exception("page %d could not be drawn; other pages continue", view.client.client_id)
 
 
 def guess_ground(fleet: list[Vehicle], origin_m: float, before: float) -> float:
-    """Guess the ground: the lowest home, else where the lowest stood, else 60 m below all, scene [10 m]."""
+    """Estimate ground height: lowest home, else lowest disarmed height, else 60 m below all, scene [10 m]."""
     homes = [alt for vehicle in fleet if (alt := home_alt_m(vehicle.mission)) is not None]
     if homes:
         return (min(homes) - origin_m) / UNIT_M

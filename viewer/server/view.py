@@ -1,4 +1,4 @@
-"""One page: what one operator has selected, shows and looks at."""
+"""View of one page: selection, display options and camera of one operator."""
 
 import contextlib
 import time
@@ -25,9 +25,9 @@ from viewer.theme.palette import Palette
 from viewer.timeline.deck import Timeline
 from viewer.timeline.recordings import Tapes
 
-WHOLE_S = 3.0  # what could not be drawn counts as mended after so long without a defect [s]
-SINCE_S = 40.0  # so much of the flown path is shown with an aircraft one turns to [s]
-ROOM = 1.35  # how much more than what was flown is framed, while it grows [-]
+WHOLE_S = 3.0  # time without an error after which the error text is removed [s]
+SINCE_S = 40.0  # flown path framed with a focused aircraft [s]
+ROOM = 1.35  # margin of the frame while the flown path grows [-]
 
 
 class View:
@@ -45,83 +45,83 @@ class View:
             Export(client, feed, tapes, palette, lambda: self.selected)
         self.camera = Camera(client)
         self.selected: int | None = None
-        self.dirty = True  # something was chosen that is not drawn yet
-        self.offset = 0  # tick of the second at which what is slow is drawn
+        self.dirty = True  # the selection changed and is not drawn yet
+        self.offset = 0  # tick of the second at which slow content is drawn
         self._seen: tuple = ()
-        self._again = False  # frame once more, wherever the camera is
-        self._framed = np.zeros((2, 3))  # corners of what the camera was last framed on [10 m]
+        self._again = False  # frame again even if the camera was moved
+        self._framed = np.zeros((2, 3))  # corners of the box last framed [10 m]
         self._followed: tuple[int, np.ndarray] | None = None
-        self._defect, self._stumbled = "", 0.0  # why it could not be drawn, and when last, monotonic [s]
+        self._defect, self._stumbled = "", 0.0  # last drawing error and its time, monotonic [s]
 
     def carry(self, before: "View") -> None:
-        """Go on where this page was in its other colours: who is selected, at which time, from where."""
+        """Restore selection, time shown and camera of the view before a theme change."""
         self.selected, self.camera, self.offset = before.selected, before.camera, before.offset
         self.timeline.player = before.timeline.player
         self._seen, self._framed, self._followed = before._seen, before._framed, before._followed
 
     def stumble(self, defect: str) -> bool:
-        """Say on the page that it could not be drawn; tell whether that is news."""
+        """Show a drawing error on the page; return whether it is new."""
         self._stumbled = time.monotonic()
         if defect == self._defect:
             return False
         self._defect = defect
-        with contextlib.suppress(RuntimeError, AssertionError):  # it may be closing
+        with contextlib.suppress(RuntimeError, AssertionError):  # the page may be closing
             self.panels.say_broken(
-                f"This page could not be drawn ({clip(defect)}): what is shown may be old. Other pages go on. "
-                "Reload this one; if it is said again, the viewer's log tells what happened."
+                f"This page could not be drawn ({clip(defect)}) and may show old data; other pages continue. "
+                "Reload it; if the error remains, see the log of the viewer."
             )
         return True
 
     def _recover(self) -> None:
-        """Take back what was said of a defect once everything can be drawn again."""
+        """Remove the error text once everything is drawn again."""
         if self._defect and time.monotonic() - self._stumbled > WHOLE_S:
             self._defect = ""
             self.panels.say_broken("")
 
     def _stir(self) -> None:
-        """Have everything drawn at once: another time is shown."""
+        """Request an immediate redraw after a change of the time shown."""
         self.dirty = True
         self._wake()
 
     def _actions(self) -> dict[str, Callable[[], None]]:
-        """Return what the command palette does beside selecting."""
+        """Return the commands of the palette other than selection."""
         return {
             "Show the whole fleet": self.show_all,
-            "Next that needs an eye": self.next_exception,
-            "Follow the selected aircraft, or no longer": self.toggle_follow,
+            "Next aircraft with an alert": self.next_exception,
+            "Toggle following the selected aircraft": self.toggle_follow,
         }
 
     def show_all(self) -> None:
-        """Frame everything again, though the camera was moved."""
+        """Frame everything again, even if the camera was moved."""
         self.panels.follow.value = False
         self._seen, self._again = (), True
 
     def next_exception(self) -> None:
-        """Turn to the next UAV that needs an eye, in the order of their ids."""
+        """Focus on the next UAV with an alert, mismatch or lost link, in the order of ids."""
         needy = [v.uav for v in self._feed.all() if look(v, time.monotonic()) in (MISMATCH, LOST)]
         later = [uav for uav in needy if self.selected is None or uav > self.selected]
         if needy:
             self.visit((later or needy)[0])
 
     def toggle_follow(self) -> None:
-        """Follow the selected UAV, or stop."""
+        """Toggle following the selected UAV."""
         self.panels.follow.value = not self.panels.follow.value
 
     def chosen(self) -> Vehicle | None:
-        """Return the selected UAV as it is shown; None where none is, or it is not there."""
+        """Return the selected UAV at the time shown; None when there is none."""
         return self.timeline.one(self.selected) if self.selected is not None else None
 
     def choose(self, uav: int) -> None:
-        """Select a UAV that was ever heard of; it is drawn at once."""
+        """Select a known UAV and draw it immediately."""
         if self._feed.one(uav) is not None:
             self.selected, self.dirty = uav, True
             self.browser.remembered.uav = None
-            self.panels.show(self.chosen(), time.monotonic())  # ahead of all that is drawn with it
+            self.panels.show(self.chosen(), time.monotonic())  # before the slower 3-D content
             self.client.flush()
             self._wake()
 
     def visit(self, uav: int, t: float | None = None) -> None:
-        """Select a UAV that may be out of sight, turn the camera to it, and show a time of its own [s since 1970]."""
+        """Select a UAV, move the camera to it and, if given, show its data time `t` [s since 1970]."""
         if t is not None:
             self.timeline.show(self._feed.all(), uav, t)
         self.choose(uav)
@@ -135,7 +135,7 @@ class View:
         self.camera.fly_to(np.vstack([around, around * [1, 1, 0] + [0, 0, self.scene.ground.height]]))
 
     def move(self, flock: Flock, now: float, tick: int) -> None:
-        """Draw what moves: aircraft at the full rate, heads of trails, stems and the selected UAV more slowly."""
+        """Draw moving content: aircraft at the full rate, trail heads, stems and the selected UAV more slowly."""
         with self.client.atomic():
             self._move(self.timeline.flock(flock, self.selected, now), now, tick)
 
@@ -152,16 +152,16 @@ class View:
         self._follow(now)
 
     def turn(self, flock: Flock, now: float, ground: float) -> None:
-        """Draw at once whom one has turned to: path, route, tube, labels."""
+        """Draw the selected UAV immediately: path, route, tube, labels."""
         with self.client.atomic():
             self._draw_chosen(now, ground)
             self._point(self.timeline.flock(flock, self.selected, now), now)
         self.client.flush()
 
     def _point(self, flock: Flock, now: float) -> None:
-        """Draw the selected UAV, size everybody for where the camera is, and label."""
+        """Draw the selected UAV, scale the aircraft to the camera distance and draw the labels."""
         sight, scene = self.camera.sight(), self.scene
-        scene.glyphs.draw(flock)  # at another time others may be there
+        scene.glyphs.draw(flock)  # another time may have other UAVs
         size = self.panels.glyph.value
         scene.glyphs.look(flock, sight, selected=self.selected, size=size)
         chosen = self.chosen()
@@ -173,7 +173,7 @@ class View:
         self._labels.draw([*said, *self.selection.marks[1:]], sight)
 
     def settle(self, flock: Flock, now: float, ground: float) -> None:
-        """Draw what changes slowly: trails, predicted paths, routes, panels; once a second and on a new selection."""
+        """Draw slow content once per second and on a new selection: trails, predictions, routes, panels."""
         flock = self.timeline.flock(flock, self.selected, now)
         self.dirty = False
         self._recall(flock)
@@ -199,7 +199,7 @@ class View:
         self._draw_chosen(now, ground)
 
     def _recall(self, flock: Flock) -> None:
-        """Select whom this browser had selected, once it is there; without anybody selected, the first predicted."""
+        """Restore the selection of the browser; without one, select the first UAV with a prediction."""
         remembered = self.browser.remembered
         if flock.index(remembered.uav) is not None:
             self.selected, remembered.uav = remembered.uav, None
@@ -217,11 +217,11 @@ class View:
         self.selection.draw_route(chosen, own, self.camera.sight(), self.scene.glyphs.unit)
 
     def frame(self, cloud: np.ndarray, seen: tuple, ground: float) -> None:
-        """Frame what there is to see when something of it is new or outgrows the frame, or the picture's shape.
+        """Frame the fleet when its content, its extent or the aspect ratio changes.
 
         Args:
-            cloud: the fleet and what is predicted, (n, 3) [10 m]
-            seen: what makes a new picture, whatever its extent
+            points: fleet and predicted paths, (n, 3) [10 m]
+            key: values whose change requires new framing
             ground: height of the ground [10 m]
         """
         if not self.timeline.player.live:
@@ -235,7 +235,7 @@ class View:
             return
         grown, self._seen = seen == self._seen, seen
         self._framed = np.stack([cloud.min(axis=0), cloud.max(axis=0)])
-        if grown:  # it will go on growing: make room, rather than move the picture every second
+        if grown:  # a growing path gets a margin, so that the camera does not move every second
             cloud = cloud.mean(axis=0) + (cloud - cloud.mean(axis=0)) * [ROOM, ROOM, 1.0]
         with self.client.atomic():
             self.camera.show(np.vstack([cloud, cloud * [1, 1, 0] + [0, 0, ground]]), again=self._again)
@@ -253,6 +253,6 @@ class View:
 
 
 def outgrown(cloud: np.ndarray, framed: np.ndarray) -> bool:
-    """Return whether points (n, 3) have left a framed box (2, 3), its corners, by more than what was left free."""
+    """Return whether points (n, 3) leave a box, corners (2, 3), by more than its margin."""
     spare = 0.4 * (ROOM - 1) * max(float(np.linalg.norm(framed[1] - framed[0])), 10.0)
     return bool(((framed[0] - cloud.min(axis=0)) > spare).any() or ((cloud.max(axis=0) - framed[1]) > spare).any())

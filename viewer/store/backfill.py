@@ -1,4 +1,4 @@
-"""What was flown before the page listened: asked of the gateways once, and laid before what was heard."""
+"""Backfill: request earlier telemetry from the gateways once and prepend it to the received path."""
 
 import contextlib
 import time
@@ -9,13 +9,13 @@ from viewer.store.received.inbox import Head
 from viewer.store.store import Feed
 from viewer.store.vehicle import Vehicle
 
-FEW = 60  # UAVs up to which everybody's past is asked for; of more that of those somebody looks at
-ASK_S = 2.0  # with a gateway that does not answer [s]
-MOST = 4_000  # samples read of one answer, the newest
+FEW = 60  # UAVs up to which all are backfilled; in a larger fleet only the selected ones
+ASK_S = 2.0  # wait for a gateway that does not answer [s]
+MOST = 4_000  # newest samples used of one answer
 
 
 class Bygone:
-    """Asks on a thread of its own; who draws takes the news."""
+    """Requests history on its own thread; the render thread takes the results."""
 
     def __init__(self, bus: Bus, feed: Feed) -> None:
         self._bus, self._feed = bus, feed
@@ -23,7 +23,7 @@ class Bygone:
         self._laid: set[int] = set()
 
     def ask(self) -> None:
-        """Ask for the past of those it was not asked of yet, one by one; a gateway gives no more at once."""
+        """Request the history of UAVs not requested yet, one at a time, as a gateway serves no more."""
         if self._feed.place is None:
             return
         known = self._feed.known
@@ -35,23 +35,23 @@ class Bygone:
                     self._lay(said)
 
     def _lay(self, said: History) -> None:
-        """Hear it as if it came now, in a vehicle of its own, and lay that one's path before what was heard."""
+        """Process a history in a separate vehicle and prepend its path to the received one."""
         place, early = self._feed.place, Vehicle(said.uav)
         if place is None:
             return
         for sample in sorted(said.samples[-MOST:], key=lambda one: one.t):
-            with contextlib.suppress(ValueError, IndexError, TypeError, OverflowError):  # a strange one is left out
+            with contextlib.suppress(ValueError, IndexError, TypeError, OverflowError):  # skip a malformed sample
                 head = Head(sample.uav, sample.t, sample.attitude, sample.position, sample.air)
                 early.hear_sample(head, place, time.monotonic())
         found = self._feed.one(said.uav)
         if found is None or place is not self._feed.place:
             return
-        with self._feed.lock:  # a copy shares its histories with the one it is of
+        with self._feed.lock:  # a snapshot shares its histories with the original
             found.track.lay_before(early.track.rows())
             found.trail.lay_before(early.trail.rows())
         self._laid.add(said.uav)
 
     def news(self) -> frozenset[int]:
-        """Take those whose past came since this was last asked."""
+        """Return the UAVs backfilled since the last call."""
         laid, self._laid = frozenset(self._laid), set()
         return laid

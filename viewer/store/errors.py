@@ -1,4 +1,4 @@
-"""How far predictions were off, measured on this page: kept predictions against the flown trail."""
+"""Prediction errors: stored predictions compared with the flown trail."""
 
 import numpy as np
 
@@ -6,17 +6,17 @@ from viewer.store.forecast import Kept
 from viewer.store.place import UNIT_M
 
 AHEADS_S = np.arange(1.0, 31.0)  # look-aheads at which errors are measured [s]
-LEAST = 3  # fewer answers at a look-ahead are none
+LEAST = 3  # fewer errors at a look-ahead give no RMS
 
 
 def errors(past: list[Kept], trail: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Measure every kept prediction at every look-ahead that has come to pass.
+    """Compute the position error of every prediction at every elapsed look-ahead.
 
     Args:
-        past: predictions, oldest first
+        predictions: oldest first
         trail: fleet time [s], scene ENU [10 m], (n, 4 or more)
     Returns:
-        when each was made, (k,) [s], and distances (k, 30) [m]; not a number where it is not answered yet
+        issue times (k,) [s] and errors (k, 30) [m]; NaN where the flown position is not available
     """
     if not past or len(trail) < 2:
         return np.zeros(0), np.zeros((0, len(AHEADS_S)))
@@ -31,7 +31,7 @@ def errors(past: list[Kept], trail: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def by_ahead(off: np.ndarray) -> np.ndarray:
-    """Return the root mean square over predictions at each look-ahead, (30,) [m]; not a number where few answered."""
+    """Return the RMS error at each look-ahead, (30,) [m]; NaN for fewer than `MIN_PREDICTIONS` errors."""
     n = np.isfinite(off).sum(axis=0)
     mean = np.nansum(off**2, axis=0) / np.maximum(n, 1)
     return np.where(n >= LEAST, np.sqrt(mean), np.nan)

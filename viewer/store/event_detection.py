@@ -1,6 +1,6 @@
-"""What is told of a UAV, message by message: pure, nothing kept but what was last known.
+"""Detect events in the messages of a UAV.
 
-`hear(known, message)` gives what is known now and the events that this message tells.
+`detect_events(state, message)` is a pure function: it returns the next state and the events of this message.
 """
 
 from collections.abc import Callable
@@ -28,39 +28,39 @@ from viewer.store.mission_items import ITEM_NAMES
 from viewer.store.received.inbox import Head
 from viewer.theme.events import LATEST, MAX_RAISED, Event, Kind
 
-MAX_WORDS = 200  # letters kept of a sentence from outside
-QUIET_S = 2.5  # a gateway that has not spoken for so long leaves it to the worker to call the link lost [s]
-MAX_CAUSES = 8  # names of a mismatch believed
-MAX_STEPS = 20  # changes of the mission item believed of one sample
-LASTS_S = 12.0  # tries that fail for so long throw doubt on a model: about three verdicts [s]
-SOUND = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST)  # the newest try bears out a model, its own or the one in force
+MAX_WORDS = 200  # characters kept of a received text
+QUIET_S = 2.5  # without a gateway status for this long, link alerts of the worker count [s]
+MAX_CAUSES = 8  # names accepted of one mismatch
+MAX_STEPS = 20  # mission item changes accepted of one sample
+LASTS_S = 12.0  # failing verifications for this long are an event: about three verdicts [s]
+SOUND = (Outcome.VERIFIED, Outcome.WORSE_THAN_LAST)  # outcomes that confirm a model, new or active
 
 
 class Known(NamedTuple):
-    """What was last said of one UAV, as far as a change of it is an event."""
+    """Latest values of one UAV whose change is an event."""
 
     mode: str = ""
     armed: bool = False
-    lost: bool | None = None  # None: not heard of alive yet, so it cannot be lost
-    status_t: float = -np.inf  # when the gateway last spoke of the link [s since 1970]
+    lost: bool | None = None  # None: link never up, so it cannot be lost
+    status_t: float = -np.inf  # time of the last gateway status [s since 1970]
     sentence: str = ""
     items: tuple[Item, ...] = ()
     seq: int = -1
-    verdict: str | None = None  # last told of: none (no model), sound or doubted; None before any
-    sound_t: float = -np.inf  # when a try last was sound [s since 1970]
-    raised: frozenset[About] = frozenset()  # alerts in force, by `Alert.about`
-    found: tuple[str, ...] = ()  # outcome and names of the mismatch last told
-    told_t: float = 0.0  # when the event was that predictions last told [s since 1970]
+    verdict: str | None = None  # last reported: none (no model), sound or doubted; None before any
+    sound_t: float = -np.inf  # time of the last accepted verification [s since 1970]
+    raised: frozenset[About] = frozenset()  # active alerts, by `Alert.about`
+    found: tuple[str, ...] = ()  # outcome and names of the last reported mismatch
+    told_t: float = 0.0  # time of the last event in predictions [s since 1970]
 
 
 Told = tuple[Known, list[Event]]
 
 
 def hear(known: Known, message: Any) -> Told:
-    """Compare a message with what is known: what is known now, and what happened, in order.
+    """Compare a message with the state; return the next state and the events in order.
 
     Raises:
-        ValueError: when rows of a sample have no sound shape; the gateway must resend.
+        ValueError: when rows of a sample have a wrong shape; the gateway must resend.
     """
     tell = _TELLS.get(type(message))
     if tell is None:
@@ -80,7 +80,7 @@ def _status(known: Known, status: Status) -> Told:
     if status.armed != known.armed:
         kind = Kind.ARMED if status.armed else Kind.DISARMED
         events.append(Event(status.t, kind, kind.value))
-    sentence = "" if lost else status.sentence  # lost: it only counts the seconds
+    sentence = "" if lost else status.sentence  # while lost, the sentence only counts seconds
     if sentence and sentence != known.sentence:
         events.append(Event(status.t, Kind.WARNING, _own_words(sentence, status.uav)))
     return known._replace(mode=status.mode or known.mode, armed=status.armed, sentence=sentence), events
@@ -94,13 +94,13 @@ def _link(known: Known, t: float, lost: bool) -> Told:
 
 
 def _alert(known: Known, alert: Alert) -> Told:
-    if alert.kind is AlertKind.LINK_LOST:  # of a worker, which may be far behind the gateway and short of messages
+    if alert.kind is AlertKind.LINK_LOST:  # a worker may lag behind the gateway
         return _link(known, alert.t, alert.active) if alert.t > known.status_t + QUIET_S else (known, [])
     if alert.active == (alert.about in known.raised):
         return known, []
     name = alert.kind.value.replace("_", " ") + (f" with uav-{alert.other}" if alert.other >= 0 else "")
     if not alert.active:
-        return known._replace(raised=known.raised - {alert.about}), [Event(alert.t, Kind.EASED, f"{name} is over")]
+        return known._replace(raised=known.raised - {alert.about}), [Event(alert.t, Kind.EASED, f"{name} cleared")]
     if len(known.raised) >= MAX_RAISED:
         return known, []
     said = _own_words(alert.sentence, alert.uav) or name
@@ -108,28 +108,28 @@ def _alert(known: Known, alert: Alert) -> Told:
 
 
 def _mismatch(known: Known, told: Mismatch) -> Told:
-    """Tell of a mismatch where its outcome or its names are news; a suspicion and none at all are no event."""
+    """Detect a change of outcome or names of a mismatch; a suspected mismatch is no event."""
     stands = told.outcome in (Found.NAMED, Found.UNKNOWN)
     found = (told.outcome.value, *(one.name for one in told.causes[:MAX_CAUSES])) if stands else ()
     if found == known.found:
         return known, []
     known = known._replace(found=found)
     if not stands:
-        return known, [Event(told.t, Kind.EASED, "the mismatch is over")]
+        return known, [Event(told.t, Kind.EASED, "mismatch cleared")]
     return known, [Event(told.t, Kind.MISMATCH, _own_words(told.sentence, told.uav) or "mismatch")]
 
 
 def _mission(known: Known, mission: Mission) -> Told:
-    if len(mission.items) < 2 or not mission.complete:  # one alone is home
+    if len(mission.items) < 2 or not mission.complete:  # a single item is home
         return known, []
     if known.items and _plan(mission.items) == _plan(known.items):
         return known._replace(items=mission.items), []
-    said = f"{'another' if known.items else 'a'} mission on board, {len(mission.items)} items"
+    said = f"{'new mission' if known.items else 'mission'} on board, {len(mission.items)} items"
     return known._replace(items=mission.items), [Event(mission.t, Kind.MISSION, said)]
 
 
 def _plan(items: tuple[Item, ...]) -> list[tuple[int, int, int, str]]:
-    """Reduce a mission to what makes it another: without home, and without what a link or a log writes differently."""
+    """Return the fields that identify a mission: no home, no fields that depend on the link or the log."""
     return [(item.command, item.lat_e7, item.lon_e7, f"{item.alt_m:.1f}") for item in items[1:]]
 
 
@@ -149,15 +149,15 @@ def _sample(known: Known, sample: Head) -> Told:
 
 
 def _item(items: tuple[Item, ...], seq: int) -> str:
-    """Name a mission item; without the mission its number alone."""
+    """Describe a mission item; without the mission by its number only."""
     command = next((item.command for item in items if item.seq == seq), None)
     return f"item {seq}" if command is None else f"item {seq}: {ITEM_NAMES.get(command, f'command {command}')}"
 
 
 def _model(known: Known, model: Model) -> Told:
-    """Tell when the first model is verified, when tries fail for a while, and when one bears it out again.
+    """Detect the first verified model, persistent verification failure, and recovery.
 
-    Verdicts come every few seconds, and near a threshold they alternate: a change that does not last is no event.
+    Verdicts arrive every few seconds and alternate near a threshold: only a lasting change is an event.
     """
     newest, before = model.verdict, known.verdict
     sound_t = model.t if before is None or newest.outcome in SOUND else known.sound_t
@@ -168,16 +168,16 @@ def _model(known: Known, model: Model) -> Told:
         said = _own_words(model.in_force.sentence, model.uav)
         news, event = "sound", Event(model.t, Kind.VERIFIED, f"model verified: {said}")
     elif newest.outcome in SOUND:
-        news, event = "sound", Event(model.t, Kind.SOUND, "newest try sound again")
+        news, event = "sound", Event(model.t, Kind.SOUND, "model verified again")
     elif model.t - sound_t >= LASTS_S:
-        words = f"{LASTS_S:.0f} s without a sound try ({_outcome(newest)}); an earlier model stays in force"
+        words = f"no verification for {LASTS_S:.0f} s ({_outcome(newest)}); an earlier model stays active"
         news, event = "doubted", Event(model.t, Kind.DOUBTED, words)
     else:
         return known, []
     return (known, []) if news == before else (known._replace(verdict=news), [event])
 
 
-_TOLD = {  # of what predictions tell; modes, missions and the link are told by others, and sooner
+_TOLD = {  # events in predictions; other messages report modes, missions and the link sooner
     Happened.PARAMETERS: Kind.PARAMETERS,
     Happened.TAKE_OFF: Kind.TAKE_OFF,
     Happened.LANDING: Kind.LANDING,
@@ -191,7 +191,7 @@ _TOLD = {  # of what predictions tell; modes, missions and the link are told by 
 
 
 def _prediction(known: Known, prediction: Prediction) -> Told:
-    """Tell the event that began a prediction anew, once."""
+    """Detect the event that restarted a prediction, once."""
     if prediction.event is None or prediction.event_t == known.told_t:
         return known, []
     kind = _TOLD.get(prediction.event)

@@ -1,4 +1,4 @@
-"""A prediction as the scene has it: checked when it is heard, laid out in the scene when somebody looks."""
+"""Prediction in scene coordinates: checked on arrival, transformed on first use."""
 
 from functools import cached_property
 from typing import NamedTuple
@@ -8,50 +8,50 @@ import numpy as np
 from fleet.contract import Prediction
 from viewer.store.place import REACH_M, UNIT_M, Place
 
-MAX_STEPS, MAX_AHEAD_S = 5_000, 3_600.0  # look-ahead accepted from outside: steps, and time [s]
-_CHORD_S, _MOST_PARTS = 1.5, 4  # look-aheads farther apart get points between, at most so many
-KEPT_S = 31.0  # look-ahead kept of what was predicted once [s]
+MAX_STEPS, MAX_AHEAD_S = 5_000, 3_600.0  # accepted look-ahead: steps, and time [s]
+_CHORD_S, _MOST_PARTS = 1.5, 4  # steps longer than this are subdivided, into at most so many parts
+KEPT_S = 31.0  # look-ahead kept of a past prediction [s]
 
 
 class Forecast:
-    """A prediction, checked; its arrays are in the scene."""
+    """Checked prediction with arrays in scene coordinates."""
 
     def __init__(self, message: Prediction, place: Place, heard: float) -> None:
-        self.t = message.t  # fleet time it starts at [s since 1970]
-        self.heard = heard  # when it arrived, monotonic [s]
+        self.t = message.t  # start, data time [s since 1970]
+        self.heard = heard  # arrival, monotonic [s]
         self.message = message
         self.place = place
 
     @cached_property
     def until(self) -> float:
-        """Return the look-ahead up to which anything is claimed: the horizon, within what was sent [s]."""
+        """Return the confidence horizon, at most the last look-ahead sent [s]."""
         horizon, last = self.message.horizon_s, float(self.message.ahead.numpy()[-1])
         return float(min(max(horizon if np.isfinite(horizon) else 0.0, 0.0), last))
 
     @property
     def ahead(self) -> np.ndarray:
-        """Return the look-ahead of each point, rising, (n,) [s]."""
-        return self._laid[0]
+        """Return the look-ahead of each point, increasing, (n,) [s]."""
+        return self._scene_arrays[0]
 
     @property
     def path(self) -> np.ndarray:
         """Return the mean positions, scene ENU, (n, 3) [10 m]."""
-        return self._laid[1]
+        return self._scene_arrays[1]
 
     @property
     def tube(self) -> np.ndarray:
         """Return the half-axes along, cross, vertical, (n, 3) [10 m]."""
-        return self._laid[2]
+        return self._scene_arrays[2]
 
     @cached_property
-    def _laid(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _scene_arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         told = self.message
         ahead, path, tube = (a.numpy().astype(float) for a in (told.ahead, told.path, told.tube))
         tube = np.clip(np.nan_to_num(tube / UNIT_M), 0.0, 1e4)
         return smooth(ahead, self.place.local(told.ned_origin(), path), tube)
 
     def at(self, ahead: np.ndarray | float) -> np.ndarray:
-        """Interpolate the mean path at look-aheads (k,) [s] -> (k, 3) [10 m]; held beyond both ends."""
+        """Interpolate the mean path at look-aheads (k,) [s] -> (k, 3) [10 m]; constant beyond both ends."""
         return np.stack([np.interp(ahead, self.ahead, self.path[:, i]) for i in range(3)], axis=-1)
 
     def width(self, ahead: np.ndarray) -> np.ndarray:
@@ -59,7 +59,7 @@ class Forecast:
         return np.stack([np.interp(ahead, self.ahead, self.tube[:, i]) for i in range(3)], axis=-1)
 
     def kept(self, before: "Kept | None" = None) -> "Kept":
-        """Return what is kept of it when newer ones have come; `before` is what was kept before it."""
+        """Return the reduced record of this prediction; `previous` is the record before it."""
         path, ahead = self.message.path.numpy(), self.message.ahead.numpy()
         ahead = ahead[: int(np.searchsorted(ahead, KEPT_S, side="right"))]
         same = before is not None and np.array_equal(before.ahead, ahead)
@@ -68,9 +68,9 @@ class Forecast:
 
 
 class Kept(NamedTuple):
-    """What was predicted once, as it was sent: a few hundred bytes."""
+    """Reduced record of a past prediction, as sent: a few hundred bytes."""
 
-    t: float  # fleet time it starts at [s since 1970]
+    t: float  # start, data time [s since 1970]
     until: float  # horizon [s]
     ahead: np.ndarray  # (n,) [s]
     ned: np.ndarray  # from `origin`, (n, 3) [m]
@@ -84,11 +84,11 @@ class Kept(NamedTuple):
 
 
 def forecast(message: Prediction, place: Place, heard: float) -> Forecast | None:
-    """Check a prediction; None where it carries no path.
+    """Check a prediction; return None when it has no path.
 
     Raises:
-        ValueError: when its arrays disagree, are not finite or do not rise in time; the worker must resend.
-        TooFar: when it is farther than 100 km from the fleet.
+        ValueError: when its arrays disagree, are not finite or not increasing in time; the worker must resend.
+        OutOfRangeError: when it is farther than 100 km from the fleet.
     """
     ahead, path, tube = (a.numpy() for a in (message.ahead, message.path, message.tube))
     n = ahead.shape[0] if ahead.ndim == 1 else -1
@@ -101,15 +101,15 @@ def forecast(message: Prediction, place: Place, heard: float) -> Forecast | None
         )
     rises = (ahead[1:] > ahead[:-1]).all() and abs(ahead[0]) <= MAX_AHEAD_S and abs(ahead[-1]) <= MAX_AHEAD_S
     if not rises or not np.isfinite(message.t):
-        raise ValueError(f"uav-{message.uav}: prediction has times that do not rise within an hour; resend")
-    if not np.abs(path).max() <= REACH_M:  # also where it is not finite
+        raise ValueError(f"uav-{message.uav}: prediction has times that do not increase within one hour; resend")
+    if not np.abs(path).max() <= REACH_M:  # also rejects NaN
         raise ValueError(f"uav-{message.uav}: prediction has a path that is not finite or beyond 100 km; resend")
     place.spot(*message.origin)
     return Forecast(message, place, heard)
 
 
 def smooth(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lay points between look-aheads that are seconds apart: a chord would cut a turn by metres."""
+    """Insert points between look-aheads that are seconds apart, as chords cut turns by metres."""
     if np.diff(ahead).max() <= _CHORD_S or len(ahead) < 4:
         return ahead, path, tube
     parts = np.minimum(np.ceil(np.diff(ahead) / _CHORD_S), _MOST_PARTS).astype(int)
@@ -118,7 +118,7 @@ def smooth(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> tuple[np.nd
 
 
 def _cubic(ahead: np.ndarray, path: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Interpolate points (n, 3) at look-aheads (k,) by cubics whose slopes are those of neighbours: (k, 3)."""
+    """Interpolate points (n, 3) at look-aheads (k,) with cubic Hermite splines: (k, 3)."""
     slope = np.gradient(path, ahead, axis=0, edge_order=2)
     i = np.clip(np.searchsorted(ahead, at, side="right") - 1, 0, len(ahead) - 2)
     h = (ahead[i + 1] - ahead[i])[:, None]

@@ -1,51 +1,50 @@
-"""Where things are drawn: one local east-north-up frame for the whole fleet, in scene units of 10 m."""
+"""Scene frame: one local east-north-up frame for the whole fleet, in scene units of 10 m."""
 
 import numpy as np
 
 from fleet.frames import Origin, to_geodetic, to_ned
 from viewer.store.received.inbox import Head
 
-UNIT_M = 10.0  # metres per scene unit: keeps a fleet of kilometres well inside the renderer's near and far planes
-REACH_M = 100_000.0  # farther from the origin than this the tangent plane lies, and nothing is drawn
+UNIT_M = 10.0  # metres per scene unit: keeps the fleet between the near and far planes of the renderer
+REACH_M = 100_000.0  # beyond this distance the tangent plane is inaccurate and nothing is drawn
 
 
 class TooFar(ValueError):
-    """A position that cannot be drawn in the scene there is."""
+    """Position beyond the range of the scene frame."""
 
 
 class Place:
-    """The common frame: its origin is the first position anyone reported, until nobody flies within its reach."""
+    """Common local frame; its origin is the first reported position, until no UAV is within range."""
 
     def __init__(self, origin: Origin) -> None:
         self.origin = origin
         north, east, _ = to_ned(origin, *(np.array([x + 1e6]) for x in origin))[0]
-        self._east, self._north = east / 1e6 / UNIT_M, north / 1e6 / UNIT_M  # the map is linear [10 m / 1e-7 deg]
+        self._east, self._north = east / 1e6 / UNIT_M, north / 1e6 / UNIT_M  # linear map [10 m / 1e-7 deg]
 
     def geodetic(self, lat_e7: np.ndarray, lon_e7: np.ndarray, alt_mm: np.ndarray) -> np.ndarray:
         """Map geodetic positions, (n,) [1e-7 deg, 1e-7 deg, mm], to the scene: (n, 3) ENU [10 m].
 
         Raises:
-            ValueError: when a position is not on this earth; check the sender.
-            TooFar: when it is farther than 100 km from the fleet.
+            ValueError: when a position is invalid; check the sender.
+            OutOfRangeError: when it is farther than 100 km from the fleet.
         """
         lat, lon, alt = (np.asarray(x, float) for x in (lat_e7, lon_e7, alt_mm))
         if not all(np.isfinite(x).all() for x in (lat, lon, alt)) or (np.abs(lat) > 9e8).any():
-            raise ValueError("position: found a value that is no latitude, longitude or altitude; check the sender")
+            raise ValueError("position: found an invalid latitude, longitude or altitude; check the sender")
         scene = ned_to_scene(to_ned(self.origin, lat, lon, alt))
         if (np.abs(scene) > REACH_M / UNIT_M).any():
             away = np.abs(scene).max() * UNIT_M / 1000
             raise TooFar(
-                f"position: found one {away:.0f} km from the fleet's first, expected at most 100 km; "
-                "open another viewer for it"
+                f"position: found {away:.0f} km from the scene origin, expected at most 100 km; open another viewer"
             )
         return scene
 
     def spot(self, lat_e7: float, lon_e7: float, alt_mm: float) -> tuple[float, float, float]:
-        """Map one position as `geodetic` does, quickly: east, north, up [10 m].
+        """Map one position as `from_geodetic` does, without numpy: east, north, up [10 m].
 
         Raises:
-            ValueError: when it is not on this earth; check the sender.
-            TooFar: when it is farther than 100 km from the fleet.
+            ValueError: when it is invalid; check the sender.
+            OutOfRangeError: when it is farther than 100 km from the fleet.
         """
         d_lon = lon_e7 - self.origin.lon_e7
         east, north = d_lon * self._east, (lat_e7 - self.origin.lat_e7) * self._north
@@ -53,7 +52,7 @@ class Place:
         reach = REACH_M / UNIT_M
         if -reach <= east <= reach and -reach <= north <= reach and -reach <= up <= reach:
             return east, north, up
-        found = self.geodetic(*(np.array([x]) for x in (lat_e7, lon_e7, alt_mm)))[0]  # says why, or crosses 180 degrees
+        found = self.geodetic(*(np.array([x]) for x in (lat_e7, lon_e7, alt_mm)))[0]  # raises, or crosses 180 degrees
         return float(found[0]), float(found[1]), float(found[2])
 
     def local(self, origin: tuple[int, int, int], ned: np.ndarray) -> np.ndarray:
@@ -67,12 +66,12 @@ class Place:
 
 
 def ned_to_scene(ned: np.ndarray) -> np.ndarray:
-    """Turn NED [m] into east, north, up [10 m]: (..., 3)."""
+    """Convert NED [m] to east, north, up [10 m]: (..., 3)."""
     return np.stack([ned[..., 1], ned[..., 0], -ned[..., 2]], axis=-1) / UNIT_M
 
 
 def scene_quat(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarray:
-    """Turn attitudes (n,) [rad] into orientations (n, 4), scalar first, of a mesh that looks along +x, left is +y.
+    """Convert attitudes (n,) [rad] to quaternions (n, 4), scalar first, of a mesh with +x forward, +y left.
 
     In ENU with a forward-left-up body the 3-2-1 angles are yaw = pi/2 - psi, pitch = -theta, roll = phi.
     """
@@ -90,7 +89,7 @@ def scene_quat(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray) -> np.ndarra
 
 
 def first_fix(sample: Head) -> Origin | None:
-    """Read the frame's origin off the first position of a sample; None before a fix."""
+    """Return the first position of a sample as frame origin; None before a fix."""
     if sample.position is None:
         return None
     x = sample.position.x.numpy()
@@ -100,7 +99,7 @@ def first_fix(sample: Head) -> Origin | None:
 
 
 def checked(origin: Origin) -> Origin:
-    """Refuse an origin that is not on this earth."""
+    """Return the origin unchanged; raise ValueError when it is invalid."""
     if abs(origin.lat_e7) > 890_000_000 or abs(origin.lon_e7) > 1_800_000_000 or abs(origin.alt_mm) > 100_000_000:
-        raise ValueError(f"origin: found {origin}, expected a place below 89 degrees and 100 km; check the sender")
+        raise ValueError(f"origin: found {origin}, expected latitude < 89 deg and altitude < 100 km; check the sender")
     return origin

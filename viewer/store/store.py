@@ -1,4 +1,4 @@
-"""From the bus to memory: the latest of every topic per UAV, never an exception, never more than fits."""
+"""Store of received messages: the latest of every topic per UAV, with bounded memory and without exceptions."""
 
 import threading
 import time
@@ -32,29 +32,29 @@ from viewer.store.received.inbox import CROWD, Head, Inbox, Letter, Newest, read
 from viewer.store.vehicle import ENDED_S, JUMP_S, Vehicle
 from viewer.theme.events import MAX_RAISED
 
-MAX_VEHICLES = 2_000  # ids are written by strangers: more than this many are counted, not kept
-COASTING_S = 1.0  # a prediction so long after the last sample is of no flight that anything can be laid beside [s]
-SOON_S = 1.2  # in a crowd a sample is read at the latest when it has waited for so long [s]
-WAIT_S = {Prediction: 3.0, Status: 2.0}  # in a crowd the newest of these is read so often, of who is well [s]
-PAST_S = 65.0  # how long what is kept of a forecast is laid beside what happened [s]
-MAX_AWAY = 10_000  # UAVs without room that are counted
-MAX_LINKS = 64  # links whose sentences are kept
-MAX_WRITERS = 16  # workers whose sentences are kept: a restarted one is another
-# asked for at the start, so that a late viewer is complete
+MAX_VEHICLES = 2_000  # ids are untrusted input: further UAVs are counted, not stored
+COASTING_S = 1.0  # a prediction later than this after the last sample is not compared with the flight [s]
+SOON_S = 1.2  # longest delay of a sample in a large fleet [s]
+WAIT_S = {Prediction: 3.0, Status: 2.0}  # decoding interval in a large fleet for UAVs without alerts [s]
+PAST_S = 65.0  # age up to which past predictions are compared with the flight [s]
+MAX_AWAY = 10_000  # rejected UAVs that are counted
+MAX_LINKS = 64  # links whose texts are stored
+MAX_WRITERS = 16  # workers whose texts are stored; a restarted worker counts as new
+# topics requested at the start, so that a late viewer is complete
 LATE = (Status, Mission, Model, Prediction, Alert, Mismatch, FleetState, Account)
 
 
 class Feed:
-    """Everything heard, one `Vehicle` per UAV; written by the bus's threads, read by the render thread."""
+    """All received data, one `Vehicle` per UAV; written by bus threads, read by the render thread."""
 
     def __init__(self, bus: Bus, clock: Callable[[], float] = time.monotonic) -> None:
         self._vehicles: dict[int, Vehicle] = {}
         self.inbox = Inbox()
         self._place: Place | None = None
-        self.sentences: dict[int, str] = {}  # what each worker says of itself
+        self.sentences: dict[int, str] = {}  # status text of each worker
         self._counts: Counter[str] = Counter()
-        self.links: dict[str, str] = {}  # what gateways say of their links, where they say something
-        self.away: set[int] = set()  # UAVs that there was no room for
+        self.links: dict[str, str] = {}  # texts of gateways about their links
+        self.away: set[int] = set()  # UAVs beyond MAX_VEHICLES
         self.since = clock()
         self.lock = threading.Lock()
         self._bus, self._clock, self._fence = bus, clock, Fence(clock)
@@ -70,27 +70,27 @@ class Feed:
             FleetState: self._fleet,
         }
         self._hears = hears
-        self.close: frozenset[int] = frozenset()  # whose letters are read as they come, also in a crowd
+        self.close: frozenset[int] = frozenset()  # UAVs decoded on arrival, also in a large fleet
         self._newest: dict[type, Newest] = {kind: Newest(wait_s) for kind, wait_s in WAIT_S.items()}
         for kind in hears:
             bus.collect(kind, self._came(kind))
 
     @property
     def vehicles(self) -> dict[int, Vehicle]:
-        """Return everyone heard of, up to date."""
+        """Return all UAVs, after decoding queued samples."""
         with self.lock:
             self._read()
             return self._vehicles
 
     @property
     def known(self) -> set[int]:
-        """Name everyone heard of, but for letters that are not read yet."""
+        """Return the ids of all UAVs, without decoding queued samples."""
         with self.lock:
             return set(self._vehicles)
 
     @property
     def place(self) -> Place | None:
-        """Return the frame of the scene; None before anybody was anywhere."""
+        """Return the scene frame; None before the first position."""
         with self.lock:
             if self._place is None or not self.inbox.crowd:
                 self._read()
@@ -98,13 +98,13 @@ class Feed:
 
     @property
     def counts(self) -> Counter[str]:
-        """Return how many messages came of each class, and how many were strange or outdated."""
+        """Return the number of messages of each class, and of malformed and outdated ones."""
         with self.lock:
             self._read()
             return self._counts
 
     def listen(self) -> None:
-        """Take in what came since the last call; call it some ten times a second."""
+        """Receive the messages since the last call; call it about ten times per second."""
         self._bus.hand_out((Sample,) if self.inbox.crowd else ())
         with self.lock:
             for kind, newest in self._newest.items():
@@ -112,7 +112,7 @@ class Feed:
                     self._open(kind, uav, letter)
 
     def _came(self, kind: type) -> Callable[[list[Said]], None]:
-        """Take in one class: samples are put aside, and in a crowd what comes every second; the rest is read."""
+        """Return the callback of one class: it queues samples and deferrable messages and decodes the others."""
         newest, named_so = self._newest.get(kind), encoding(kind)
 
         def came(letters: list[Said]) -> None:
@@ -134,14 +134,14 @@ class Feed:
         return came
 
     def _may_wait(self, kind: type, uav: int) -> bool:
-        """Return whether one of a crowd is not looked at closely, and such a message of it is known already."""
+        """Return whether decoding may wait: large fleet, UAV not immediate, an earlier message present."""
         if not self.inbox.crowd or uav in self.close:
             return False
         vehicle = self._vehicles.get(uav)
         return vehicle is not None and getattr(vehicle, kind.topic) is not None  # type: ignore[attr-defined]
 
     def _open(self, kind: type, uav: int | None, letter: Letter) -> None:
-        """Read one letter, after the samples before it; the lock is held."""
+        """Decode one message, after the samples before it; the caller owns the lock."""
         if not self.inbox.crowd:
             self._read()
         try:
@@ -152,7 +152,7 @@ class Feed:
         self._hear(kind, message, letter.stamp, letter.now)
 
     def _read(self, uavs: Iterable[int] | None = None) -> None:
-        """Read what was put aside, or what of it is of some UAVs; the lock is held."""
+        """Decode the queued samples of all or some UAVs; the caller owns the lock."""
         for uav, letter in self.inbox.take(uavs):
             try:
                 sample = read(letter.payload)
@@ -167,16 +167,16 @@ class Feed:
 
     @property
     def router(self) -> bool:
-        """Return whether a router is there to hear anything through."""
+        """Return whether a router is connected."""
         return bool(self._bus.router)
 
     @property
     def listening(self) -> str:
-        """Name the key the first sign of life comes on."""
+        """Return the key expression of samples."""
         return key(Sample, "*")
 
     def catch_up(self) -> None:
-        """Ask everyone for what was said before we listened; what is newer by now is kept."""
+        """Request the latest messages published before the start; keep newer ones."""
         for kind in LATE:
             hear = self._guarded(kind)
             for message, stamp in self._bus.ask(kind):
@@ -184,22 +184,22 @@ class Feed:
                     hear(message, stamp)
 
     def _is_known(self, message: Any) -> bool:
-        """Return whether something as new came by itself while we asked."""
+        """Return whether an equally new message arrived during the request."""
         with self.lock:
             held = getattr(self._vehicles.get(getattr(message, "uav", -1)), message.topic, None)
         return held is not None and held.t >= message.t
 
     def all(self) -> list[Vehicle]:
-        """Copy the UAVs, in order of their ids: nothing changes in them while they are drawn."""
+        """Return snapshots of all UAVs in the order of their ids."""
         with self.lock:
             self._read(self.inbox.waiting(self._clock() - SOON_S) if self.inbox.crowd else None)
             return [self._vehicles[uav].still(self._clock()) for uav in sorted(self._vehicles)]
 
     def poses(self, uavs: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where some UAVs are, how they are turned, and when that was heard; of others nothing is read.
+        """Return positions, attitudes and arrival times of some UAVs; do not decode others.
 
         Returns:
-            scene ENU (n, 3) [10 m], not a number where nobody told; phi theta psi (n, 3) [rad]; monotonic (n,) [s]
+            scene ENU (n, 3) [10 m], NaN where unknown; phi theta psi (n, 3) [rad]; monotonic (n,) [s]
         """
         nowhere = np.full(3, np.nan)
         with self.lock:
@@ -210,39 +210,39 @@ class Feed:
         return np.array(places).reshape(-1, 3), np.array(turns).reshape(-1, 3), np.array(heard)
 
     def one(self, uav: int) -> Vehicle | None:
-        """Copy one UAV; None where it was never heard of."""
+        """Return a snapshot of one UAV; None when it is unknown."""
         with self.lock:
             self._read((uav,) if self.inbox.crowd else None)
             found = self._vehicles.get(uav)
             return found.still(self._clock()) if found is not None else None
 
     def said(self) -> list[str]:
-        """Copy what the workers say of themselves."""
+        """Return the status texts of the workers."""
         with self.lock:
             return [text for text in self.sentences.values() if text]
 
     def trail(self, vehicle: Vehicle) -> np.ndarray:
-        """Copy the flown trail: (n, 5) fleet time [s], scene ENU [10 m], Va [m/s]."""
+        """Copy the flown trail: (n, 5) data time [s], scene ENU [10 m], Va [m/s]."""
         with self.lock:
             return vehicle.trail.rows()
 
     def track(self, vehicle: Vehicle) -> np.ndarray:
-        """Copy the whole flown path, thinned: (n, 4) fleet time [s], scene ENU [10 m]."""
+        """Copy the whole flown path, thinned: (n, 4) data time [s], scene ENU [10 m]."""
         with self.lock:
             return vehicle.track.rows()
 
     def past(self, vehicle: Vehicle) -> list[Kept]:
-        """Copy what is kept of the forecasts of the last half minute, oldest first."""
+        """Copy the past predictions of the last minute, oldest first."""
         with self.lock:
             return list(vehicle.past)
 
     def fits(self, vehicle: Vehicle) -> np.ndarray:
-        """Copy the history of fits: (n, 2) fleet time [s], mean over the states [%]."""
+        """Copy the history of fits: (n, 2) data time [s], mean over the states [%]."""
         with self.lock:
             return np.array(vehicle.fits, float).reshape(-1, 2)
 
     def _guarded(self, kind: type) -> Callable[[Any, Stamp | None], None]:
-        """Wrap one hearer: under the lock, and a strange message is counted instead of raised."""
+        """Return a handler of one class that takes the lock and counts malformed messages."""
 
         def hear(message: Any, stamp: Stamp | None) -> None:
             with self.lock:
@@ -259,7 +259,7 @@ class Feed:
         except (ValueError, IndexError, TypeError, OverflowError) as error:
             self._counts["strange"] += 1
             if (vehicle := self._vehicles.get(getattr(message, "uav", -1))) is not None:
-                vehicle.refused = now, f"A {kind.__name__.lower()} was refused: {error}"
+                vehicle.refused = now, f"A {kind.__name__.lower()} was rejected: {error}"
 
     def _vehicle(self, uav: int) -> Vehicle:
         if uav not in self._vehicles:
@@ -267,8 +267,8 @@ class Feed:
                 if len(self.away) < MAX_AWAY:
                     self.away.add(uav)
                 raise ValueError(
-                    f"uav-{uav}: found {len(self._vehicles)} UAVs already or no id below 1,000,000, "
-                    f"expected at most {MAX_VEHICLES}; open another viewer"
+                    f"uav-{uav}: found {len(self._vehicles)} UAVs or an id of 1,000,000 or more, "
+                    f"expected at most {MAX_VEHICLES} UAVs; open another viewer"
                 )
             self._vehicles[uav] = Vehicle(uav)
         return self._vehicles[uav]
@@ -290,7 +290,7 @@ class Feed:
         vehicle.note(sample, now)
 
     def _move(self, place: Place) -> None:
-        """Begin anew elsewhere: where we are, nobody flies any more; the first position was a wrong one, say."""
+        """Move the scene origin: no UAV flies near the old one, as after a wrong first position."""
         self._place = place
         for vehicle in self._vehicles.values():
             vehicle.forget()
@@ -304,7 +304,7 @@ class Feed:
         return hear
 
     def _believe(self, vehicle: Vehicle, stamp: Stamp | None, now: float) -> bool:
-        """Return whether a worker may speak for a UAV: not below the highest claim that still speaks."""
+        """Return whether the fencing token of a worker message is current for a UAV."""
         if not self._fence.believes(vehicle.uav, stamp):
             self._counts["outdated"] += 1
             return False
@@ -326,7 +326,7 @@ class Feed:
         if not self._believe(vehicle, stamp, now):
             return
         if vehicle.prediction is not None and 0 < vehicle.prediction.t - message.t < JUMP_S:
-            return  # delayed, and newer is here
+            return  # delayed: a newer one is present
         vehicle.note(message, now)
         vehicle.controller = message.controller or vehicle.controller
         if self._place is None and message.path.shape[0]:
@@ -351,7 +351,7 @@ class Feed:
             vehicle.note(found, now)
 
     def _account(self, account: Account, _: Stamp | None, now: float) -> None:
-        """Learn who is played from a recording, and that the player still speaks; one who flies now is live again."""
+        """Update link texts and which UAVs are replayed from a recording."""
         for link in account.per_link[:MAX_LINKS]:
             self.links.pop(link.link, None)
             if link.sentence and len(self.links) < MAX_LINKS:
@@ -364,7 +364,7 @@ class Feed:
 
     def _alert(self, alert: Alert, stamp: Stamp | None, now: float) -> None:
         vehicle = self._vehicle(alert.uav)
-        if stamp is not None and not self._believe(vehicle, stamp, now):  # without a stamp: of a gateway
+        if stamp is not None and not self._believe(vehicle, stamp, now):  # no token: from a gateway
             return
         vehicle.note(alert, now)
         others = {about: held for about, held in vehicle.alerts.items() if about != alert.about}
@@ -381,7 +381,7 @@ class Feed:
                 vehicle.row = row
 
     def alerts(self) -> list[tuple[Vehicle, AlertKind, Alert]]:
-        """Return the alerts in force, newest first."""
+        """Return the active alerts, newest first."""
         with self.lock:
             now = self._clock()
             copies = [vehicle.still(now) for vehicle in self._vehicles.values() if vehicle.alerts]
@@ -390,6 +390,6 @@ class Feed:
 
 
 def _stamp_of(row: FleetRow) -> Stamp:
-    """Return the claim of a row of the fleet table; the writer is a stranger's text."""
+    """Return the fencing token of a fleet table row; the writer is untrusted text."""
     hexadecimal = len(row.worker) == 16 and all(letter in "0123456789abcdef" for letter in row.worker)
     return Stamp(row.epoch, int(row.worker, 16) if hexadecimal else 0)

@@ -1,4 +1,4 @@
-"""The whole flown path of one UAV in a fixed number of points: the longer the flight, the farther apart they are."""
+"""Flown path of one UAV: the whole flight in a fixed number of points, and the newest stretch in full."""
 
 from math import dist
 
@@ -8,20 +8,20 @@ from viewer.store.place import UNIT_M
 
 POINTS = 800
 TRAIL_ROWS = 900  # about 90 s at 10 Hz
-STEP_S = 0.5  # between two points, until they are full for the first time [s]
-SETTLE_S = 30.0  # so long first positions may be wrong: a leap among them begins the path anew [s]
-LEAP_M, LEAP_M_S = 50.0, 60.0  # farther than this, and this for every second between, is a leap [m], [m/s]
+STEP_S = 0.5  # initial spacing of the points [s]
+SETTLE_S = 30.0  # initial positions may be wrong: a jump within this time restarts the path [s]
+LEAP_M, LEAP_M_S = 50.0, 60.0  # a jump exceeds JUMP_M plus JUMP_M_S times the interval [m], [m/s]
 
 
 class Track:
-    """Times and places, thinned to every other one whenever there is no room left."""
+    """Path of a flight; when the buffer is full, every second point is dropped."""
 
     def __init__(self) -> None:
-        self._rows = np.full((POINTS, 4), np.nan)  # t [s], scene ENU [10 m]; all its memory is taken at once
+        self._rows = np.full((POINTS, 4), np.nan)  # t [s], scene ENU [10 m]; preallocated
         self._n, self._step, self._last = 0, STEP_S, -np.inf
 
     def add(self, spots: list[tuple[float, float, float, float]]) -> bool:
-        """Add times and places, rising: t [s], scene ENU [10 m]; what does not rise is left out. Tell of a leap."""
+        """Append points in time order, t [s], scene ENU [10 m]; skip older ones. Return whether the path jumped."""
         if leapt := self._leaps(spots[0]):
             self.clear()
         for spot in spots:
@@ -41,7 +41,7 @@ class Track:
         return UNIT_M * dist(spot[1:], last[1:]) > LEAP_M + LEAP_M_S * max(spot[0] - last[0], 0.0)
 
     def lay_before(self, rows: np.ndarray) -> None:
-        """Put earlier points first: (n, 4) as of `rows`; what is not earlier than all that is held is left out."""
+        """Prepend earlier points (n, 4), as of `rows`; skip points that are not earlier."""
         held = self.rows()
         joined = np.vstack([_before(rows, held), held])
         self.clear()
@@ -49,7 +49,7 @@ class Track:
             self.add([tuple(row) for row in joined.tolist()])
 
     def clear(self) -> None:
-        """Forget the flight."""
+        """Remove all points."""
         self._n, self._step, self._last = 0, STEP_S, -np.inf
 
     def rows(self) -> np.ndarray:
@@ -58,11 +58,11 @@ class Track:
 
 
 class Trail:
-    """The newest stretch of the flown path, as it was heard: t [s], scene ENU [10 m], Va [m/s]."""
+    """Newest stretch of the flown path, as received: t [s], scene ENU [10 m], Va [m/s]."""
 
     def __init__(self) -> None:
-        self._rows = np.full((TRAIL_ROWS, 5), np.nan)  # all its memory is taken at once
-        self._n = 0  # ever written; the newest `TRAIL_ROWS` are held
+        self._rows = np.full((TRAIL_ROWS, 5), np.nan)  # preallocated
+        self._n = 0  # rows ever written; the newest `TRAIL_ROWS` are stored
 
     def add(self, *row: float) -> None:
         """Add one row of five."""
@@ -70,36 +70,36 @@ class Trail:
         self._n += 1
 
     def lay_before(self, rows: np.ndarray) -> None:
-        """Put earlier rows first, (n, 5), as many as there is room for; what is not earlier is left out."""
+        """Prepend earlier rows (n, 5) up to the capacity; skip rows that are not earlier."""
         held = self.rows()
         joined = np.vstack([_before(rows, held), held])[-TRAIL_ROWS:]
         self._rows[: len(joined)], self._n = joined, len(joined)
 
     def clear(self) -> None:
-        """Forget it."""
+        """Remove all rows."""
         self._n = 0
 
     def rows(self) -> np.ndarray:
-        """Copy what is held, oldest first: (n, 5)."""
+        """Copy the stored rows, oldest first: (n, 5)."""
         if self._n <= TRAIL_ROWS:
             return self._rows[: self._n].copy()
         return np.roll(self._rows, -(self._n % TRAIL_ROWS), axis=0)
 
 
 def _before(rows: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Return the rows whose time is before the first one held."""
+    """Return the rows earlier than the first current one."""
     return rows[rows[:, 0] < held[0, 0]] if len(held) else rows
 
 
 def placed(rows: np.ndarray, t: np.ndarray, slack: float = 2.0) -> np.ndarray:
-    """Interpolate where the UAV was.
+    """Interpolate positions on a path.
 
     Args:
         rows: of a track, (n, 4)
-        t: when, (k,) [s]
-        slack: how far before the first and after the last point it is still said to have been there [s]
+        t: times, (k,) [s]
+        slack: tolerance before the first and after the last point [s]
     Returns:
-        (k, 3) [10 m]; not a number where the flown path does not reach
+        (k, 3) [10 m]; NaN outside the path
     """
     t = np.asarray(t, float)
     if not len(rows):

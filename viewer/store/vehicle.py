@@ -1,4 +1,4 @@
-"""What the viewer remembers of one UAV: the latest of each topic, and a bounded trail."""
+"""State of one UAV in the viewer: the latest message of each topic and bounded histories."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -31,24 +31,24 @@ from viewer.store.received.rows import last, stacked
 from viewer.store.track import Track, Trail
 from viewer.theme.events import Event, closed, merged
 
-SILENT_S = 3.0  # without a sample for this long the link counts as lost, whatever was last said [s]
-ABANDONED_S = 30.0  # without a word of any worker for so long, what was last said is no state any more [s]
-LATE_S = 5.0  # a prediction older than this is no news, in wall time [s]
-ENDED_S = 3.0  # a recording whose player is silent for so long is over [s]
-JUMP_S = 5.0  # a step back in time by more than this is another flight: start afresh [s]
-AWAY_S = 86_400.0  # a status whose time lies farther from the samples is of another flight [s]
+SILENT_S = 3.0  # without a sample for this long the link counts as lost [s]
+ABANDONED_S = 30.0  # without a worker message for this long the UAV counts as unclaimed [s]
+LATE_S = 5.0  # a prediction older than this is reported as late, wall time [s]
+ENDED_S = 3.0  # a replay without messages for this long has ended [s]
+JUMP_S = 5.0  # a larger step back in time is another flight: reset [s]
+AWAY_S = 86_400.0  # a status farther from the sample time belongs to another flight [s]
 
 
 @dataclass
 class Vehicle:
-    """One UAV as the page knows it."""
+    """One UAV on the page."""
 
     uav: int
-    believed: float = -np.inf  # when a worker's result was last accepted, monotonic [s]
-    heard: float = -np.inf  # when a sample last arrived, monotonic [s]
+    believed: float = -np.inf  # last accepted worker result, monotonic [s]
+    heard: float = -np.inf  # arrival of the last sample, monotonic [s]
     t: float = -np.inf  # fleet time of the newest sample [s]
     at: np.ndarray | None = None  # newest position, scene ENU, (3,) [10 m]
-    floor: float = np.nan  # the lowest it was while disarmed, scene [10 m]
+    floor: float = np.nan  # lowest height while disarmed, scene [10 m]
     alt_m: float = np.nan  # above mean sea level [m]
     attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)  # phi theta psi [rad]
     Va: float = np.nan  # [m/s]
@@ -57,30 +57,30 @@ class Vehicle:
     model: Model | None = None
     prediction: Prediction | None = None
     mismatch: Mismatch | None = None
-    controller: Controller | None = None  # the law in force, as last told
+    controller: Controller | None = None  # active control law, as last received
     forecast: Forecast | None = None
     row: FleetRow | None = None
     time: DataTime = field(default_factory=DataTime)
-    player: float = -np.inf  # when the gateway that plays it as a recording last spoke, monotonic [s]; -inf: live
-    judged: tuple[float, State] | None = None  # of a copy: when its state was last judged, and what it was
-    ended: bool = False  # the recording is over: what is shown is its last instant
+    player: float = -np.inf  # last message of the replaying gateway, monotonic [s]; -inf: live
+    judged: tuple[float, State] | None = None  # of a snapshot: time and value of the last computed state
+    ended: bool = False  # the recording has ended: the page shows its last instant
     known: Known = field(default_factory=Known)
-    events: tuple[Event, ...] = ()  # oldest first; replaced as a whole, never changed
-    alerts: dict[About, Alert] = field(default_factory=dict)  # replaced as a whole, never changed
-    refused: tuple[float, str] = (-np.inf, "")  # when a message was refused, monotonic [s], and why
-    trail: Trail = field(default_factory=Trail)  # the newest stretch of it, as it was heard
+    events: tuple[Event, ...] = ()  # oldest first; immutable, replaced as a whole
+    alerts: dict[About, Alert] = field(default_factory=dict)  # replaced as a whole, never mutated
+    refused: tuple[float, str] = (-np.inf, "")  # last rejected message: time, monotonic [s], and reason
+    trail: Trail = field(default_factory=Trail)  # newest stretch of the flight, as received
     track: Track = field(default_factory=Track)  # the whole flight, thinned
-    past: deque[Kept] = field(default_factory=lambda: deque(maxlen=65))  # forecasts of the last minute
-    sure: Forecast | None = None  # the newest that did not coast
+    past: deque[Kept] = field(default_factory=lambda: deque(maxlen=65))  # predictions of the last minute
+    sure: Forecast | None = None  # newest prediction made with current telemetry
     fits: deque = field(default_factory=lambda: deque(maxlen=64))  # t, mean fit [%]
 
     @property
     def name(self) -> str:
-        """Name the UAV as the page does."""
+        """Return the display name of the UAV."""
         return f"UAV-{self.uav:03d}"
 
     def state(self, now: float) -> State:
-        """Judge where its twin stands; the worst news wins. `now` is monotonic [s]."""
+        """Return the state of the twin; the most severe condition wins. `now` is monotonic [s]."""
         if self.judged is None:
             return self._judge(now)
         if self.judged[0] != now:
@@ -88,7 +88,7 @@ class Vehicle:
         return self.judged[1]
 
     def _judge(self, now: float) -> State:
-        silent = now - self.heard > SILENT_S / min(self.time.pace, 1.0)  # a slow recording may breathe
+        silent = now - self.heard > SILENT_S / min(self.time.pace, 1.0)  # a slow replay has longer gaps
         if silent or (self.status is not None and self.status.link is Link.LOST):
             return State.LINK_LOST
         if now - self.believed > ABANDONED_S:
@@ -102,9 +102,9 @@ class Vehicle:
         return State.WAITING
 
     def still(self, now: float) -> "Vehicle":
-        """Return a copy that nobody changes any more; the histories stay shared, read them through the feed.
+        """Return an immutable copy; the histories stay shared, read them through the store.
 
-        A recording that is over stands still at its end: what a worker says after that is of no flight.
+        A recording that has ended stays at its last instant: later worker messages do not belong to the flight.
         """
         copy = object.__new__(Vehicle)
         copy.__dict__.update(self.__dict__)
@@ -120,20 +120,20 @@ class Vehicle:
 
     @property
     def recorded(self) -> bool:
-        """Return whether it is played from a recording."""
+        """Return whether the UAV is replayed from a recording."""
         return self.player > -np.inf
 
     def age(self, now: float) -> float:
-        """Return the data time since the last sample [s]; infinite before any."""
+        """Return the data time since the last sample [s]; infinite before the first."""
         return max(self.clock(now) - self.t, 0.0) if np.isfinite(self.t) else np.inf
 
     def late(self, now: float) -> float:
-        """Return how far the newest prediction lies behind data time [s]; 0 while its worker keeps up."""
+        """Return the lag of the newest prediction behind data time [s]; 0 below `LATE_S`."""
         behind = self.clock(now) - self.forecast.t if self.forecast is not None else 0.0
         return behind if behind > LATE_S * max(self.time.pace, 1.0) else 0.0
 
     def clock(self, now: float) -> float:
-        """Estimate the aircraft's data time now [s], from the newest thing heard of it; it stops with a recording."""
+        """Estimate the current data time [s] from the newest message; it stops at the end of a recording."""
         if self.ended:
             return self.time.t
         if self.time.t == -np.inf and self.forecast is not None:
@@ -141,8 +141,8 @@ class Vehicle:
         return self.time.at(now)
 
     def note(self, message: Any, now: float) -> None:
-        """Take down what a message tells: data time and events."""
-        if isinstance(message, Head | Status) and abs(message.t - self.t) < AWAY_S:  # also: it is a time at all
+        """Update data time and events from a message."""
+        if isinstance(message, Head | Status) and abs(message.t - self.t) < AWAY_S:  # also rejects NaN
             self.time = self.time.hear(message.t, now)
         if isinstance(message, Head) and self._no_news(message):
             return
@@ -151,12 +151,12 @@ class Vehicle:
             self.events = merged(self.events, fresh)
 
     def _no_news(self, sample: Head) -> bool:
-        """Return whether a sample names the mission item in force, or none: most do."""
+        """Return whether a sample has no mission item or the active one."""
         leg = sample.leg
         return leg is None or (leg.x.shape == (1, 1) and leg.t.shape == (1,) and last(leg.x) == (self.known.seq,))
 
     def where(self, now: float) -> np.ndarray | None:
-        """Return the place to draw it, (3,) [10 m]: the last sample's, or, link lost, the predicted ghost's."""
+        """Return the position to draw, (3,) [10 m]: last sample, or the prediction when the link is lost."""
         if self.ended and self.at is not None:
             return self.at
         if self.forecast is not None and (self.at is None or self.state(now) is State.LINK_LOST):
@@ -164,7 +164,7 @@ class Vehicle:
         return self.at
 
     def hear_sample(self, sample: Head, place: Place, now: float) -> None:
-        """Take over the newest rows of a sample."""
+        """Update from the newest rows of a sample."""
         if not isfinite(sample.t):
             raise ValueError(
                 f"uav-{self.uav}: sample has time {sample.t}, expected seconds since 1970; check the gateway"
@@ -194,12 +194,12 @@ class Vehicle:
         for spot in spots:
             self.trail.add(*spot, self.Va)
         up = spots[-1][3]
-        if self.status is not None and self.status.mode and not self.status.armed:  # no mode: not yet known
+        if self.status is not None and self.status.mode and not self.status.armed:  # no mode: status unknown
             self.floor = min(self.floor, up) if isfinite(self.floor) else up
         self.at, self.alt_m = np.array(spots[-1][1:]), up * UNIT_M + place.origin.alt_mm * 1e-3
 
     def forget(self) -> None:
-        """Drop everything that belongs to a flight: the clock went back, or the scene begins anew elsewhere."""
+        """Clear the state of a flight after a clock step back or a new scene origin."""
         self.at, self.alerts, self.floor = None, {}, np.nan
         self.time, self.known, self.events = DataTime(), Known(), ()
         self.t, self.forecast, self.prediction, self.model, self.row = -np.inf, None, None, None, None

@@ -1,15 +1,15 @@
-"""What a click on the page says: whom it means and, where it means a time, when."""
+"""Encoding of clicks on the page: UAV id and optional data time."""
 
 from viewer.theme.events import LATEST
 
 
 def click(uav: int, t: float) -> str:
-    """Write down a UAV and a time of its own, data time [s since 1970]: `7@1700000000.500`; noise is no time."""
+    """Encode a UAV id and a data time [s since 1970]: `7@1700000000.500`; omit an invalid time."""
     return f"{uav}@{t:.3f}" if 0 <= t < LATEST else f"{uav}"
 
 
 def clicked(text: str) -> tuple[int, float | None] | None:
-    """Read `7` or `7@1700000000.500`; None for anything else, which is somebody's mischief."""
+    """Parse `7` or `7@1700000000.500`; return None for any other text."""
     uav, _, t = text[:40].partition("@")
     if not (uav.isascii() and uav.isdecimal() and len(uav) <= 6):
         return None

@@ -1,4 +1,4 @@
-"""What happened while one was away: the browser remembers when it was last here, the fleet what it told since."""
+"""Events during an absence of the operator; the browser stores the time of its last visit."""
 
 import contextlib
 import threading
@@ -12,22 +12,22 @@ from viewer.text.clicks import click
 from viewer.theme.events import Event, Kind
 from viewer.theme.palette import MARK, Palette
 
-KEY = "parauav-seen"  # in the browser's own store
-AWAY_S = 5.0  # a shorter interruption is none [s]
-LONGEST_S = 12 * 3600.0  # who was away for longer begins anew [s]
+KEY = "parauav-seen"  # in the local storage of the browser
+AWAY_S = 5.0  # a shorter interruption is ignored [s]
+LONGEST_S = 12 * 3600.0  # a longer absence lists nothing [s]
 ROWS = 40
 WORTH = {Kind.ALERT, Kind.MISMATCH, Kind.LOST, Kind.BACK, Kind.EASED, Kind.WARNING, Kind.NO_MODEL}
 
 
 class Away(NamedTuple):
-    """An interruption, on the wall clock [s since 1970]."""
+    """Absence of the operator, wall-clock time [s since 1970]."""
 
     left: float
     came: float
 
 
 class Presence:
-    """Knows of one page when its browser was last here."""
+    """Time of the last visit of one browser."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
@@ -41,16 +41,16 @@ class Presence:
             self.away = Away(left, now) if AWAY_S < now - left < LONGEST_S else None
 
     def here(self) -> None:
-        """Let the browser remember that it is here."""
+        """Store the current time in the browser."""
         self._client.local_storage.set_item(KEY, f"{time.time():.1f}")
 
     def seen(self) -> None:
-        """Forget the interruption: what happened in it was read."""
+        """Clear the absence after the operator has read its events."""
         self.away = None
 
 
 def missed(fleet: list[Vehicle], away: Away) -> list[tuple[Vehicle, Event]]:
-    """Choose what live aircraft told during an interruption and an operator must know of, newest first."""
+    """Return the reported events of live UAVs during an absence, newest first."""
     live = [vehicle for vehicle in fleet if not vehicle.recorded]
     found = [
         (v, event) for v in live for event in v.events if event.kind in WORTH and away.left < event.t <= away.came + 1.0
@@ -59,7 +59,7 @@ def missed(fleet: list[Vehicle], away: Away) -> list[tuple[Vehicle, Event]]:
 
 
 def since(fleet: list[Vehicle], away: Away | None, palette: Palette, pick: str) -> str:
-    """List what was missed, as HTML; nothing where nobody was away. `pick` shows whose and when it was: `{}`."""
+    """Return the missed events as HTML; empty without an absence. `pick` is the click handler with `{}`."""
     if away is None:
         return ""
     found = missed(fleet, away)
@@ -72,5 +72,5 @@ def since(fleet: list[Vehicle], away: Away | None, palette: Palette, pick: str) 
         for v, event in found[:ROWS]
     )
     more = f'<div class="soft">and {len(found) - ROWS} earlier</div>' if len(found) > ROWS else ""
-    rows = rows or '<div class="soft">nothing to tell</div>'
+    rows = rows or '<div class="soft">no events</div>'
     return f'<div class="uav">{head}<div class="events">{rows}{more}</div></div>'

@@ -1,4 +1,4 @@
-"""What the page says, as HTML. Everything that came over the bus is escaped here, at the edge, and nowhere else."""
+"""Texts of the page as HTML. Received texts are escaped here."""
 
 from collections import Counter
 from html import escape
@@ -16,12 +16,12 @@ from viewer.theme.palette import GLYPH, MARK, WORD, Palette
 
 SEVERITY = (State.LINK_LOST, State.UNCLAIMED, State.WAITING, State.IDENTIFYING, State.PREDICTING, State.VERIFIED)
 MAX_ROWS = 50
-CLAIMS_S = 0.5  # a shorter horizon claims nothing [s]
-BAR_S = 10.0  # a bar of the table that is full stands for at least this horizon [s]
+CLAIMS_S = 0.5  # a shorter horizon counts as none [s]
+BAR_S = 10.0  # smallest horizon of a full bar in the table [s]
 
 
 class Standing(NamedTuple):
-    """How a UAV stands, in a glyph, a word and a colour."""
+    """Status of a UAV as glyph, text and colour."""
 
     glyph: str
     word: str
@@ -29,7 +29,7 @@ class Standing(NamedTuple):
 
 
 def standing(vehicle: Vehicle, palette: Palette, now: float) -> Standing:
-    """Say how a UAV stands: its twin's state, what is wrong with it, or that its recording is over."""
+    """Return the status of a UAV: state of its twin, mismatch, alert or end of recording."""
     if vehicle.ended:
         return Standing(MARK[Kind.END], "recording ended", palette.event(Kind.END))
     state = vehicle.state(now)
@@ -41,18 +41,18 @@ def standing(vehicle: Vehicle, palette: Palette, now: float) -> Standing:
 
 
 def severity(vehicle: Vehicle, now: float) -> tuple[bool, int, float, int]:
-    """Rank a UAV: alerts first, then the worst state, then the shortest horizon; ended recordings last."""
+    """Return a sort key: alerts first, then worst state, then shortest horizon; ended recordings last."""
     rank = len(SEVERITY) if vehicle.ended else SEVERITY.index(vehicle.state(now))
     return (not (vehicle.alerts or in_force(vehicle.mismatch)), rank, horizon_s(vehicle), vehicle.uav)
 
 
 def horizon_s(vehicle: Vehicle) -> float:
-    """Return the horizon in force [s]; 0 where nothing is predicted."""
+    """Return the current horizon [s]; 0 without a prediction."""
     return vehicle.forecast.until if vehicle.forecast is not None else 0.0
 
 
 def fit(vehicle: Vehicle) -> float | None:
-    """Return the mean fit over the states of the model in force [%]; None before any."""
+    """Return the mean fit over the states of the active model [%]; None before the first."""
     source = (
         (vehicle.model.in_force or vehicle.model.verdict).fit
         if vehicle.model is not None
@@ -65,9 +65,9 @@ def fit(vehicle: Vehicle) -> float | None:
 
 
 def empty(feed: Feed, now: float) -> str:
-    """Say what is listened to and what to check, while nobody is there."""
+    """Return the page text without UAVs: subscribed key and what to check."""
     n, strange = sum(tuple(feed.counts.values())) - feed.counts["strange"], feed.counts["strange"]
-    odd = f" {strange} could not be read." if strange else ""
+    odd = f" {strange} malformed." if strange else ""
     said = "".join(f"<br>{escape(text)}" for text in feed.said())
     return (
         f'<div class="uav"><h1>No vehicles yet</h1><div class="soft">Listening on <code>{escape(feed.listening)}'
@@ -94,7 +94,7 @@ def summary(fleet: list[Vehicle], feed: Feed, palette: Palette, now: float) -> s
 
 
 def _recording(fleet: list[Vehicle], now: float) -> str:
-    """Say that recordings are played, the data time they have come to, and how fast they run."""
+    """Return the replay status: data time and rate of recordings."""
     played = [vehicle for vehicle in fleet if vehicle.recorded]
     if not played:
         return ""
@@ -109,7 +109,7 @@ def _fleet_coverage(fleet: list[Vehicle]) -> str:
 
 
 def table(fleet: list[Vehicle], palette: Palette, now: float, *, total: int, pick: str, selected: int | None) -> str:
-    """List the worst up to 50 of those that pass the filter; `pick` is the handler of a row, `{}` its UAV."""
+    """Return the table of up to 50 UAVs, most severe first; `pick` is the click handler with `{}` for the UAV."""
     worst = sorted(fleet, key=lambda vehicle: severity(vehicle, now))[:MAX_ROWS]
     longest = max((horizon_s(vehicle) for vehicle in worst), default=0.0)
     longest = max(longest, BAR_S)
@@ -137,13 +137,13 @@ def _row(vehicle: Vehicle, palette: Palette, now: float, pick: str, *, on: bool,
 
 
 def _finding(vehicle: Vehicle) -> str:
-    """Say what is wrong with a UAV, for who rests on its row; not yet escaped."""
+    """Return mismatch and alert texts of a UAV for the tooltip of its row; not escaped."""
     said = [short(vehicle.mismatch)] if vehicle.mismatch is not None and in_force(vehicle.mismatch) else []
     return "; ".join([*said, *(alert.sentence[:200] for alert in vehicle.alerts.values())])
 
 
 def alerts(fleet: list[Vehicle], feed: Feed, palette: Palette, pick: str = "") -> str:
-    """List the mismatches and the alerts in force, newest first, at most 50 of each; `pick` shows whose and when."""
+    """Return active mismatches and alerts, newest first, at most 50 each; `pick` is the click handler."""
     strange = [(v, v.mismatch) for v in fleet if v.mismatch is not None and in_force(v.mismatch)]
     told = [(v, "mismatch", one.t, short(one)) for v, one in sorted(strange, key=lambda one: -one[1].t)[:MAX_ROWS]]
     found = [(v, kind.value.replace("_", " "), a.t, a.sentence) for v, kind, a in feed.alerts()[:MAX_ROWS]]
@@ -154,25 +154,25 @@ def alerts(fleet: list[Vehicle], feed: Feed, palette: Palette, pick: str = "") -
         f'<span class="soft when">{moment(t)}</span><br>{escape(text[:300])}</div>'
         for vehicle, kind, t, text in [*told, *found]
     )
-    return f'<div class="uav">{cards or "<div class=soft>No alert is in force.</div>"}</div>'
+    return f'<div class="uav">{cards or "<div class=soft>No active alerts.</div>"}</div>'
 
 
 def legend(fleet: list[Vehicle], palette: Palette) -> str:
-    """Say what the lines mean and how often the band held, measured: it stays on the screen whatever else is shown."""
+    """Return the legend of the lines and the measured coverage of the band; it is always visible."""
     n, held, quantile = held_so_far(fleet)
-    said = f"held {held * 100:.0f} %, n = {n}" if n else "not measured yet"
+    said = f"coverage {held * 100:.0f} %, n = {n}" if n else "not measured yet"
     parts = (
         f'<i class="line" style="background:{palette.flown}"></i>flown',
         f'<i class="line dash" style="color:{palette.ink}"></i>predicted',
         f'<i class="band" style="background:{palette.tube}"></i>{quantile * 100:.0f} % band: <b>{said}</b>',
         f'<i class="ring" style="border-color:{palette.horizon}"></i>horizon: error reaches 10 %',
-        f'<i class="line dash" style="color:{palette.muted}"></i>beyond it nothing is claimed',
+        f'<i class="line dash" style="color:{palette.muted}"></i>beyond the horizon',
     )
     return f'<div class="legend">{"".join(f"<span>{part}</span>" for part in parts)}</div>'
 
 
 def held_so_far(fleet: list[Vehicle]) -> tuple[int, float, float]:
-    """Give how many predictions were answered, the share of them inside the band, and the share it is meant to hold."""
+    """Return the number of evaluated predictions, their coverage and the nominal coverage."""
     told = [v.prediction for v in fleet if v.prediction is not None]
     sure = [p for p in told if p.held_n > 0 and isfinite(p.held)]
     n = sum(p.held_n for p in sure)
@@ -180,7 +180,7 @@ def held_so_far(fleet: list[Vehicle]) -> tuple[int, float, float]:
 
 
 def ago(seconds: float) -> str:
-    """Say an age in a few letters."""
+    """Format an age."""
     if not isfinite(seconds):
-        return "never heard"
+        return "never received"
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"

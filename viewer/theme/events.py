@@ -1,18 +1,18 @@
-"""What happened to a UAV, as a list of events: their times are data times, so a recording of 2013 tells 2013.
+"""Events of a UAV in data time.
 
-What the words say is not escaped here but where they become HTML.
+Texts are not escaped here but where they become HTML.
 """
 
 from enum import StrEnum
 from typing import NamedTuple
 
-MAX_EVENTS = 200  # kept of one UAV; the oldest go first
-MAX_RAISED = 64  # alerts of one UAV in force at once; more are a stranger's
-LATEST = 4e9  # times beyond are noise [s since 1970]
+MAX_EVENTS = 200  # events of one UAV; the oldest are dropped first
+MAX_RAISED = 64  # simultaneous alerts accepted of one UAV
+LATEST = 4e9  # later times are invalid [s since 1970]
 
 
 class Kind(StrEnum):
-    """What sort of event it is; each has its glyph and its colour."""
+    """Kind of event; each has a glyph and a colour."""
 
     MODE = "mode"
     ITEM = "item"
@@ -40,19 +40,19 @@ class Kind(StrEnum):
 
 
 class Event(NamedTuple):
-    """Something that happened."""
+    """Event of a UAV."""
 
     t: float  # data time [s since 1970]
     kind: Kind
-    text: str  # from outside: escape it before it becomes HTML
+    text: str  # untrusted: escape it in HTML
 
 
 def merged(events: tuple[Event, ...], fresh: list[Event]) -> tuple[Event, ...]:
-    """Add events in the order of their times; of too many the newest stay."""
+    """Merge events by time; keep the newest `MAX_EVENTS`."""
     return tuple(sorted((*events, *fresh), key=lambda event: event.t)[-MAX_EVENTS:])
 
 
 def closed(events: tuple[Event, ...], t: float) -> tuple[Event, ...]:
-    """End the events with the recording at time t [s]: that nothing came after it is no loss of the link."""
+    """End the events at the end of the recording, t [s]; drop a link loss after it."""
     flown = tuple(event for event in events if event.t <= t or event.kind is not Kind.LOST)
     return merged(flown, [Event(t, Kind.END, "end of the recording")] if 0 < t < LATEST else [])

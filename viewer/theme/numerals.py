@@ -1,8 +1,8 @@
-"""Figures as strokes: numbers that lie in the scene cost neither a label nor a node."""
+"""Digits as line segments: numbers in the scene without label nodes."""
 
 import numpy as np
 
-# Each figure on a grid of 2 x 4, as polylines of corners (x, y).
+# Each digit on a 2 x 4 grid, as polylines of corners (x, y).
 _FIGURES: dict[str, tuple[tuple[tuple[float, float], ...], ...]] = {
     "0": (((0, 0), (2, 0), (2, 4), (0, 4), (0, 0)),),
     "1": (((0.4, 3.2), (1.2, 4), (1.2, 0)),),
@@ -18,11 +18,11 @@ _FIGURES: dict[str, tuple[tuple[tuple[float, float], ...], ...]] = {
     "k": (((0, 0), (0, 4)), ((1.6, 2.6), (0, 1.2), (1.7, 0))),
     "m": (((0, 0), (0, 2.4), (2, 2.4), (2, 0)), ((1, 2.4), (1, 0))),
 }
-_STEP = {".": 1.4}  # how far the next figure stands; 3 of the rest
+_STEP = {".": 1.4}  # advance width; 3 for the others
 
 
 def written(text: str, tall: float) -> np.ndarray:
-    """Write figures flat on the ground, east along the line, north up: (n, 2, 3); what has no figure is a space."""
+    """Return the strokes of digits in the ground plane, text direction east: (n, 2, 3); others are spaces."""
     lines, x = [np.zeros((0, 2, 2))], 0.0
     for letter in text:
         for stroke in _FIGURES.get(letter, ()):
@@ -34,5 +34,5 @@ def written(text: str, tall: float) -> np.ndarray:
 
 
 def upright(strokes: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Turn flat strokes (n, 2, 3) to face who looks along right x up, both (3,): (n, 2, 3)."""
+    """Rotate strokes (n, 2, 3) into the plane of `right` and `up`, both (3,): (n, 2, 3)."""
     return strokes[..., :1] * right + strokes[..., 1:2] * up

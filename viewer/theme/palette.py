@@ -1,4 +1,4 @@
-"""The colours of the page, and the one place where the renderer's tone mapping is undone."""
+"""Colours of the page and the inverse of the renderer's tone mapping."""
 
 from dataclasses import dataclass
 
@@ -41,11 +41,11 @@ class Palette:
         }.get(state, self.muted)
 
     def looks(self) -> tuple[str, ...]:
-        """Return the colours of `flock.LOOKS`, in their order."""
+        """Return the colours of the display statuses, in the order of `STATUS_COLOURS`."""
         return self.muted, self.predicting, self.verified, self.identifying, self.lost, self.mismatch
 
     def event(self, kind: Kind) -> str:
-        """Return the colour of an event; none but a verified model has that of "verified"."""
+        """Return the colour of an event kind."""
         return {
             Kind.MODE: self.predicting,
             Kind.ITEM: self.route,
@@ -151,25 +151,25 @@ _EXPOSURE = 0.6
 
 
 def rgb(colour: str) -> np.ndarray:
-    """Read `#RRGGBB` as (3,) floats [0..255]."""
+    """Parse `#RRGGBB` as (3,) floats [0..255]."""
     return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)], float)
 
 
 def triple(colour: str) -> tuple[int, int, int]:
-    """Read `#RRGGBB` as three integers, as the page library wants them."""
+    """Parse `#RRGGBB` as three integers, as viser expects them."""
     r, g, b = rgb(colour)
     return int(r), int(g), int(b)
 
 
 def mix(colour: str, other: str, share: float) -> np.ndarray:
-    """Blend two colours, `share` of the first; lines have no alpha, so they fade to the ground: (3,) [0..255]."""
+    """Blend two colours, `share` of the first: (3,) [0..255]; lines have no alpha."""
     return rgb(colour) * share + rgb(other) * (1 - share)
 
 
 def line_colour(wanted: np.ndarray) -> np.ndarray:
-    """Return the vertex colour that the renderer shows as `wanted`: (..., 3) sRGB [0..255] -> (..., 3) uint8.
+    """Return the vertex colour that the renderer shows as `displayed`: (..., 3) sRGB [0..255] -> (..., 3) uint8.
 
-    Vertex colours are taken as linear and then tone-mapped; this is the inverse of both, clipped to what is reachable.
+    The renderer treats vertex colours as linear and tone-maps them; this inverts both, clipped to its range.
     """
     y = np.clip(_linear(np.asarray(wanted, float) / 255) @ np.linalg.inv(_OUT).T, 0, 0.98)
     a, b, c = 1 - 0.983729 * y, 0.0245786 - 0.432951 * y, -(0.000090537 + 0.238081 * y)
@@ -178,14 +178,14 @@ def line_colour(wanted: np.ndarray) -> np.ndarray:
 
 
 def shown_line(vertex: np.ndarray) -> np.ndarray:
-    """Tell what a vertex colour looks like on screen: (..., 3) [0..255] -> (..., 3) sRGB [0..255]."""
+    """Return the displayed colour of a vertex colour: (..., 3) [0..255] -> (..., 3) sRGB [0..255]."""
     v = (np.asarray(vertex, float) / 255 / _EXPOSURE) @ _IN.T
     v = (v * (v + 0.0245786) - 0.000090537) / (v * (0.983729 * v + 0.4329510) + 0.238081)
     return 255 * _companded(np.clip(v @ _OUT.T, 0, 1))
 
 
 def mesh_colour(wanted: np.ndarray) -> np.ndarray:
-    """Return instance colours of a lit mesh, which are taken as linear too: (n, 3) sRGB [0..255] -> uint8."""
+    """Return linear instance colours of a lit mesh: (n, 3) sRGB [0..255] -> uint8."""
     return np.rint(255 * _linear(np.clip(np.asarray(wanted, float), 0, 255) / 255)).astype(np.uint8)
 
 

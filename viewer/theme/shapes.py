@@ -1,11 +1,11 @@
-"""The shapes of what is drawn as a mesh: vertices and triangles, of about one unit."""
+"""Meshes of about one unit: vertices and triangles."""
 
 import numpy as np
 
 
 def aircraft() -> tuple[np.ndarray, np.ndarray]:
-    """Shape a small fixed-wing aircraft of one unit span that looks along +x: vertices (n, 3), triangles (m, 3)."""
-    boxes = [  # centre, half size, how far the tip is swept back
+    """Return a fixed-wing aircraft of one unit span, +x forward: vertices (n, 3), triangles (m, 3)."""
+    boxes = [  # centre, half size, sweep of the tip
         ((0.05, 0.0, 0.0), (0.38, 0.045, 0.05), 0.0),
         ((0.08, 0.26, 0.02), (0.09, 0.24, 0.012), 0.07),
         ((0.08, -0.26, 0.02), (0.09, -0.24, 0.012), 0.07),
@@ -31,7 +31,7 @@ def aircraft() -> tuple[np.ndarray, np.ndarray]:
 
 
 def diamond() -> tuple[np.ndarray, np.ndarray]:
-    """Shape an octahedron of radius 1: vertices (6, 3), triangles (8, 3)."""
+    """Return an octahedron of radius 1: vertices (6, 3), triangles (8, 3)."""
     vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1.3], [0, 0, -1.3]], np.float32)
     ring = [0, 2, 1, 3]
     faces = [(ring[k], ring[(k + 1) % 4], 4) for k in range(4)] + [(ring[(k + 1) % 4], ring[k], 5) for k in range(4)]
@@ -39,7 +39,7 @@ def diamond() -> tuple[np.ndarray, np.ndarray]:
 
 
 def rotorcraft() -> tuple[np.ndarray, np.ndarray]:
-    """Shape a small multirotor of one unit span that looks along +x: vertices (n, 3), triangles (m, 3)."""
+    """Return a multirotor of one unit span, +x forward: vertices (n, 3), triangles (m, 3)."""
     turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     disc = 0.24 * np.stack([np.cos(turn), np.sin(turn), np.zeros(12)], axis=-1)
     fan = np.array([(0, k, k + 1) for k in range(1, 11)])
@@ -57,7 +57,7 @@ def rotorcraft() -> tuple[np.ndarray, np.ndarray]:
 
 
 def dart() -> tuple[np.ndarray, np.ndarray]:
-    """Shape an arrowhead of one unit span that looks along +x, for a crowd: vertices (5, 3), triangles (6, 3)."""
+    """Return an arrowhead of one unit span, +x forward, for a large fleet: vertices (5, 3), triangles (6, 3)."""
     vertices = np.array([[0.75, 0, 0], [-0.45, 0.42, 0], [-0.45, -0.42, 0], [-0.2, 0, 0.16], [-0.2, 0, -0.06]])
     faces = np.array([(0, 1, 3), (0, 3, 2), (1, 2, 3), (0, 4, 1), (0, 2, 4), (1, 4, 2)])
     return vertices.astype(np.float32), faces.astype(np.uint32)

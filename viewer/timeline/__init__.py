@@ -1,1 +1,1 @@
-"""Time on the page: what was shown before, kept and shown again; what was predicted then against what happened."""
+"""Timeline of the page: recording, replay, and past predictions compared with the flight."""

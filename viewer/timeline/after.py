@@ -1,4 +1,4 @@
-"""In 3-D: what happened after the time shown, and how far from what was predicted then."""
+"""Path flown after the time shown in 3-D, with error lines to the prediction."""
 
 from typing import Any
 
@@ -9,12 +9,12 @@ from viewer.theme.palette import Palette, mix, rgb
 from viewer.timeline import compare
 from viewer.timeline.past import Past
 
-AFTER_S = 60.0  # how much of the flight after the time shown is drawn, at least what answers the prediction [s]
+AFTER_S = 60.0  # shortest path drawn after the time shown; at least to the prediction horizon [s]
 NOTHING = np.zeros((0, 2, 3))
 
 
 class After:
-    """Two nodes: the path flown since, and whiskers from what was predicted to it."""
+    """Two nodes: the path flown after the time shown, and error lines to the prediction."""
 
     def __init__(self, scene: Any, palette: Palette) -> None:
         self._palette = palette
@@ -23,7 +23,7 @@ class After:
         self._drawn = False
 
     def draw(self, past: Past | None) -> list[compare.Miss]:
-        """Draw what happened after a UAV's time shown; None clears it. Give the misses."""
+        """Draw the path after the time shown and return the prediction errors; None clears it."""
         if past is None:
             if self._drawn:
                 self._flown.draw(NOTHING)

@@ -1,4 +1,4 @@
-"""What was predicted then against what happened: misses, band, and whether it held them."""
+"""Compare a past prediction with the flown path: errors, band, coverage."""
 
 from typing import NamedTuple
 
@@ -8,26 +8,26 @@ from viewer.scene.selection.tube import frame_of
 from viewer.store.forecast import Forecast
 from viewer.store.place import UNIT_M
 
-STEPS_S = (5.0, 10.0, 20.0, 30.0, 60.0, 120.0)  # look-aheads compared in words [s]
-WHISKER_S = 5.0  # between whiskers [s]
+STEPS_S = (5.0, 10.0, 20.0, 30.0, 60.0, 120.0)  # look-aheads compared in the text [s]
+WHISKER_S = 5.0  # between error lines [s]
 
 
 class Miss(NamedTuple):
-    """One look-ahead of a prediction, answered by the flight."""
+    """Prediction error at one look-ahead."""
 
     ahead: float  # from the time shown [s]
-    miss: float  # distance between predicted and flown place [m]
-    band: float  # half-axis of the tube across the path, there [m]
-    held: bool  # the flown place lies within all three half-axes
+    miss: float  # distance between predicted and flown position [m]
+    band: float  # cross-track half-axis of the prediction region [m]
+    held: bool  # flown position within all three half-axes
 
 
 def answered(told: Forecast, flown: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the predicted and the flown places at some times.
+    """Return predicted and flown positions at some times.
 
     Args:
-        told: the prediction
-        flown: the flown path, (n, 4) time [s], scene ENU [10 m]
-        at: times [s since 1970], (k,)
+        forecast: the prediction
+        track: the flown path, (n, 4) time [s], scene ENU [10 m]
+        times: data times [s since 1970], (k,)
     Returns:
         predicted and flown, each (k, 3) [10 m]
     """
@@ -36,12 +36,12 @@ def answered(told: Forecast, flown: np.ndarray, at: np.ndarray) -> tuple[np.ndar
 
 
 def until(told: Forecast, flown: np.ndarray) -> float:
-    """Return how far a prediction can be answered: to its horizon, or to the newest row [s since 1970]."""
+    """Return the time up to which a prediction can be compared: horizon or newest row [s since 1970]."""
     return min(told.t + told.until, float(flown[-1, 0])) if len(flown) else told.t
 
 
 def misses(told: Forecast, flown: np.ndarray, then: float) -> list[Miss]:
-    """Compare at whole look-aheads from the time shown, `then` [s since 1970]."""
+    """Compute the errors at the look-aheads `STEPS_S` from the time shown, `shown_t` [s since 1970]."""
     ahead = np.array([step for step in STEPS_S if then + step <= until(told, flown)])
     if not len(ahead):
         return []
@@ -61,6 +61,6 @@ def misses(told: Forecast, flown: np.ndarray, then: float) -> list[Miss]:
 
 
 def whiskers(told: Forecast, flown: np.ndarray, then: float) -> np.ndarray:
-    """Join predicted and flown places every 5 s from the time shown: (k, 2, 3) [10 m]."""
+    """Return lines from predicted to flown positions every 5 s from the time shown: (k, 2, 3) [10 m]."""
     at = np.arange(then + WHISKER_S, until(told, flown), WHISKER_S)
     return np.stack(answered(told, flown, at), axis=1) if len(at) else np.zeros((0, 2, 3))

@@ -1,4 +1,4 @@
-"""The timeline of one page: its player, its panel, and the fleet as it was at the time shown."""
+"""Timeline of one page: player, panel, and the fleet at the time shown."""
 
 import threading
 from collections.abc import Callable
@@ -20,12 +20,12 @@ from viewer.timeline.past import Past, as_it_was, remember
 from viewer.timeline.player import Player, Span, last_before, next_after
 from viewer.timeline.recordings import Tapes
 
-SNAP = 0.008  # of the bar: a press this near to an event means the event
-OTHERS = 40  # events of each other UAV looked at: the newest
+SNAP = 0.008  # share of the bar within which a press snaps to an event
+OTHERS = 40  # newest events used of each other UAV
 
 
 class Timeline:
-    """What one page shows: the fleet as it is, or as it was."""
+    """State of one page in time: live, or at a past time."""
 
     def __init__(self, client: Any, feed: Feed, tapes: Tapes, palette: Palette, changed: Callable[[], None]) -> None:
         self.player = Player()
@@ -33,15 +33,15 @@ class Timeline:
         self._lock = threading.Lock()
         self._span, self._shift = Span(0.0, 0.0), dict[int, float]()
         self._lead: int | None = None
-        self._measured = -np.inf  # as of which second of the fleet the span was found
-        self._then, self._drawn_at = Flock(), (-np.inf, -np.inf)  # the fleet as it was; wall and data time of it
+        self._measured = -np.inf  # fleet update for which the range was computed
+        self._then, self._drawn_at = Flock(), (-np.inf, -np.inf)  # past fleet; wall and data time of it
         self._panel = Panel(client.gui, palette, self.asked)
         self._after = After(client.scene, palette)
 
     # --- what is shown ---
 
     def flock(self, flock: Flock, selected: int | None, now: float) -> Flock:
-        """Return the fleet to draw: the one given, which is now, or, at another time, as it was."""
+        """Return the fleet to draw: the given live one, or the fleet at the time shown."""
         passed = now - self._drawn_at[0]
         with self._lock:
             if flock.now != self._measured or not self.player.live:
@@ -57,7 +57,7 @@ class Timeline:
         return self._then
 
     def one(self, uav: int) -> Vehicle | None:
-        """Return one UAV as it is shown; None where it is not there."""
+        """Return one UAV at the time shown; None when there is none."""
         vehicle, t = self._feed.one(uav), self.player.t
         if vehicle is None or t is None or uav not in self._tapes.of:
             return vehicle if t is None else None
@@ -68,12 +68,12 @@ class Timeline:
         return as_it_was(vehicle, self._tapes.of[vehicle.uav], then, self.player.rate)
 
     def _remember(self, fleet: list[Vehicle], t: float, now: float) -> None:
-        """Make the fleet of a time gone by."""
+        """Update the fleet of a past time."""
         found = [past for one in fleet if one.uav in self._tapes.of and (past := self._past(one, t)) is not None]
         remember(self._then, found, now)
 
     def _measure(self, fleet: list[Vehicle], selected: int | None) -> None:
-        """Find what can be shown, on the clock of the selected UAV."""
+        """Update the available time range, on the clock of the selected UAV."""
         taped = {one.uav: one for one in fleet if len(self._tapes.of.get(one.uav, ()))}
         if not taped:
             self._span, self._shift, self._lead = Span(0.0, 0.0), {}, None
@@ -81,18 +81,18 @@ class Timeline:
         self._lead = selected if selected in taped else max(taped, key=lambda uav: taped[uav].heard)
         self._span, self._shift = self._tapes.measure(taped[self._lead], list(taped.values()))
 
-    # --- being asked ---
+    # --- commands ---
 
     def tab(self, label: str, icon: Any) -> Any:
-        """Return another tab beside the timeline, to be filled in a `with` statement."""
+        """Add a tab beside the timeline; use it in a `with` statement."""
         return self._panel.window.add_tab(label, icon)
 
     def sender(self) -> str:
-        """Return the page's code that shows the time in its place `{}`."""
+        """Return page code that seeks to the time inserted at `{}`."""
         return self._panel.sender("at:")
 
     def asked(self, what: str) -> None:
-        """Do what a press means; anything else is somebody's mischief."""
+        """Execute a command of the page; ignore unknown ones."""
         with self._lock:
             if self._lead is None:
                 return
@@ -109,7 +109,7 @@ class Timeline:
         self._changed()
 
     def show(self, fleet: list[Vehicle], uav: int, t: float) -> None:
-        """Show a time of one UAV, data time [s since 1970]; nothing is done where nothing of it is kept."""
+        """Show a data time of one UAV [s since 1970]; do nothing without a recording of it."""
         with self._lock:
             if not len(self._tapes.of.get(uav, ())):
                 return
@@ -152,13 +152,13 @@ class Timeline:
     # --- the panel ---
 
     def draw(self, selected: int | None) -> None:
-        """Draw the panel and what happened after the time shown; call it about once a second and when it changes."""
+        """Draw the panel and the path after the time shown; call it about once per second and on changes."""
         one = self.one(selected) if selected is not None and not self.player.live else None
         past = one if isinstance(one, Past) else None
         misses = self._after.draw(past)
         t, span = self.player.t, self._span
         if self._lead is None:
-            return self._panel.draw("", '<span class="soft">nothing is kept yet</span>', "", "")
+            return self._panel.draw("", '<span class="soft">no recording yet</span>', "", "")
         tapes = [tape for uav, tape in list(self._tapes.of.items()) if uav != self._lead]
         others = [e for tape in tapes for e in tape.events[-OTHERS:] if span.begin <= e.t <= span.end]
         bar = strip.strip(self._events(), others, span, t, self._palette)
@@ -170,10 +170,10 @@ class Timeline:
         self._panel.draw(bar, self._head(t, span), words, self._banner(t, span))
 
     def _head(self, t: float | None, span: Span) -> str:
-        behind = "live" if t is None else f"{strip.length(span.end - t)} back"
+        behind = "live" if t is None else f"{strip.length(span.end - t)} ago"
         pace = "" if t is None else " · paused" if not self.player.rate else f" · playing {self.player.rate:g}×"
         lasts, n = strip.length(span.end - span.begin), len(self._tapes.of)
-        kept = f"{lasts} of {n} kept, {strip.size(self._tapes.nbytes())}"
+        kept = f"{lasts} of {n} UAVs recorded, {strip.size(self._tapes.nbytes())}"
         apart = f"one prediction per UAV every {self._tapes.apart_s:.0f} s"
         return (
             f'<div class="head"><b class="now">{stamp(span.end if t is None else t)}</b>'
@@ -183,4 +183,4 @@ class Timeline:
     def _banner(self, t: float | None, span: Span) -> str:
         if t is None:
             return ""
-        return f"Not live: this is {stamp(t)}, {strip.length(span.end - t)} before the newest. Press ● Live to go on."
+        return f"Not live: showing {stamp(t)}, {strip.length(span.end - t)} before the newest. Press ● Live to return."

@@ -1,4 +1,4 @@
-"""The floating panel of the timeline: bar, transport, steps, and one line of comparison."""
+"""Floating panel of the timeline: bar, playback buttons, steps and comparison text."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,7 +16,7 @@ SEND = (
 
 
 class Panel:
-    """Handles of the page; `asked(what)` is called with what a press means."""
+    """Panel handles; `on_command(command)` is called for each press."""
 
     def __init__(self, gui: Any, palette: Palette, asked: Callable[[str], None]) -> None:
         self._gui, self._palette = gui, palette
@@ -34,18 +34,18 @@ class Panel:
             command.on_trigger(lambda _, what=what: asked(what))
 
     def _buttons(self) -> str:
-        """Lay all buttons in one row, as the page library's own would take two, each with room for a name."""
+        """Return all buttons in one row; viser buttons would need two."""
         send = self.sender("")
         row = (*STEPS[:3], *TRANSPORT, *STEPS[3:])
         made = (f'<button onclick="{send.format(repr(what))}">{what}</button>' for what in row)
         return f'<div class="uav time buttons">{"".join(made)}</div>'
 
     def sender(self, tag: str) -> str:
-        """Return the page's code that asks for `tag` and a value in its place `{}`."""
+        """Return page code that sends `tag` and the value inserted at `{}`."""
         return SEND.replace("UUID", str(self._asked._impl.uuid)).replace("TAG", tag)
 
     def draw(self, bar: str, head: str, words: str, banner: str) -> None:
-        """Write the parts anew where they are others."""
+        """Update the parts that changed."""
         for node, text in (
             (self._bar, f'<div class="uav time"><div {touched(self.sender("share:"))}>{bar}</div>{head}</div>'),
             (self._words, f'<div class="uav time soft">{words}</div>'),

@@ -1,4 +1,4 @@
-"""A UAV as it was: a `Vehicle` that every drawing and every sentence takes for one of now."""
+"""A UAV at a past time, with the interface of `Vehicle` for drawing and texts."""
 
 from typing import Any
 
@@ -16,86 +16,86 @@ from viewer.theme.events import Event
 from viewer.timeline.recording import Tape
 from viewer.timeline.state_at import Stood
 
-TRAIL_S = 90.0  # of the fine trail [s]
-PAST_S = 60.0  # of the predictions before [s]
-UNTOLD = (State.IDENTIFYING, State.WAITING, State.UNCLAIMED)  # whoever stands so claims no path
+TRAIL_S = 90.0  # length of the fine trail [s]
+PAST_S = 60.0  # age of the past predictions [s]
+UNTOLD = (State.IDENTIFYING, State.WAITING, State.UNCLAIMED)  # states without a predicted path
 
 
 class Flown:
-    """The path flown until then, in the form of a `Track` or a `Trail`."""
+    """Path up to the time shown, with the interface of `FlightTrack` and `Trail`."""
 
     def __init__(self, rows: np.ndarray) -> None:
         self._rows = rows
 
     def rows(self) -> np.ndarray:
-        """Return all points, (n, 4) or (n, 5): t [s], scene ENU [10 m], and of a trail Va [m/s]."""
+        """Return all points, (n, 4) or (n, 5): t [s], scene ENU [10 m], for a trail also Va [m/s]."""
         return self._rows
 
 
 class Past(Vehicle):
-    """One UAV at a time gone by; it stands still, and its histories end there."""
+    """One UAV at a past time; immutable, its histories end there."""
 
     tape: Tape
     then: float  # data time shown [s since 1970]
     stood: Stood
 
     def clock(self, now: float) -> float:
-        """Return the data time shown [s], whatever the time is now."""
+        """Return the data time shown [s]; ignore `now`."""
         return self.then
 
     def state(self, now: float) -> State:
-        """Return the state it had then."""
+        """Return the state at the time shown."""
         return self.stood.state
 
     def late(self, now: float) -> float:
-        """Return nothing: what was late then may have come since."""
+        """Return 0: the lag at a past time is unknown."""
         return 0.0
 
     def still(self, now: float) -> "Past":
-        """Return itself: nobody changes it."""
+        """Return itself, as it is immutable."""
         return self
 
     @property
     def recorded(self) -> bool:
-        """Tell that it is played again: its trails are laid by data time."""
+        """Return True: it is replayed, so trails use data time."""
         return True
 
     @property
     def trail(self) -> Flown:  # type: ignore[override]
-        """Return the fine trail until then: rows of time [s], scene ENU [10 m], Va [m/s]."""
+        """Return the fine trail up to the time shown: time [s], scene ENU [10 m], Va [m/s]."""
         return Flown(self.tape.flown(self.then - TRAIL_S, self.t))
 
     @property
     def track(self) -> Flown:  # type: ignore[override]
-        """Return all the path that is kept until then."""
+        """Return the recorded path up to the time shown."""
         return Flown(self.tape.path(-np.inf, self.t))
 
     @property
     def past(self) -> list[Forecast]:  # type: ignore[override]
-        """Return the predictions of the minute before, oldest first."""
+        """Return the predictions of the preceding minute, oldest first."""
         return [one for one in self.tape.told if self.then - PAST_S <= one.t <= self.then]
 
     @property
     def fits(self) -> list[tuple[float, float]]:  # type: ignore[override]
-        """Return the fits until then: time [s], mean over the states [%]."""
+        """Return the fits up to the time shown: time [s], mean over the states [%]."""
         return [(one.t, one.fit) for one in self.tape.stood if one.fit is not None and one.t <= self.then]
 
     @property
     def events(self) -> tuple[Event, ...]:  # type: ignore[override]
-        """Return what had happened by then."""
+        """Return the events up to the time shown."""
         return tuple(event for event in self.tape.events if event.t <= self.then)
 
 
 def as_it_was(vehicle: Vehicle, tape: Tape, then: float, rate: float = 0.0) -> Past | None:
-    """Turn a UAV of now into that of another time.
+    """Return a UAV at a past time.
 
     Args:
-        vehicle: as it is now
-        tape: what is kept of it
-        then: data time [s since 1970]
-        rate: data seconds per wall second it is played at; 0 paused
+        vehicle: current UAV
+        recording: its recording
+        shown_t: data time [s since 1970]
+        rate: data seconds per wall second; 0 paused
     Returns:
-        None where nothing was known of it yet
+        the UAV; None before its first record
     """
     how = tape.stood_at(then)
     if how is None or not len(tape) or then < tape.t[0] - 1.0:
@@ -114,7 +114,7 @@ _OWN = ("trail", "track", "past", "fits", "events")
 
 
 def _figures(vehicle: Vehicle, row: np.ndarray, how: Stood, told: Forecast | None) -> dict[str, Any]:
-    """Return what of a UAV was another then."""
+    """Return the fields of a UAV that differ at a past time."""
     status = vehicle.status
     if status is not None:
         status = msgspec.structs.replace(status, mode=how.mode, armed=how.armed, link=how.link, sentence=how.sentence)
@@ -137,7 +137,7 @@ def _figures(vehicle: Vehicle, row: np.ndarray, how: Stood, told: Forecast | Non
 
 
 def remember(flock: Flock, pasts: list[Past], now: float) -> None:
-    """Make a flock that of a time gone by; `now` is monotonic [s]."""
+    """Update fleet arrays to a past time; `now` is monotonic [s]."""
     flock.meet(list(pasts), now)
     shown = [past for past in pasts if flock.index(past.uav) is not None]
     flock.at = np.array([past.where(now) for past in shown]).reshape(-1, 3)
@@ -145,4 +145,4 @@ def remember(flock: Flock, pasts: list[Past], now: float) -> None:
     minute = [placed(past.tape.path(past.then - MINUTE[0], past.t), past.then - MINUTE, np.inf) for past in shown]
     ring = [np.where(np.isfinite(rows), rows, at) for rows, at in zip(minute, flock.at, strict=True)]
     flock.ring = np.array(ring).reshape(-1, len(MINUTE), 3)
-    flock.changes, flock.beats = min(flock.changes, 0) - 1, 0  # others than those of now, and others every time
+    flock.changes, flock.beats = min(flock.changes, 0) - 1, 0  # differs from live revisions and on every call

@@ -1,54 +1,54 @@
-"""What is shown when: live, paused, or played again. Pure: it knows times alone."""
+"""Playback state: live, paused or playing. Pure: it depends on times only."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 
 class Span(NamedTuple):
-    """What can be shown: from the oldest kept to the newest heard, data time [s since 1970]."""
+    """Available time range: oldest to newest recorded data time [s since 1970]."""
 
     begin: float
     end: float
 
     def clip(self, t: float) -> float:
-        """Bring a time into the span."""
+        """Clip a time to the range."""
         return min(max(t, self.begin), self.end)
 
     def share(self, t: float) -> float:
-        """Return where in the span a time lies, 0 to 1."""
+        """Return the relative position of a time in the range, 0 to 1."""
         return (self.clip(t) - self.begin) / max(self.end - self.begin, 1e-9)
 
 
 @dataclass
 class Player:
-    """The time shown; None is live."""
+    """Time shown and playback rate."""
 
-    t: float | None = None  # data time shown [s since 1970]
+    t: float | None = None  # data time shown [s since 1970]; None: live
     rate: float = 0.0  # data seconds per wall second; 0 paused
 
     @property
     def live(self) -> bool:
-        """Return whether what is shown is now."""
+        """Return whether the page is live."""
         return self.t is None
 
     def go_live(self) -> None:
-        """Show now."""
+        """Return to live."""
         self.t, self.rate = None, 0.0
 
     def seek(self, t: float, span: Span) -> None:
-        """Show another time; a player that was live pauses there."""
+        """Show another time; a live player pauses there."""
         self.t = span.clip(t)
 
     def pause(self, span: Span) -> None:
-        """Stand still at the time shown."""
+        """Pause at the time shown."""
         self.t, self.rate = span.end if self.t is None else self.t, 0.0
 
     def play(self, rate: float, span: Span) -> None:
-        """Play at a rate from the time shown; from live there is nothing to play yet, so from the beginning."""
+        """Play at a rate from the time shown; from live, play from the beginning."""
         self.t, self.rate = span.begin if self.t is None else self.t, rate
 
     def advance(self, passed: float, span: Span) -> None:
-        """Let wall time pass [s]; what is no longer kept is skipped, and whoever reaches the end is live again."""
+        """Advance by elapsed wall time [s]; skip deleted data, return to live at the end."""
         if self.t is None:
             return
         self.t = max(self.t + self.rate * passed, span.begin)
@@ -57,10 +57,10 @@ class Player:
 
 
 def next_after(t: float, times: list[float]) -> float | None:
-    """Find the first of some times after t, by more than rounding; None where there is none."""
+    """Return the first time after t by more than 1 ms; None when there is none."""
     return min((one for one in times if one > t + 1e-3), default=None)
 
 
 def last_before(t: float, times: list[float]) -> float | None:
-    """Find the last of some times before t; None where there is none."""
+    """Return the last time before t by more than 1 ms; None when there is none."""
     return max((one for one in times if one < t - 1e-3), default=None)

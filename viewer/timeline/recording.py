@@ -1,4 +1,4 @@
-"""What is kept of one UAV so that it can be shown again: rows, predictions 5 s apart, and how it stood."""
+"""Recording of one UAV for replay on the page: rows, predictions every 5 s, and states."""
 
 import msgspec
 import numpy as np
@@ -11,25 +11,29 @@ from viewer.store.vehicle import JUMP_S, Vehicle
 from viewer.theme.events import Event
 from viewer.timeline.state_at import Stood, stood
 
-KEPT_S = 600.0  # of a live flight; of a recording all [s]
-TOLD_S = 5.0  # between two predictions kept [s]
-THIN_S, NEAR_S, FAR_S = 1.0, 20.0, 2.5  # look-ahead between points kept, so far ahead, and beyond: drawn as cubics [s]
-AFTER_S = 20.0  # of a prediction, how far past its horizon it is kept [s]
-GAP_S, SPARE_S, MOST_FILLED = 1.6, 0.4, 100  # a longer gap is filled in, to so near its ends, by so many rows [s]
-ROOM = 64  # rows that there is room for at first, and between two looks at what is too old
-MAX_ROWS = 8_000  # of one UAV: a longer recording keeps every second of them
-MAX_STOOD = 500  # changes of how one UAV stood; the oldest go first
-MAX_TOLD = 1_500  # predictions of one UAV: a longer recording keeps every second of them
-BARE_BYTES = 850  # of a prediction without its arrays, about
-WORDS = ("sentence", "calibration", "law", "method", "origin", "event_said")  # seldom others than a moment before
+KEPT_S = 600.0  # retention of a live flight; a recording is kept completely [s]
+TOLD_S = 5.0  # between two recorded predictions [s]
+THIN_S, NEAR_S, FAR_S = 1.0, 20.0, 2.5  # step up to NEAR_S of look-ahead, and step beyond; drawn as cubic splines [s]
+AFTER_S = 20.0  # look-ahead recorded beyond the horizon [s]
+GAP_S, SPARE_S, MOST_FILLED = (
+    1.6,
+    0.4,
+    100,
+)  # gaps filled from the trail, margin at their ends, most rows [s]
+ROOM = 64  # initial capacity, and rows between two checks for expired rows
+MAX_ROWS = 8_000  # rows of one UAV; beyond it every second row is dropped
+MAX_STOOD = 500  # state changes of one UAV; the oldest are dropped first
+MAX_TOLD = 1_500  # predictions of one UAV; beyond it every second one is dropped
+BARE_BYTES = 850  # approximate size of a prediction without its arrays
+WORDS = ("sentence", "calibration", "law", "method", "origin", "event_said")  # rarely change between predictions
 COLUMNS = 7  # east north up [10 m], phi theta psi [rad], Va [m/s]
 
 
 class Tape:
-    """Rows of one UAV, rising in data time, in arrays that grow as it flies and then stay as they are."""
+    """Rows of one UAV in the order of data time, in growing arrays."""
 
     def __init__(self) -> None:
-        self.told: list[Forecast] = []  # oldest first, without what nobody asks of an old one
+        self.told: list[Forecast] = []  # oldest first, reduced by `_reduced`
         self.stood: list[Stood] = []
         self.events: tuple[Event, ...] = ()
         self._t, self._x = np.empty(ROOM), np.empty((ROOM, COLUMNS), np.float32)
@@ -42,7 +46,7 @@ class Tape:
 
     @property
     def t(self) -> np.ndarray:
-        """Return the times of the rows, rising, (n,) [s since 1970]."""
+        """Return the times of the rows, increasing, (n,) [s since 1970]."""
         return self._t[: self._n]
 
     @property
@@ -51,20 +55,20 @@ class Tape:
         return self._x[: self._n]
 
     def nbytes(self) -> int:
-        """Count the bytes of all arrays kept."""
+        """Return the size of all arrays [bytes]."""
         return self._t.nbytes + self._x.nbytes + self._told_bytes
 
     def take(self, vehicle: Vehicle, trail: np.ndarray, now: float, apart_s: float = TOLD_S) -> None:
-        """Keep how a UAV is now.
+        """Record the current state of a UAV.
 
         Args:
-            vehicle: a copy that nobody changes
-            trail: its newest positions, (n, 5): time, scene ENU, Va; fills in what came since the row before
+            vehicle: immutable snapshot
+            trail: newest positions, (n, 5): time, scene ENU, Va; fills gaps since the last row
             now: monotonic time [s]
-            apart_s: least time between two predictions kept [s]
+            step_s: shortest time between two recorded predictions [s]
         """
         if self._n and vehicle.t < self._t[self._n - 1] - JUMP_S:
-            self.__init__()  # type: ignore[misc]  # its clock went back: another flight
+            self.__init__()  # type: ignore[misc]  # clock step back: another flight
         if vehicle.at is not None and np.isfinite(vehicle.t) and (not self._n or vehicle.t > self._t[self._n - 1]):
             self._fill(vehicle, trail)
             if not self._n or vehicle.t >= self._t[self._n - 1] + self._step:
@@ -72,7 +76,7 @@ class Tape:
         self._listen(vehicle, now, apart_s)
 
     def _fill(self, vehicle: Vehicle, trail: np.ndarray) -> None:
-        """Lay in positions that came between two looks, as of a fast recording; the nose points where it flies."""
+        """Insert positions between two records, as for a fast replay; heading is the course."""
         last = self._t[self._n - 1] if self._n else -np.inf
         if vehicle.t - last < GAP_S or len(trail) < 2:
             return
@@ -91,13 +95,13 @@ class Tape:
         self._n += 1
 
     def _let_go(self, recorded: bool) -> None:
-        """Let go what is too old of a live flight, once that is an eighth of it: the rest is copied."""
+        """Drop expired rows of a live flight once they are an eighth of all."""
         old = 0 if recorded else int(np.searchsorted(self.t, self._t[self._n - 1] - KEPT_S))
         if old > self._n // 8:
             self._keep(slice(old, self._n))
 
     def _make_room(self) -> None:
-        """Grow, or keep every second row."""
+        """Grow the arrays, or drop every second row."""
         if self._n >= MAX_ROWS:
             self._step = 2 * float(np.median(np.diff(self.t)))
             self._keep(slice(self._n % 2, self._n, 2))
@@ -111,7 +115,7 @@ class Tape:
         self._t[: self._n], self._x[: self._n] = t, x
 
     def _listen(self, vehicle: Vehicle, now: float, apart_s: float) -> None:
-        """Keep the newest prediction if the last one kept is old enough, and how it stands if that is news."""
+        """Record the newest prediction if due, and the state if it changed."""
         at = vehicle.clock(now)
         if not np.isfinite(at):
             return
@@ -130,14 +134,14 @@ class Tape:
             self._told_bytes = sum(map(_size, self.told))
 
     def _forget(self, before: float) -> None:
-        """Let go the oldest prediction, and how it stood, of before a time [s since 1970]."""
+        """Drop the oldest prediction and state if earlier than a time [s since 1970]."""
         if self.told and self.told[0].t < before:
             self._told_bytes -= _size(self.told.pop(0))
-        if len(self.stood) > 1 and self.stood[1].t < before:  # the first tells how it stands until the second
+        if len(self.stood) > 1 and self.stood[1].t < before:  # the first is valid until the second
             del self.stood[0]
 
     def row(self, t: float) -> np.ndarray:
-        """Interpolate how it flew at a time: (7,); angles the short way round. Held beyond both ends."""
+        """Interpolate a row at a time: (7,); angles the short way round, constant beyond both ends."""
         k = int(np.clip(np.searchsorted(self.t, t), 1, max(self._n - 1, 1)))
         if self._n == 1:
             return self.x[0].astype(float)
@@ -156,30 +160,30 @@ class Tape:
         return np.column_stack([at, *(np.interp(at, self.t, self.x[:, k]) for k in range(3))])
 
     def flown(self, begin: float, end: float) -> np.ndarray:
-        """Return the last rows between two times as a trail has them: (n, 5) time, scene ENU [10 m], Va [m/s]."""
+        """Return the last trail rows between two times: (n, 5) time, scene ENU [10 m], Va [m/s]."""
         path = self.path(begin, end)[-TRAIL_ROWS:]
         return np.column_stack([path, np.interp(path[:, 0], self.t, self.x[:, 6])]) if len(path) else np.zeros((0, 5))
 
     def told_by(self, t: float) -> Forecast | None:
-        """Return the newest prediction there was at a time; of those asked for before, the laid out path is let go."""
+        """Return the newest prediction at a time; release the scene arrays of the last one returned."""
         found = next((one for one in reversed(self.told) if one.t <= t + 0.5), None)
         if self._asked is not None and self._asked is not found:
-            vars(self._asked).pop("_laid", None)
+            vars(self._asked).pop("_scene_arrays", None)
         self._asked = found
         return found
 
     def stood_at(self, t: float) -> Stood | None:
-        """Tell how it stood at a time; None before it was known."""
+        """Return the state at a time; None before the first."""
         return next((one for one in reversed(self.stood) if one.t <= t), None)
 
 
 def _size(told: Forecast) -> int:
-    """Count the bytes of a prediction that is kept, about."""
+    """Return the approximate size of a recorded prediction [bytes]."""
     return len(told.message.path.data) + len(told.message.tube.data) + BARE_BYTES
 
 
 def _slim(told: Forecast, before: Forecast | None) -> Forecast:
-    """Keep of a prediction what is drawn of it: as far as its horizon and a little beyond, and words once."""
+    """Reduce a prediction to what is drawn: look-aheads up to `AFTER_S` past the horizon, shared texts."""
     message = told.message
     ahead = message.ahead.numpy()
     n = max(int(np.searchsorted(ahead, told.until + AFTER_S)) + 1, 2)

@@ -1,4 +1,4 @@
-"""What is kept of everyone, once for all who look."""
+"""Recordings of all UAVs, shared by all pages."""
 
 from collections.abc import Callable
 
@@ -10,23 +10,23 @@ from viewer.store.vehicle import Vehicle
 from viewer.timeline.player import Span
 from viewer.timeline.recording import GAP_S, KEPT_S, TOLD_S, Tape
 
-APART_S = 3600.0  # recordings that begin farther apart are of different days, and are laid beside each other [s]
-FEW, CROWD = 50, 300  # UAVs up to which five rows a second are kept; one a second, and predictions 5 s apart
-FEW_S, MANY_S = 0.15, 0.9  # least time between two looks [s]
+APART_S = 3600.0  # recordings that start farther apart are shown as simultaneous [s]
+FEW, CROWD = 50, 300  # UAVs up to which rows are recorded at 5 Hz; at 1 Hz, with predictions every 5 s
+FEW_S, MANY_S = 0.15, 0.9  # shortest time between two records [s]
 NO_TRAIL = np.zeros((0, 5))
 
 
 class Tapes:
-    """A tape for every UAV."""
+    """Recording of every UAV."""
 
     def __init__(self) -> None:
         self.of: dict[int, Tape] = {}
         self.place: Place | None = None
-        self.apart_s = TOLD_S  # between two predictions kept of one UAV [s]
+        self.apart_s = TOLD_S  # between two recorded predictions of one UAV [s]
         self._due, self._turn = -np.inf, False
 
     def take(self, feed: Feed, copies: Callable[[], list[Vehicle]], now: float) -> None:
-        """Keep how everyone is now, as often as their number allows; `copies` gives them."""
+        """Record all UAVs at a rate that depends on their number; `copies` returns snapshots."""
         if feed.place is not self.place:
             self.place = feed.place
             self.of.clear()
@@ -34,7 +34,7 @@ class Tapes:
             return
         fleet = copies()
         self._due = now + (FEW_S if len(fleet) <= FEW else MANY_S)
-        self.apart_s = TOLD_S * max(len(fleet) / CROWD, 1.0)  # of a crowd fewer, in the same memory
+        self.apart_s = TOLD_S * max(len(fleet) / CROWD, 1.0)  # bounded memory for a large fleet
         self._turn, crowd = not self._turn, len(fleet) > CROWD
         for vehicle in fleet[self._turn :: 2] if crowd else fleet:
             tape = self.of.setdefault(vehicle.uav, Tape())
@@ -42,17 +42,17 @@ class Tapes:
             tape.take(vehicle, feed.trail(vehicle) if behind else NO_TRAIL, now, self.apart_s)
 
     def nbytes(self) -> int:
-        """Count what is kept."""
+        """Return the size of all recordings [bytes]."""
         return sum(tape.nbytes() for tape in list(self.of.values()))
 
     def measure(self, lead: Vehicle, fleet: list[Vehicle]) -> tuple[Span, dict[int, float]]:
-        """Find what can be shown, on the clock of one UAV.
+        """Compute the available time range on the clock of one UAV.
 
         Args:
-            lead: whose clock it is
-            fleet: everyone with a tape
+            clock_vehicle: UAV whose clock is used
+            fleet: UAVs with a recording
         Returns:
-            the span, and by how much the clocks of recordings of other days are ahead of it [s]
+            the range, and the clock offsets of recordings of other days [s]
         """
         tapes = {one.uav: self.of[one.uav] for one in fleet}
         zero = tapes[lead.uav].t[0]

@@ -1,4 +1,4 @@
-"""How a UAV stood at a time, in few words: what its panel and its row in the table need."""
+"""State of a UAV at a time, as its panel and table row need it."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from viewer.text.words import fit
 
 
 class Stood(NamedTuple):
-    """How a UAV stood, from a time on until the next."""
+    """State of a UAV from a time until the next record."""
 
     t: float  # data time [s since 1970]
     state: State
@@ -23,7 +23,7 @@ class Stood(NamedTuple):
 
 
 def stood(vehicle: Vehicle, at: float, now: float) -> Stood:
-    """Write down how a UAV stands at data time `at` [s since 1970]; `now` is monotonic [s]."""
+    """Return the state of a UAV at data time `at` [s since 1970]; `now` is monotonic [s]."""
     status, mean = vehicle.status, fit(vehicle)
     return Stood(
         at,

@@ -1,4 +1,4 @@
-"""The bar of the timeline as HTML: event marks in colour, the time shown, and what to send when it is touched."""
+"""Bar of the timeline as HTML: event marks, the time shown and drag handlers."""
 
 from collections.abc import Iterable
 from html import escape
@@ -10,19 +10,19 @@ from viewer.theme.palette import MARK, Palette
 from viewer.timeline.compare import STEPS_S, Miss
 from viewer.timeline.player import Span
 
-WIDTH = 1000  # of the drawing; the page stretches it
-GRAVE = {Kind.ALERT, Kind.MISMATCH, Kind.LOST, Kind.NO_MODEL, Kind.BLIND}  # of others, these alone are marked
-MAX_MARKS = 150  # drawn of one row: the newest
-TICKS_S = (10, 30, 60, 120, 300, 600, 1800, 3600)  # between upright ticks, so that there are at most twelve
+WIDTH = 1000  # width of the drawing; the page scales it
+GRAVE = {Kind.ALERT, Kind.MISMATCH, Kind.LOST, Kind.NO_MODEL, Kind.BLIND}  # events marked of other UAVs
+MAX_MARKS = 150  # newest marks drawn of one row
+TICKS_S = (10, 30, 60, 120, 300, 600, 1800, 3600)  # between ticks, at most twelve
 
 
 def strip(own: Iterable[Event], others: Iterable[Event], span: Span, t: float | None, palette: Palette) -> str:
-    """Draw the bar.
+    """Return the bar as SVG.
 
     Args:
         own: events of the selected UAV, above
-        others: those of the rest of the fleet, below; only grave ones are drawn
-        span: what can be shown
+        others: events of the other UAVs, below; only severe ones are drawn
+        span: available time range
         t: the time shown [s since 1970]; None is live
         palette: colours
     """
@@ -56,10 +56,10 @@ def _ticks(span: Span) -> list[float]:
 
 
 def touched(send: str) -> str:
-    """Return the attributes of whatever wraps the bar: a press or a drag sends the share of its width.
+    """Return HTML attributes that send the relative position of a press or drag on the bar.
 
     Args:
-        send: the page's code that asks for a value in its place `{}`
+        send: page code with the value inserted at `{}`
     """
     share = "((event.clientX-r.left)/r.width).toFixed(5)"
     code = f"var r=this.getBoundingClientRect();{send.format(share)}"
@@ -67,13 +67,13 @@ def touched(send: str) -> str:
 
 
 def compared(misses: list[Miss], told_t: float | None, then: float, palette: Palette, claimed_s: float = inf) -> str:
-    """Say what was predicted then against what happened, look-ahead by look-ahead; so far ahead it was claimed [s]."""
+    """Describe the prediction errors at each look-ahead; `claimed_s` is the horizon from the time shown [s]."""
     if told_t is None:
-        return "nothing was predicted at this time"
+        return "no prediction at this time"
     if claimed_s < STEPS_S[0]:
-        return f"nothing was claimed {STEPS_S[0]:.0f} s ahead at this time"
+        return f"horizon shorter than {STEPS_S[0]:.0f} s at this time"
     if not misses:
-        return "what was predicted here is not answered yet"
+        return "prediction not yet compared with the flight"
     parts = "".join(
         f'<span class="miss"><b>+{one.ahead:g} s</b> {one.miss:.1f} m '
         f'<span style="color:{palette.verified if one.held else palette.mismatch}">'
@@ -81,16 +81,16 @@ def compared(misses: list[Miss], told_t: float | None, then: float, palette: Pal
         for one in misses
     )
     age = f" {then - told_t:.0f} s before" if then - told_t > 1 else ""
-    return f"predicted{age}, against flown: {parts}"
+    return f"error of the prediction{age}: {parts}"
 
 
 def length(seconds: float) -> str:
-    """Say a length of time: 2:13."""
+    """Format a duration: 2:13."""
     minutes, rest = divmod(int(max(seconds, 0.0)), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def size(n: int) -> str:
-    """Say how much memory it takes."""
+    """Format a size in bytes."""
     return f"{n / 1e6:.1f} MB" if n >= 1e5 else f"{n / 1e3:.0f} kB"

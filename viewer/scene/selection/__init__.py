@@ -1,1 +1,1 @@
-"""What the scene draws of the selected aircraft only."""
+"""Scene content of the selected aircraft."""

@@ -1,4 +1,4 @@
-"""What was predicted for now some time ago, beside what happened."""
+"""Hindcast: an earlier prediction compared with the flown path."""
 
 import numpy as np
 
@@ -6,18 +6,18 @@ from viewer.scene.labels import Tag
 from viewer.scene.strokes import dashed
 from viewer.store.forecast import Kept
 
-AGE_S, SPAN_S = 25.0, 5.0  # how old the prediction is that is laid beside what happened, give or take [s]
-LEAST_S = 5.0  # a shorter stretch says nothing [s]
+AGE_S, SPAN_S = 25.0, 5.0  # age of the compared prediction and its tolerance [s]
+LEAST_S = 5.0  # shortest stretch drawn [s]
 NONE = np.zeros((0, 2, 3)), None
 
 
 def hindcast(past: list[Kept], trail: np.ndarray, clock: float) -> tuple[np.ndarray, Tag | None]:
-    """Lay an old prediction beside the flown trail, with a whisker every 5 s to where it was then.
+    """Return an earlier prediction and error lines to the flown trail every 5 s.
 
     Args:
-        past: forecasts, oldest first
-        trail: fleet time [s], scene ENU [10 m], (n, 4 or more)
-        clock: data time now [s]
+        past: predictions, oldest first
+        trail: data time [s], scene ENU [10 m], (n, 4 or more)
+        clock: current data time [s]
     Returns:
         segments (k, 2, 3) and their label
     """
@@ -25,7 +25,7 @@ def hindcast(past: list[Kept], trail: np.ndarray, clock: float) -> tuple[np.ndar
     if not old or len(trail) < 2:
         return NONE
     told = min(old, key=lambda one: abs(clock - one.t - AGE_S))
-    reach = min(clock - told.t, told.until, float(trail[-1, 0] - told.t))  # past its horizon it claimed nothing
+    reach = min(clock - told.t, told.until, float(trail[-1, 0] - told.t))  # at most the horizon
     if reach < LEAST_S:
         return NONE
     at = np.arange(5.0, reach, 5.0)

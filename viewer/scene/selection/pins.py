@@ -1,4 +1,4 @@
-"""Events of the selected UAV on its flown path: one batch of small diamonds, and a label for the newest few."""
+"""Event markers of the selected UAV on its flown path, with labels for the newest few."""
 
 from typing import Any
 
@@ -11,17 +11,17 @@ from viewer.theme.events import Event, Kind
 from viewer.theme.palette import MARK, Palette, mesh_colour, rgb
 from viewer.theme.shapes import diamond
 
-PINS = 40  # drawn: the newest of those that lie on the path
-LABELS = 3  # labels do not make room for each other: few are readable
-LETTERS = 26  # of a label
-CLEAR = 3.0  # a label keeps this far from the aircraft and from the others [drawn spans of an aircraft]
-RADIUS = 0.22  # of a diamond [drawn spans of an aircraft]
-MINOR = {Kind.ITEM, Kind.MISSION, Kind.SOUND, Kind.DOUBTED}  # come often: drawn smaller, and without a label
-MODEL = {Kind.VERIFIED, Kind.NO_MODEL}  # a label has room for the first words of their sentence alone
+PINS = 40  # newest markers on the path
+LABELS = 3  # more labels would overlap
+LETTERS = 26  # characters of a label
+CLEAR = 3.0  # distance of a label to the aircraft and other labels [drawn spans of an aircraft]
+RADIUS = 0.22  # marker radius [drawn spans of an aircraft]
+MINOR = {Kind.ITEM, Kind.MISSION, Kind.SOUND, Kind.DOUBTED}  # frequent: smaller, without label
+MODEL = {Kind.VERIFIED, Kind.NO_MODEL}  # the label shows only the text before the colon
 
 
 class Pins:
-    """The marks of one UAV: a batch of fixed size, whatever happens."""
+    """Markers of one UAV: a mesh batch of fixed size."""
 
     def __init__(self, scene: Any, palette: Palette) -> None:
         self._palette = palette
@@ -41,17 +41,17 @@ class Pins:
         )
 
     def draw(self, events: tuple[Event, ...], rows: np.ndarray, at: np.ndarray | None, size: float) -> list[Tag]:
-        """Mark events where they happened; return the labels of the newest few.
+        """Draw events at their positions; return the labels of the newest few.
 
         Args:
             events: oldest first
             rows: the flown path, (n, 4) time [s] and scene ENU [10 m]
-            at: where the aircraft is drawn, (3,) [10 m]
+            at: drawn position of the aircraft, (3,) [10 m]
             size: drawn span of an aircraft [10 m]
         """
         spots = placed(rows, np.array([event.t for event in events]))
         found = [(event, spot) for event, spot in zip(events, spots, strict=True) if np.isfinite(spot).all()]
-        found = sorted(found, key=lambda one: one[0].kind not in MINOR)[-PINS:]  # rather the major ones
+        found = sorted(found, key=lambda one: one[0].kind not in MINOR)[-PINS:]  # major events take precedence
         where, scales, colours = np.zeros((PINS, 3)), np.zeros(PINS, np.float32), np.zeros((PINS, 3))
         for k, (event, spot) in enumerate(found):
             where[k], colours[k] = spot, rgb(self._palette.event(event.kind))
@@ -66,12 +66,12 @@ class Pins:
 
 
 def apart(found: list[tuple[Event, np.ndarray]], at: np.ndarray | None, clear: float) -> list[tuple[Event, np.ndarray]]:
-    """Choose which events get a label: the newest few that stand clear of the aircraft and of each other.
+    """Return the events with a label: the newest with clearance to the aircraft and each other.
 
     Args:
-        found: events with their places (3,) [10 m], oldest first
-        at: where the aircraft is drawn, (3,) [10 m]; None where it is not
-        clear: least distance [10 m]
+        located: events with positions (3,) [10 m], oldest first
+        at: drawn position of the aircraft, (3,) [10 m]; None when it is not drawn
+        clearance: shortest distance [10 m]
     """
     chosen: list[tuple[Event, np.ndarray]] = []
     taken = [] if at is None else [at]
@@ -83,7 +83,7 @@ def apart(found: list[tuple[Event, np.ndarray]], at: np.ndarray | None, clear: f
 
 
 def caption(event: Event) -> str:
-    """Say an event in one short line."""
+    """Describe an event in one short line."""
     text = event.text.split(":")[0] if event.kind in MODEL else event.text
     text = text if len(text) <= LETTERS else text[: LETTERS - 1] + "…"
     return f"{MARK[event.kind]} {text} {moment(event.t)}"

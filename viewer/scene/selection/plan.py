@@ -1,4 +1,4 @@
-"""The mission of the selected UAV in 3-D: its legs, the number of each item, and the leg in force."""
+"""Mission of the selected UAV in 3-D: legs, item numbers and the active leg."""
 
 from typing import Any
 
@@ -11,11 +11,11 @@ from viewer.store.vehicle import Vehicle
 from viewer.theme.numerals import upright, written
 from viewer.theme.palette import Palette, mix, rgb
 
-NUMBERS = 60  # items that get their number: of more one could read none
+NUMBERS = 60  # items up to which numbers are drawn
 
 
 class Plan:
-    """Two nodes: the route, and what of it is in force."""
+    """Two nodes: the route and its active leg."""
 
     def __init__(self, scene: Any, palette: Palette) -> None:
         self._palette = palette
@@ -26,9 +26,9 @@ class Plan:
         """Draw a route: legs and loiters solid, jumps and returns dashed, a ring and its number at each item.
 
         Args:
-            route: where it goes
-            seq: the item in force; -1 where nobody said
-            sight: what the camera sees: numbers face it
+            route: lines of the mission
+            seq: active item; -1 when unknown
+            camera_view: view that the numbers face
             unit: drawn span of an aircraft [10 m]
         """
         p, lines, leg = self._palette, Sheaf(), Sheaf()
@@ -45,13 +45,13 @@ class Plan:
 
     @staticmethod
     def _number(item: int, point: np.ndarray, sight: Sight, unit: float) -> np.ndarray:
-        """Write an item's number beside its ring, upright in the picture: (n, 2, 3)."""
+        """Return the strokes of an item number beside its ring, facing the camera: (n, 2, 3)."""
         right, up = sight.axes()
         return upright(written(str(item), 0.42 * unit), right, up) + point + 0.34 * unit * (right + up)
 
 
 def seq_in_force(vehicle: Vehicle) -> int:
-    """Return the mission item in force, the newest word of it first; -1 where nobody said."""
+    """Return the active mission item from telemetry, prediction or mission; -1 when unknown."""
     told = vehicle.prediction.seq if vehicle.prediction is not None else -1
     sent = vehicle.mission.seq if vehicle.mission is not None else -1
     return next((seq for seq in (vehicle.known.seq, told, sent) if seq >= 0), -1)

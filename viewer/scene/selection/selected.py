@@ -1,4 +1,4 @@
-"""The selected UAV in 3-D: tube, rings, horizon, route, flown path, hindcast, and what its labels say."""
+"""Selected UAV in 3-D: tube, rings, horizon, route, flown path, hindcast and labels."""
 
 from typing import Any
 
@@ -20,13 +20,13 @@ from viewer.text import mismatch_text
 from viewer.text.words import CLAIMS_S, fit
 from viewer.theme.palette import Palette, mix, rgb, triple
 
-BANDS, BAND_STEPS = 5, 12  # the tube fades in bands, each of so many slices
-BEYOND_S = 20.0  # how far past the horizon the grey dashes go
-SAMPLES, SAMPLE_STEPS = 6, 40  # paths drawn out of the band, each in so many points
+BANDS, BAND_STEPS = 5, 12  # fading bands of the tube, slices per band
+BEYOND_S = 20.0  # look-ahead of the grey dashes beyond the horizon [s]
+SAMPLES, SAMPLE_STEPS = 6, 40  # sample paths, points per path
 
 
 class Selection:
-    """The nodes of one selected UAV on one page."""
+    """Nodes of the selected UAV on one page."""
 
     def __init__(self, scene: Any, palette: Palette) -> None:
         self._scene, self._palette = scene, palette
@@ -43,11 +43,11 @@ class Selection:
         self._bold = Strokes(scene, "/selected/bold", 2.6)
         self._horizon = Strokes(scene, "/selected/horizon", 4.0)
         self._pins, self._plan = Pins(scene, palette), Plan(scene, palette)
-        self._since = np.inf  # the newest stretch of the path is drawn from here on, brightly [s since 1970]
+        self._since = np.inf  # start of the bright newest stretch of the path [s since 1970]
         self._flown_colour = mix(palette.flown, palette.ground, 0.5)
         self.tube = True
-        self.tags: list[Tag] = []  # of what moves
-        self.marks: list[Tag] = []  # of what stays where it happened
+        self.tags: list[Tag] = []  # moving labels
+        self.marks: list[Tag] = []  # labels at fixed positions
 
     def _sheet(self, name: str, vertices: np.ndarray, faces: np.ndarray, opacity: float, colour: str) -> Any:
         return self._scene.add_mesh_simple(
@@ -63,14 +63,14 @@ class Selection:
         )
 
     def clear(self) -> None:
-        """Hide everything: nobody is selected."""
+        """Hide everything when no UAV is selected."""
         for strokes in (self._thin, self._flown, self._bold, self._horizon, self._mismatch):
             strokes.draw(NOTHING.legs)
         self._hide_tube()
         self.tags, self.marks = [], []
 
     def draw(self, vehicle: Vehicle, feed: Feed, now: float, *, ground: float, unit: float) -> None:
-        """Draw what moves with one UAV; `unit` is the drawn span of an aircraft [10 m]."""
+        """Draw the moving content of the UAV; `unit` is the drawn span of an aircraft [10 m]."""
         at, p = vehicle.where(now), self._palette
         if at is None:
             return self.clear()
@@ -118,7 +118,7 @@ class Selection:
         thin.add(_beyond(told, until), rgb(p.muted))
 
     def _draw_marks(self, told: Forecast, start: float, thin: Sheaf) -> None:
-        """Ring the tube at the marked look-aheads and, in its own colour, at the horizon."""
+        """Draw rings of the tube at marked look-aheads and at the horizon."""
         p, until = self._palette, told.until
         steps = [s for s in marks(until) if s > start + 1.0][-4:]
         hoop = rings(told.at(np.array([0.0, *steps, until])), told.width(np.array([0.0, *steps, until])))[1:]
@@ -136,13 +136,13 @@ class Selection:
         self._horizon.draw(NOTHING.legs)
 
     def _no_tube(self, told: Forecast | None, start: float, thin: Sheaf) -> None:
-        """Claim nothing: no band, no horizon; a path without a horizon is grey dashes."""
+        """Hide band and horizon; draw a path without horizon as grey dashes."""
         self._hide_tube()
         if told is not None:
             thin.add(_beyond(told, start), rgb(self._palette.muted))
 
     def draw_flight(self, vehicle: Vehicle, rows: np.ndarray, now: float, unit: float) -> None:
-        """Draw the flown path (n, 4) before its newest stretch, with what happened on it; `unit` as for `draw`."""
+        """Draw the flown path (n, 4) before its newest stretch, with events and mismatch; `unit` as for `draw`."""
         sound = ~mismatch_text.within(rows[:, 0], vehicle.mismatch)[1:] & (rows[:-1, 0] < self._since)
         self._flown.draw(chain(rows[:, 1:])[sound] if len(rows) > 1 else NOTHING.legs, self._flown_colour)
         found = vehicle.mismatch
@@ -158,13 +158,13 @@ class Selection:
 
 
 def _beyond(told: Forecast, start: float) -> np.ndarray:
-    """Dash what was predicted past the horizon: (n, 2, 3), where nothing is claimed."""
+    """Return dashes of the prediction beyond the horizon: (n, 2, 3)."""
     end = min(float(told.ahead[-1]), start + BEYOND_S)
     return dashed(told.at(np.linspace(start, end, 40))) if end > start + 0.5 else np.zeros((0, 2, 3))
 
 
 def caption(vehicle: Vehicle, now: float) -> str:
-    """Say in one line who is selected and how it stands."""
+    """Describe the selected UAV and its status in one line."""
     told = vehicle.forecast
     if told is None:
         horizon = "  no prediction yet"

@@ -1,9 +1,9 @@
-"""The shape of doubt: a skin round the mean path as wide as the band, its rings, and what lies beyond the horizon."""
+"""Prediction tube: surface around the mean path with the half-axes of the prediction region, rings, sample paths."""
 
 import numpy as np
 
 SIDES = 20  # corners of one ring
-BAND_SIGMA = 2.1  # half-axes of the 90 % band, to be held all at once, in standard deviations
+BAND_SIGMA = 2.1  # half-axes of the simultaneous 90 % region in standard deviations
 
 
 def frame_of(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -25,7 +25,7 @@ def frame_of(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rings(path: np.ndarray, axes: np.ndarray, sides: int = SIDES) -> np.ndarray:
-    """Draw the band's cross-section at each point.
+    """Return the cross-section of the tube at each point.
 
     Args:
         path: mean position, (n, 3) [10 m]
@@ -51,7 +51,7 @@ def skin(n: int, sides: int = SIDES) -> np.ndarray:
 
 
 def curtain(path: np.ndarray, ground: float) -> tuple[np.ndarray, np.ndarray]:
-    """Hang a curtain from a path to the ground: corners (2 n, 3), triangles (2 (n - 1), 3)."""
+    """Return a vertical surface from a path to the ground: corners (2 n, 3), triangles (2 (n - 1), 3)."""
     foot = path * [1.0, 1.0, 0.0] + [0.0, 0.0, ground]
     k = np.arange(len(path) - 1) * 2
     faces = np.concatenate([np.stack([k, k + 1, k + 2], -1), np.stack([k + 1, k + 3, k + 2], -1)])
@@ -59,21 +59,21 @@ def curtain(path: np.ndarray, ground: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def marks(until: float, steps: tuple[float, ...] = (5, 10, 20, 30, 60, 120)) -> list[float]:
-    """Choose the look-aheads to mark [s]: those that leave room before the horizon."""
+    """Return the look-aheads to mark [s]: those with enough distance to the horizon."""
     return [step for step in steps if step < until - max(2.0, 0.12 * until)]
 
 
 def samples(path: np.ndarray, axes: np.ndarray, n: int, seed: int) -> np.ndarray:
-    """Draw a few paths that the band would hold as often as it says: (n, k, 3).
+    """Sample paths that the tube contains with its nominal coverage: (n, k, 3).
 
-    Each is off the mean by one standard normal offset across and one up, in units of the band's half-axes over
-    `BAND_SIGMA`, that turn slowly into two others: doubt is correlated along a flight.
+    Cross and vertical offsets are standard normal in units of the half-axes over `BAND_SIGMA` and rotate slowly into
+    a second pair, so that errors are correlated along the path.
 
     Args:
         path: mean position, (k, 3) [10 m]
         axes: half-axes along, cross, vertical, (k, 3) [10 m]
-        n: how many
-        seed: the same gives the same offsets, so that paths do not flicker
+        n: number of paths
+        seed: constant per UAV, so that paths do not flicker
     """
     cross, up = frame_of(path)
     begin, end = np.random.default_rng(seed).standard_normal((2, n, 2, 1))

@@ -1,4 +1,4 @@
-"""Heights and pictures of the ground in the scene of a page: one mesh and its contours."""
+"""Terrain and imagery in the scene: one textured mesh and contours."""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,48 +14,48 @@ from viewer.theme.palette import Palette, mix, rgb
 if TYPE_CHECKING:
     import trimesh
 
-REACH_M = 15_000.0  # how far from the origin of the scene ground is shown [m]
-CELLS, TEXELS = 160, 1_536  # of the mesh and of its picture, along one side
-STEPS_M = (2, 5, 10, 20, 50, 100, 200, 500)  # between contours; the first that makes at most so many of them
+REACH_M = 15_000.0  # extent of the terrain from the scene origin [m]
+CELLS, TEXELS = 160, 1_536  # mesh cells and texture pixels along one side
+STEPS_M = (2, 5, 10, 20, 50, 100, 200, 500)  # contour intervals; the smallest with at most `MAX_CONTOURS` is used
 MOST_CONTOURS = 24
-SUN = np.array([-0.5, 0.6, 0.62])  # where the light comes from that shades the slopes: north-west, as on maps
-CONTOUR = {True: "#6B9A7E", False: "#7FA08C"}  # by whether the page is dark
-DIM = {True: 0.65, False: 1.0}  # how much of the light of a picture is kept
-LIT = 0.45  # the lights of the scene make a picture so much brighter: 1 over that [-]
+SUN = np.array([-0.5, 0.6, 0.62])  # light direction for hill shading: north-west, as on maps
+CONTOUR = {True: "#6B9A7E", False: "#7FA08C"}  # key: dark theme
+DIM = {True: 0.65, False: 1.0}  # brightness of imagery; key: dark theme
+LIT = 0.45  # compensates the scene lights [-]
 
 
 class Shape(NamedTuple):
-    """The ground round the origin, east and north from it."""
+    """Height grid around the scene origin."""
 
     east: np.ndarray  # (n,) [10 m]
     north: np.ndarray  # (n,) [10 m]
-    up: np.ndarray  # (n, n), rows go north; not a number where unknown [10 m]
+    up: np.ndarray  # (n, n), rows towards north; NaN where unknown [10 m]
 
 
 class Land:
-    """Terrain and imagery, laid out once for a place and shown on every page."""
+    """Terrain and imagery, computed once per scene frame and shown on every page."""
 
     def __init__(self, terrain: Raster | None, imagery: Raster | None) -> None:
         self._terrain, self._imagery = terrain, imagery
         self._place: Place | None = None
         self._form: Shape | None = None
         self._extent = np.zeros((2, 2))
-        self._meshes: dict[bool, trimesh.Trimesh] = {}  # by whether it is dark
+        self._meshes: dict[bool, trimesh.Trimesh] = {}  # key: dark theme
         self._contours = np.zeros((0, 2, 3))
-        self._shown: dict[int, Place] = {}  # by client: where it was laid out for
-        self.sentence = ""  # why nothing is shown; empty: it is
+        self._shown: dict[int, Place] = {}  # by client: scene frame of the shown terrain
+        self.sentence = ""  # why nothing is shown; empty without an error
 
     @property
     def lies(self) -> bool:
-        """Return whether there is ground to see, so that the grid is in the way."""
+        """Return whether terrain is shown, so that the grid is hidden."""
         return self._form is not None
 
     def forget(self, client: int) -> None:
-        """Lay the ground out anew for a client whose scene was emptied."""
+        """Show the terrain again for a client whose scene was reset."""
         self._shown.pop(client, None)
 
     def show(self, client: Any, place: Place | None, palette: Palette, ground: float) -> None:
-        """Show it on a page, once; `ground` is where a picture without heights lies [10 m]."""
+        """Show the terrain on a page, once; `ground` is the height of imagery without terrain [10 m]."""
         if place is None or (self._terrain is None and self._imagery is None):
             return
         if place is not self._place:
@@ -77,15 +77,13 @@ class Land:
         names = " and ".join(raster.name for raster in (self._terrain, self._imagery) if raster is not None)
         extent = self._covered(place)
         if extent is None:
-            self.sentence = (
-                f"{names}: found nothing within {REACH_M / 1000:.0f} km of the fleet; name the files of its place."
-            )
+            self.sentence = f"{names}: found no data within {REACH_M / 1000:.0f} km of the fleet; use other files."
             return
         self._extent, self._form = np.array(extent), shape(self._terrain, place, extent, ground)
         self._contours = contours(self._form) if self._terrain is not None else self._contours
 
     def _covered(self, place: Place) -> tuple[np.ndarray, np.ndarray] | None:
-        """Find the corners, south-west and north-east, of what the files cover near the origin, (2,) each [10 m]."""
+        """Return the covered extent near the origin: south-west and north-east corner, (2,) each [10 m]."""
         side = np.linspace(-REACH_M, REACH_M, 201) / UNIT_M
         raster = self._terrain if self._terrain is not None else self._imagery
         assert raster is not None
@@ -97,7 +95,7 @@ class Land:
         return np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]])
 
     def _picture(self, place: Place, palette: Palette, form: Shape) -> Image.Image:
-        """Paint the ground: the picture of the file where there is one, else its slopes in the page's colours."""
+        """Return the texture: imagery, or hill shading in the page colours."""
         (west, south), (east, north) = self._extent
         e, n = np.meshgrid(np.linspace(west, east, TEXELS), np.linspace(north, south, TEXELS))
         plain = rgb(palette.ground)
@@ -119,7 +117,7 @@ def _degrees(place: Place, east: np.ndarray, north: np.ndarray) -> tuple[np.ndar
 
 
 def shape(terrain: Raster | None, place: Place, extent: tuple[np.ndarray, np.ndarray], ground: float) -> Shape:
-    """Lay out the heights; without any it is flat, a little below the ground."""
+    """Sample the heights; without terrain return a plane slightly below the ground."""
     (west, south), (east, north) = extent
     e, n = np.linspace(west, east, CELLS), np.linspace(south, north, CELLS)
     if terrain is None:
@@ -129,7 +127,7 @@ def shape(terrain: Raster | None, place: Place, extent: tuple[np.ndarray, np.nda
 
 
 def shade(form: Shape) -> np.ndarray:
-    """Return how much light falls on each point, about 0.5 on level ground, (n, n)."""
+    """Return the hill shading, about 0.5 on level ground, (n, n)."""
     up = np.where(np.isfinite(form.up), form.up, np.nanmin(form.up))
     slope_n, slope_e = np.gradient(up, form.north, form.east)
     normal = np.stack([-2 * slope_e, -2 * slope_n, np.ones_like(up)], axis=-1)
@@ -138,7 +136,7 @@ def shade(form: Shape) -> np.ndarray:
 
 def contours(form: Shape) -> np.ndarray:
     """Return the contours at whole metres above mean sea level of the scene, (n, 2, 3) [10 m]."""
-    import contourpy  # here: as in `mesh`
+    import contourpy  # deferred import, as in `mesh`
 
     low, high = float(np.nanmin(form.up)) * UNIT_M, float(np.nanmax(form.up)) * UNIT_M
     step = next((s for s in STEPS_M if (high - low) / s <= MOST_CONTOURS), STEPS_M[-1])
@@ -153,8 +151,8 @@ def contours(form: Shape) -> np.ndarray:
 
 
 def mesh(form: Shape, picture: Image.Image) -> "trimesh.Trimesh":
-    """Make the mesh with its picture; there are holes where the heights are not known."""
-    import trimesh  # here: most pages show no ground, and a restarted viewer is waited for
+    """Return the textured mesh, with holes where heights are unknown."""
+    import trimesh  # deferred import: most pages show no terrain
 
     east, north = np.meshgrid(form.east, form.north)
     known = np.isfinite(form.up).ravel()

@@ -1,4 +1,4 @@
-"""A raster file with its place on earth: GeoTIFF, or PNG and JPEG with bounds or a world file."""
+"""Georeferenced raster files: GeoTIFF, or PNG and JPEG with bounds or a world file."""
 
 import warnings
 from pathlib import Path
@@ -9,24 +9,24 @@ from PIL import Image
 
 from viewer.scene.terrain.utm import to_utm
 
-MAX_PIXELS = 80_000_000  # of one file
+MAX_PIXELS = 80_000_000  # pixels of one file
 SCALE, TIEPOINT, MATRIX, KEYS, NO_DATA = 33550, 33922, 34264, 34735, 42113  # TIFF tags
 MODEL, RASTER_TYPE, PROJECTED = 1024, 1025, 3072  # keys in KEYS
 WORLD = (".wld", ".pgw", ".pngw", ".jgw", ".tfw")
-CURE = "write it as EPSG:4326 (gdalwarp -t_srs EPSG:4326) or name its bounds: FILE@south,west,north,east"
+CURE = "convert it to EPSG:4326 (gdalwarp -t_srs EPSG:4326) or give its bounds: FILE@south,west,north,east"
 
 
 class Raster(NamedTuple):
-    """Values on a grid, and how to find a place on earth in it."""
+    """Georeferenced grid of heights or colours."""
 
     name: str
-    values: np.ndarray  # (h, w) heights [m above mean sea level], not a number where unknown; or (h, w, 3) colours
-    affine: np.ndarray  # (2, 3): column, row, 1 -> x, y of the middle of a pixel
-    zone: tuple[int, bool] | None = None  # UTM zone and whether it is a northern one; None: x, y are degrees
+    values: np.ndarray  # (h, w) heights [m above mean sea level], NaN where unknown; or (h, w, 3) colours
+    affine: np.ndarray  # (2, 3): column, row, 1 -> x, y of the pixel centre
+    zone: tuple[int, bool] | None = None  # UTM zone and northern hemisphere; None: x, y in degrees
 
     def at(self, lat_deg: np.ndarray, lon_deg: np.ndarray) -> np.ndarray:
-        """Interpolate at places of any shape: values, not a number outside; colours have a last axis of 3."""
-        from scipy.ndimage import map_coordinates  # here: a viewer without ground starts without it
+        """Interpolate values at positions of any shape, NaN outside; colours have a last axis of 3."""
+        from scipy.ndimage import map_coordinates  # deferred import: only needed with terrain
 
         lat, lon = np.asarray(lat_deg, float).ravel(), np.asarray(lon_deg, float).ravel()
         x, y = (lon, lat) if self.zone is None else to_utm(lat, lon, self.zone[0], north=self.zone[1])
@@ -42,21 +42,21 @@ class Raster(NamedTuple):
 
 
 def read(text: str, *, colours: bool) -> Raster:
-    """Read a raster.
+    """Read a raster file.
 
     Args:
         text: `FILE`, or `FILE@south,west,north,east` in degrees
-        colours: whether it is a picture; else heights in metres
+        colours: True for imagery, False for heights in metres
     Raises:
-        ValueError: when it is no such file or has no place on earth; the sentence says what to do.
+        ValueError: when the file is invalid or not georeferenced; the message contains the remedy.
         OSError: when it cannot be opened.
     """
     path, bounds = _split(text)
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # what is wrong is said below
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:  # errors are reported below
             if image.width * image.height > MAX_PIXELS:
                 raise ValueError(
-                    f"{path.name}: found {image.width} x {image.height} pixels, expected at most {MAX_PIXELS:,}; cut it"
+                    f"{path.name}: found {image.width} x {image.height} pixels, expected <= {MAX_PIXELS:,}; crop it"
                 )
             values = _colours(image) if colours else _heights(image)
             affine, zone = (_bounded(bounds, image), None) if bounds else _placed(path, image)
@@ -66,7 +66,7 @@ def read(text: str, *, colours: bool) -> Raster:
         if error.errno is not None:
             raise
         raise ValueError(
-            f"{path.name}: found a damaged raster ({error}), expected a whole one; fetch it again"
+            f"{path.name}: found a damaged raster ({error}), expected a complete one; download it again"
         ) from None
     return Raster(path.name, values, affine, zone)
 
@@ -78,10 +78,10 @@ def _split(text: str) -> tuple[Path, list[float]]:
     try:
         south, west, north, east = (float(x) for x in numbers.split(","))
     except ValueError:
-        return Path(text), []  # the @ belongs to the name
+        return Path(text), []  # the @ is part of the name
     if not (-90 <= south < north <= 90 and -180 <= west < east <= 180):
         raise ValueError(
-            f"{name}: found bounds {numbers}, expected south,west,north,east in degrees; put them in order"
+            f"{name}: found bounds {numbers}, expected south,west,north,east in degrees; correct their order"
         )
     return Path(name), [south, west, north, east]
 
@@ -110,7 +110,7 @@ def _bounded(bounds: list[float], image: Any) -> np.ndarray:
 
 
 def _placed(path: Path, image: Any) -> tuple[np.ndarray, tuple[int, bool] | None]:
-    """Read where it lies: from its own tags, else from a world file beside it."""
+    """Return affine map and zone from the TIFF tags, else from a world file."""
     tags = dict(getattr(image, "tag_v2", {}))
     if KEYS in tags and (SCALE in tags or MATRIX in tags):
         return _tagged(path.name, tags)
@@ -118,7 +118,7 @@ def _placed(path: Path, image: Any) -> tuple[np.ndarray, tuple[int, bool] | None
         if (beside := path.with_suffix(suffix)).is_file():
             a, d, b, e, c, f = (float(x) for x in beside.read_text(encoding="ascii").split()[:6])
             return np.array([[a, b, c], [d, e, f]]), None
-    raise ValueError(f"{path.name}: found nothing that says where it lies, expected a GeoTIFF or a world file; {CURE}")
+    raise ValueError(f"{path.name}: found no georeference, expected a GeoTIFF or a world file; {CURE}")
 
 
 def _tagged(name: str, tags: dict[int, Any]) -> tuple[np.ndarray, tuple[int, bool] | None]:
@@ -130,7 +130,7 @@ def _tagged(name: str, tags: dict[int, Any]) -> tuple[np.ndarray, tuple[int, boo
     else:
         (dx, dy), (i, j, _, x, y, _) = tags[SCALE][:2], tags[TIEPOINT][:6]
         matrix = np.array([[dx, 0.0, x - i * dx], [0.0, -dy, y + j * dy]], float)
-    if told.get(RASTER_TYPE, 1) == 1:  # told for the corner of a pixel, wanted for its middle
+    if told.get(RASTER_TYPE, 1) == 1:  # pixel corner to pixel centre
         matrix = matrix + np.outer(matrix[:, :2].sum(axis=1) / 2, [0, 0, 1])
     return matrix, zone
 

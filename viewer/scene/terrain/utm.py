@@ -1,4 +1,4 @@
-"""Latitude and longitude to the metres of a UTM zone."""
+"""Projection of latitude and longitude to UTM coordinates."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ _SCALE, _EAST_M, _SOUTH_M = 0.9996, 500_000.0, 10_000_000.0
 
 
 def to_utm(lat_deg: np.ndarray, lon_deg: np.ndarray, zone: int, *, north: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Project to a zone, to a millimetre within it: easting and northing [m].
+    """Project to a UTM zone, accurate to 1 mm within it: easting and northing [m].
 
     Source: Krüger 1912 as Karney 2011, "Transverse Mercator with an accuracy of a few nanometers", eq. 7-11.
     """

@@ -1,6 +1,7 @@
-"""Letters not yet read: of a small fleet all are read, in a crowd the newest of each, and all with news of the mission.
+"""Queues of undecoded messages: a small fleet decodes every sample, a large fleet the newest of each UAV.
 
-Reading a letter costs ten times what putting it aside does: of a thousand aircraft only what is drawn is read.
+Samples that change the mission item are always decoded. Decoding costs ten times as much as queueing, so of a large
+fleet only what is drawn is decoded.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,20 +14,20 @@ from fleet.bus.bus_protocol import Letter as Said
 from fleet.bus.codec import Stamp
 from fleet.contract import Rows, Sample
 
-CROWD = 300  # above this many a sample that a newer one has replaced is not read
-MOST = 40  # letters kept of one UAV while nobody looks; the newest replaces the last
-MOST_UAVS = 4_000  # of whom letters are kept: ids are written by strangers
-_LEG = b"\xa3leg\x82"  # msgpack: the key, and a map after it, which nil is not
+CROWD = 300  # UAVs above which only the newest sample of each is decoded
+MOST = 40  # queued samples of one UAV; then the newest replaces the last
+MOST_UAVS = 4_000  # UAVs with queued samples: ids are untrusted input
+_LEG = b"\xa3leg\x82"  # msgpack: the key followed by a map (not nil)
 
 
 class Leg(msgspec.Struct):
-    """Of a sample only the mission item in force."""
+    """Active mission item of a sample."""
 
     leg: Rows
 
 
 class Head(msgspec.Struct, frozen=True):
-    """Of a sample what is drawn or told; the rest of it is passed over."""
+    """Fields of a sample that the viewer uses; the others are skipped."""
 
     uav: int
     t: float
@@ -41,21 +42,23 @@ _UNREADABLE = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 
 
 def read(payload: bytes) -> Head:
-    """Unpack what the viewer needs of a sample.
+    """Decode the fields of a sample that the viewer uses.
 
     Raises:
-        ValueError: when the bytes are too many or do not fit; the sender must repair it.
+        ValueError: when the message is too large or malformed; correct the sender.
     """
     if len(payload) > SAID[Sample.topic].most:
         raise ValueError(f"sample: found {len(payload):,} bytes, expected {SAID[Sample.topic].most:,}; send less")
     try:
         return _HEAD.decode(payload)
     except _UNREADABLE as error:
-        raise ValueError(f"sample: found {len(payload)} bytes that do not fit ({str(error)[:80]}); resend") from None
+        raise ValueError(
+            f"sample: found {len(payload)} malformed bytes ({str(error)[:80]}), expected msgpack; resend"
+        ) from None
 
 
 class Letter:
-    """What came, when, monotonic [s], and under which claim: ten thousand a second, so it is quickly made."""
+    """Queued payload, its arrival time, monotonic [s], and its fencing token; slots make it cheap to create."""
 
     __slots__ = ("now", "payload", "stamp")
 
@@ -64,25 +67,25 @@ class Letter:
 
 
 class Held(NamedTuple):
-    """What waits of one UAV, and since when, monotonic [s]."""
+    """Queued messages of one UAV and the arrival time of the first, monotonic [s]."""
 
     since: float
     letters: list[Letter]
 
 
 class Inbox:
-    """Samples that wait; who fills it and who empties it hold the same lock."""
+    """Queue of samples; the caller must own one common lock to fill or empty it."""
 
     def __init__(self) -> None:
         self.crowd = False
-        self.keen: frozenset[int] = frozenset()  # of whom every letter is kept, also in a crowd
-        self.lost = 0  # letters that name nobody, or came when there was no room
-        self._held: dict[int, Held] = {}  # who has waited longest first
-        self._kept: set[int] = set()  # whose last letter has news of the mission
-        self._item: dict[int, bytes] = {}  # the mission item each named last
+        self.keen: frozenset[int] = frozenset()  # UAVs of which every sample is kept, also in a large fleet
+        self.lost = 0  # messages without a UAV id, or beyond the limit
+        self._held: dict[int, Held] = {}  # oldest first
+        self._kept: set[int] = set()  # UAVs whose last queued sample changes the mission item
+        self._item: dict[int, bytes] = {}  # last mission item of each UAV
 
     def put(self, samples: list[Said], now: float) -> None:
-        """Take in samples as they came."""
+        """Queue samples in order of arrival."""
         crowd, keen, kept = self.crowd, self.keen, self._kept
         for uav, payload, _, _ in samples:
             if uav is None:
@@ -104,7 +107,7 @@ class Inbox:
                 kept.add(uav)
 
     def _is_news(self, uav: int, payload: bytes) -> bool:
-        """Return whether a sample names another mission item than the one before; one that cannot be read may."""
+        """Return whether a sample changes the mission item; True when it cannot be decoded."""
         try:
             told = _LEG_ALONE.decode(payload).leg.x
         except _UNREADABLE:
@@ -115,14 +118,14 @@ class Inbox:
         return before != told.data
 
     def take(self, uavs: Iterable[int] | None = None) -> Iterator[tuple[int, Letter]]:
-        """Empty it, or take out what is of some UAVs: letters of each in the order they came."""
+        """Remove and yield the messages of all or some UAVs, each UAV in order of arrival."""
         for uav in list(self._held) if uavs is None else uavs:
             if (held := self._held.pop(uav, None)) is not None:
                 self._kept.discard(uav)
                 yield from ((uav, letter) for letter in held.letters)
 
     def waiting(self, before: float) -> list[int]:
-        """Name those of whom something has waited since before a time, monotonic [s]."""
+        """Return the UAVs with a message queued since before a time, monotonic [s]."""
         found = []
         for uav, held in self._held.items():
             if held.since > before:
@@ -132,24 +135,24 @@ class Inbox:
 
 
 class Newest:
-    """Letters of another class in a crowd: the newest of each, read when one has waited for so long."""
+    """Queue of the newest message per UAV; a message is due `wait_s` after the first one it replaced."""
 
     def __init__(self, wait_s: float) -> None:
         self._wait_s = wait_s
-        self._held: dict[int, tuple[float, Letter]] = {}  # since when, monotonic [s]; who has waited longest first
+        self._held: dict[int, tuple[float, Letter]] = {}  # first arrival, monotonic [s]; oldest first
 
     def put(self, uav: int, letter: Letter) -> None:
-        """Take in one in place of the one before."""
+        """Queue a message in place of the previous one."""
         held = self._held.get(uav)
         if held is not None or len(self._held) < MOST_UAVS:
             self._held[uav] = (held[0] if held is not None else letter.now), letter
 
     def drop(self, uav: int) -> None:
-        """Forget what waits of a UAV: a newer one was read."""
+        """Discard the queued message of a UAV."""
         self._held.pop(uav, None)
 
     def due(self, now: float) -> list[tuple[int, Letter]]:
-        """Take out what has waited long enough, at `now`, monotonic [s]."""
+        """Remove and return the messages that are due at `now`, monotonic [s]."""
         found = []
         while self._held and (uav := next(iter(self._held))) is not None and self._held[uav][0] + self._wait_s <= now:
             found.append((uav, self._held.pop(uav)[1]))

@@ -1,4 +1,4 @@
-"""Rows of a sample as plain numbers: of a fleet they come by the ten thousand, and one row is no array's work."""
+"""Decode rows of a sample into tuples: for single rows this is faster than a numpy array."""
 
 import struct
 from functools import cache
@@ -15,25 +15,25 @@ def _packed(dtype: str, width: int) -> struct.Struct:
 
 
 def last(x: Array) -> tuple[float, ...]:
-    """Return the last row of a table; nothing where there is none.
+    """Return the last row of a table; empty when there is none.
 
     Raises:
-        ValueError: when dtype, shape and byte count disagree; the sender must repair it.
+        ValueError: when dtype, shape and byte count disagree; correct the sender.
     """
     shape = x.shape
     if len(shape) != 2 or not shape[0]:
         return ()
     if x.dtype not in _LETTER or not 0 < shape[1] < 100 or len(x.data) != shape[0] * _packed(x.dtype, shape[1]).size:
-        return tuple(map(float, x.numpy()[-1]))  # says what is wrong with it
+        return tuple(map(float, x.numpy()[-1]))  # raises with the reason
     pack = _packed(x.dtype, shape[1])
     return pack.unpack_from(x.data, (shape[0] - 1) * pack.size)
 
 
 def stacked(uav: int, rows: Rows) -> tuple[Any, Any]:
-    """Return the times (n,) and rows (n, 3 or more) of positions; of one row without an array.
+    """Return the times (n,) and rows (n, 3 or more) of positions; decode a single row without numpy.
 
     Raises:
-        ValueError: when their shapes are none of positions; the gateway must resend.
+        ValueError: when the shapes do not match; the gateway must resend.
     """
     t, x = rows.t, rows.x
     if x.shape == (1, 3) and t.shape == (1,):
