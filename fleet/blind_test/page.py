@@ -12,8 +12,8 @@ from fleet.report.html import document, safe
 
 _HOW = (
     "JSBSim simulates every flight. The effects come from its own physics or from faults of servos and sensors that "
-    "share no code with the diagnosis. The labels are encrypted and their hash is printed, then the reports are written "
-    "and their hash is printed. Only then are the labels decrypted."
+    "share no code with the diagnosis. The labels are encrypted and their hash is printed. The reports are written and "
+    "their hash is printed. Only then are the labels decrypted."
 )
 
 

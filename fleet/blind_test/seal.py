@@ -36,7 +36,7 @@ def taken(key: Path) -> bytes:
     mode = stat.S_IMODE(found.st_mode)
     if not stat.S_ISREG(found.st_mode) or mode & 0o077 or found.st_uid != os.geteuid():
         raise ValueError(
-            f"{key}: found mode {mode:04o}, owner {found.st_uid}, expected a regular file readable by its owner only; restart the test"
+            f"{key}: found mode {mode:04o}, owner {found.st_uid}, expected a file for its owner only; restart the test"
         )
     secret = key.read_bytes()
     key.unlink()
@@ -51,11 +51,9 @@ def unseal(sealed: Path, key: bytes, promised: str) -> bytes:
     """
     if digest(sealed) != promised:
         raise ValueError(
-            f"{sealed.name}: found another hash than {promised[:16]}…, expected the committed labels; restart the test"
+            f"{sealed.name}: found another hash than {promised[:16]}…, expected the labels; restart the test"
         )
     try:
         return Fernet(key.strip()).decrypt(sealed.read_bytes())
     except (InvalidToken, ValueError):
-        raise ValueError(
-            f"{sealed.name}: found a key that does not match, expected its own; restart the test"
-        ) from None
+        raise ValueError(f"{sealed.name}: found a wrong key, expected its own; restart the test") from None
