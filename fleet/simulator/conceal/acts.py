@@ -27,7 +27,7 @@ _AT_ONCE: dict[str, float] = {  # noise per channel and sample, as in `sensors`
     **dict.fromkeys(("f_x", "f_y", "f_z"), 0.07),  # [m/s2]
     **dict.fromkeys(("w_n", "w_e", "w_d"), 0.25),  # [m/s]
 }
-_FLOWN: dict[str, float] = {  # columns of `Log.seen`
+_FLOWN: dict[str, float] = {  # columns of `ExamFlightLog.channels`
     **{name: _AT_ONCE[name] for name in ("p", "q", "r", "a_x", "a_y", "a_z", "phi", "theta", "psi")},
     **{name: _AT_ONCE[name] for name in ("v_n", "v_e", "v_d")},
     **dict.fromkeys(("p_n", "p_e", "p_d"), 0.5),  # [m]
