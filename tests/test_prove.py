@@ -200,7 +200,7 @@ def test_an_examination_runs_and_keeps_its_promises(tmp_path: Path) -> None:
     promised = [
         next(k for k, line in enumerate(said) if told[name] in line) for name in ("labels_sha256", "reports_sha256")
     ]
-    opened = next(k for k, line in enumerate(said) if "seal opened" in line)
+    opened = next(k for k, line in enumerate(said) if "labels decrypted" in line)
     assert promised[0] < promised[1] < opened
     assert digest(folder / "labels.sealed") == told["labels_sha256"]
     assert digest(*sorted(folder.glob("*/reports.json"))) == told["reports_sha256"]

@@ -1,1 +1,1 @@
-"""Autopilot twins, one folder or file each: `ls` is the catalogue."""
+"""Models of autopilot control laws, one folder or file per autopilot."""

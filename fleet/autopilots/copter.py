@@ -1,14 +1,14 @@
-"""A multirotor's autopilot in the large: a point that follows the route, and an airframe that lags behind it.
+"""Multirotor autopilot model: a reference point moves along the route, the airframe follows with a lag.
 
-    v_allowed = min(v_max, fastest from which the end of the segment is reached at its speed)      one segment
-    s'' -> within the acceleration, s''' within the jerk;   r = A + t s                             the reference
+    v_allowed = min(v_max, v from which braking to the end speed of the segment is possible)        one segment
+    s'' and s''' limited by acceleration and jerk;   r = A + t s                                      the reference
     x'' = wn^2 (r - x) + 2 zeta wn (r' - x')                                                        the airframe
 
-Corners are rounded: at acceleration `a` a turn by `theta` cut by at most `radius` is flown at
-v^2 = a radius / (1 / cos(theta / 2) - 1). Segments are straight; a circle is many of them.
+Corners are rounded: with acceleration `a` and a distance of at most `radius` to the corner, the speed in a turn
+`theta` is v^2 = a radius / (1 / cos(theta / 2) - 1). Segments are straight; a circle consists of many segments.
 
 Source: ArduCopter 4.x waypoint navigation (S-curves, corner acceleration) and PX4 multicopter position control
-(jerk-limited reference), parameter names and defaults as theirs; the lag stands for their position and attitude loops.
+(jerk-limited reference), with their parameter names and defaults; the lag represents their position and attitude loops.
 """
 
 from collections.abc import Mapping
@@ -21,28 +21,28 @@ import numpy as np
 LAW = "copter: route at limited speed, acceleration and jerk, behind a lag"
 
 # columns of one segment
-A_N, B_N = 0, 3  # where it begins and ends, NED, three each [m]
+A_N, B_N = 0, 3  # start and end point, NED, three each [m]
 SPEED, ACC = 6, 7  # limits along it [m/s, m/s2]
-END = 8  # speed at its end; 0: a stop [m/s]
-HOLD = 9  # time to wait at its end; inf: for good [s]
-SEQ = 10  # mission item it came from
+END = 8  # speed at the end; 0: stop [m/s]
+HOLD = 9  # time to wait at the end; inf: unlimited [s]
+SEQ = 10  # sequence number of the mission item
 N_SEGMENT = 11
 
-# state of the follower
-AT, S, S_DOT, S_DDOT, WAITED = range(5)  # segment, way along it [m], its rates, time waited at its end [s]
+# state of the reference
+AT, S, S_DOT, S_DDOT, WAITED = range(5)  # segment, distance along it [m], its derivatives, time waited at its end [s]
 N_FOLLOW = 5
 
-# what the kernel is told besides
+# parameters of the kernel
 JERK, WN, ZETA, V_AIR, W_N, W_E = range(6)  # [m/s3], [rad/s], [-], top airspeed [m/s], wind [m/s]
 N_PAR = 6
 
-_THERE = 0.15  # as near the end of a segment as this it is reached [m]
-_STILL = 0.3  # and as slow as this [m/s]
-_MOST_LEVEL, _MOST_UPRIGHT = 6.0, 4.0  # acceleration that tilt and thrust leave to the airframe [m/s2]
+_THERE = 0.15  # distance to the end of a segment that counts as arrived [m]
+_STILL = 0.3  # and the speed for it [m/s]
+_MOST_LEVEL, _MOST_UPRIGHT = 6.0, 4.0  # horizontal and vertical acceleration limits of the airframe [m/s2]
 
 
 class Limits(NamedTuple):
-    """What the autopilot allows itself, SI."""
+    """Motion limits of the autopilot, SI."""
 
     speed: float
     up: float
@@ -57,7 +57,7 @@ class Limits(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One limit: default and the names it goes by, each with its factor to SI; the first one found counts."""
+    """One limit: default and parameter names, each with its factor to SI; the first available name is used."""
 
     default: float
     names: tuple[tuple[str, float], ...]
@@ -76,17 +76,17 @@ TABLE = {
     "land": Row(0.5, (("LAND_SPD_MS", 1), ("LAND_SPEED", _CM), ("LAND_FINAL_SPD", 1), ("MPC_LAND_SPEED", 1))),
     "tilt": Row(radians(30.0), (("ANGLE_MAX", radians(_CM)), ("MPC_TILTMAX_AIR", radians(1.0)))),
 }
-_LOW, _HIGH = 0.02, 60.0  # limits outside are noise
+_LOW, _HIGH = 0.02, 60.0  # values outside are rejected
 
 
 def limits(values: Mapping[str, float], prefix: str = "") -> tuple[Limits, tuple[str, ...]]:
     """Read the limits from autopilot parameters.
 
     Args:
-        values: parameters as the autopilot names and scales them
+        values: parameters in the names and units of the autopilot
         prefix: `Q_` for the rotors of a quadplane
     Returns:
-        limits, SI; names of those that no parameter gave, at their defaults
+        limits, SI; names of the limits at their defaults for lack of a parameter
     """
     found, absent = {}, []
     for limit, row in TABLE.items():
@@ -96,15 +96,15 @@ def limits(values: Mapping[str, float], prefix: str = "") -> tuple[Limits, tuple
         if not good and limit != "acc_corner":
             absent.append(limit)
     if not found["acc_corner"]:
-        found["acc_corner"] = 2.0 * found["acc"]  # as ArduCopter does for 0
+        found["acc_corner"] = 2.0 * found["acc"]  # ArduCopter: 0 means twice the acceleration
     return Limits(**found), tuple(absent)
 
 
 def along(limit: float, limit_up: float, limit_down: float, t: np.ndarray) -> float:
-    """Return the limit along a direction, from those along the horizontal, up and down [same unit].
+    """Return the limit along a direction from the horizontal, upward and downward limits [same unit].
 
     Args:
-        limit, limit_up, limit_down: along each of the three
+        limit, limit_up, limit_down: horizontal, upward, downward
         t: direction, NED, (3,)
     """
     level, rise = float(np.hypot(t[0], t[1])), float(-t[2])
@@ -113,7 +113,7 @@ def along(limit: float, limit_up: float, limit_down: float, t: np.ndarray) -> fl
 
 
 def corner_speed(before: np.ndarray, after: np.ndarray, limit: Limits) -> float:
-    """Return the speed of a corner between two directions (3,) rounded within the radius [m/s]."""
+    """Return the speed in a corner between two directions (3,), rounded within the radius [m/s]."""
     half = sqrt(max((1.0 + float(before @ after)) / 2.0, 0.0))  # cos(theta / 2)
     if half < 0.1:
         return 0.0
@@ -122,7 +122,7 @@ def corner_speed(before: np.ndarray, after: np.ndarray, limit: Limits) -> float:
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
 def _fastest(to_go: float, end: float, acc: float, jerk: float) -> float:
-    """Return the speed from which the end is reached at its speed: d = v^2 / 2a + v a / 2j [m/s]."""
+    """Return the speed from which braking to the end speed is possible: d = v^2 / 2a + v a / 2j [m/s]."""
     way = max(to_go, 0.0) + end * end / (2.0 * acc) + end * acc / (2.0 * jerk)
     b = acc / (2.0 * jerk)
     return acc * (sqrt(b * b + 2.0 * way / acc) - b)
@@ -130,7 +130,7 @@ def _fastest(to_go: float, end: float, acc: float, jerk: float) -> float:
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
 def _top(n: float, e: float, limit: float, par: np.ndarray) -> float:
-    """Return the ground speed along the horizontal direction (n, e) that the top airspeed leaves [m/s]."""
+    """Return the ground speed along the horizontal direction (n, e) at maximum airspeed [m/s]."""
     level = sqrt(n * n + e * e)
     if not par[V_AIR] > 0.0 or level < 0.3:
         return limit
@@ -144,10 +144,10 @@ def _top(n: float, e: float, limit: float, par: np.ndarray) -> float:
 def follow(
     ref: np.ndarray, segments: np.ndarray, x: np.ndarray, v: np.ndarray, par: np.ndarray, dt: float, out: np.ndarray
 ) -> None:
-    """Fly the segments ahead.
+    """Simulate the flight along the segments.
 
     Args:
-        ref: state of the follower, changed in place, (N_FOLLOW,)
+        ref: state of the reference, changed in place, (N_FOLLOW,)
         segments: (n, N_SEGMENT), n > 0
         x, v: position and ground velocity at the start, NED, changed in place, (3,) [m, m/s]
         par: (N_PAR,)
@@ -181,11 +181,11 @@ def follow(
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
 def _advance(ref: np.ndarray, segments: np.ndarray, length: float, top: float, jerk: float, dt: float) -> None:
-    """Move the reference one step along its segment."""
+    """Advance the reference one step along its segment."""
     row = segments[int(ref[AT])]
     acc = row[ACC]
     miss = min(top, _fastest(length - ref[S], row[END], acc, jerk)) - ref[S_DOT]
-    wanted = min(sqrt(2.0 * jerk * abs(miss)), acc)  # so that the acceleration is gone when the speed is met
+    wanted = min(sqrt(2.0 * jerk * abs(miss)), acc)  # the acceleration reaches zero when the speed is reached
     wanted = wanted if miss > 0.0 else -wanted
     ref[S_DDOT] += min(max(wanted - ref[S_DDOT], -2.0 * jerk * dt), 2.0 * jerk * dt)
     ref[S_DOT] += ref[S_DDOT] * dt
@@ -199,7 +199,7 @@ def _advance(ref: np.ndarray, segments: np.ndarray, length: float, top: float, j
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
 def _over(ref: np.ndarray, row: np.ndarray, dt: float) -> bool:
-    """Count the wait at the end of a segment; tell whether it is over."""
+    """Advance the wait timer at the end of a segment; return whether the wait is over."""
     if row[END] > 0.0:
         return True
     ref[WAITED] += dt

@@ -1,9 +1,9 @@
-"""Any fixed wing's autopilot in the large: L1 guidance on the route, and lags in place of surfaces and loops.
+"""Generic fixed-wing autopilot model: L1 guidance on the route, first-order lags for attitude, speed and climb.
 
     phi_c from L1 (`arduplane.legs`);  phi' = (phi_c - phi) / tau_phi;  psi' = g tan(phi) / V
     V' = (V_c - V) / tau_V;  h_dot_c = clip((h_sp - h) / tau_h, climb, sink);  h_ddot = (h_dot_c - h_dot) / tau_climb
 
-No surface, no rate loop, no airspeed sensor is needed: position and velocity are enough.
+It needs position and velocity only: no surfaces, rate loops or airspeed sensor.
 Source: Park, Deyst & How (2004) for L1; lags as in Beard & McLain 2012, section 9.1 (autopilot design models).
 """
 
@@ -21,8 +21,8 @@ LAW = "greybox: L1 on the route, lags for the rest"
 
 TAU_PHI, TAU_V, TAU_H, TAU_CLIMB, CRUISE, SHARE, CLIMB, SINK = range(8)
 N_PAR = 8
-"""Lags of bank, speed, height, climb [s]; true airspeed where none is commanded [m/s]; true over commanded airspeed
-[-]; greatest climb and sink [m/s]."""
+"""Time constants of bank, speed, height, climb [s]; default true airspeed [m/s]; true over commanded airspeed [-];
+maximum climb and sink rate [m/s]."""
 
 
 @making
@@ -36,14 +36,14 @@ def follow(
     dt: float,
     out: np.ndarray,
 ) -> None:
-    """Fly the route ahead.
+    """Simulate the flight along the route.
 
     Args:
-        ctl, par: state (changed) and parameters of ArduPlane's guidance
+        ctl, par: state (changed) and parameters of the ArduPlane guidance
         legs: route, (n, 9), see `fleet.mission`
         grey: (N_PAR,)
         start: p NED [m], V true airspeed [m/s], phi, psi [rad], h_dot [m/s], (7,)
-        wind: NED, where it blows to, (2,) [m/s]
+        wind: NED, direction the wind blows to, (2,) [m/s]
         dt: step [s]
         out: positions, filled in, NED, (k, 3) [m]; out[0] is the start
     """

@@ -1,12 +1,13 @@
-"""One door to every control law: the last slot of `par` says whose it is.
+"""Common interface of all control laws; the last element of `par` selects the law.
 
     par, absent = parameters(law, values, altitude_m)         law: a name in LAWS
     ctl = init(par, legs, k, start, p, v, euler, Va, theta_c, delta_t)
     phi_c, theta_c, delta_t = guide(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
     delta_a, delta_e, delta_r = stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
 
-All but `parameters` are compiled, change `ctl` in place and take what ArduPlane's take. The shadow run is in `shadow`.
-A newcomer adds a folder or file with `parameters, init, begin, fly, stabilise, shift, LAW` and a line in each function.
+All but `parameters` are compiled, change `ctl` in place and have the arguments of the ArduPlane law. The replay on
+telemetry is in `shadow`. To add a law, add a folder with `parameters, init, begin, fly, stabilise, align_integrators,
+LAW` and a branch in each function below.
 """
 
 from collections.abc import Callable, Mapping
@@ -30,7 +31,7 @@ inlined = nb.njit(cache=True, error_model="numpy", inline="always")
 
 
 class Law(NamedTuple):
-    """One law: what it is called in sentences, its mark in `par`, its parameters by name, and the table of them."""
+    """One control law: description, code in `par`, parameter function, parameter names and parameter table."""
 
     sentence: str
     mark: float
@@ -40,7 +41,7 @@ class Law(NamedTuple):
 
     @property
     def defaults(self) -> dict[str, float]:
-        """Return the defaults by name, in the autopilot's units."""
+        """Return the defaults by name, in the units of the autopilot."""
         return {row.name: float(row.default) for row in self.table}
 
 
@@ -50,33 +51,33 @@ LAWS = {
     "textbook": Law(textbook.LAW, TEXTBOOK, textbook.parameters, textbook.NAMES, textbook.TABLE),
 }
 NAMES = frozenset(name for law in LAWS.values() for name in law.names)
-"""Parameters that any law reads."""
+"""Names of all parameters that at least one law reads."""
 
 
 def parameters(law: str, values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Turn autopilot parameters into the vector of one law, in calm air.
+    """Convert autopilot parameters to the parameter vector of one law, without wind.
 
     Args:
         law: name in `LAWS`
-        values: parameters as the autopilot names and scales them
+        values: parameters in the names and units of the autopilot
         altitude_m: height above mean sea level [m]
     Returns:
         par: (N_PAR,)
-        absent: names that were missing, not finite or absurd; their defaults are in `par`
+        absent: names that are missing, not finite or out of range; `par` contains their defaults
     """
     par, absent = LAWS[law].parameters(values, altitude_m)
     return (padded(par, ARDUPLANE) if law == "arduplane" else par), absent
 
 
 def vector(law: str, found: Mapping[str, float], altitude_m: float = 0.0) -> np.ndarray:
-    """Turn what `read` found into the vector of one law, in calm air, (N_PAR,); altitude as for `parameters`."""
+    """Convert the result of `read` to the parameter vector of one law, without wind, (N_PAR,)."""
     if law == "arduplane":
         return padded(arduplane.vector(found, altitude_m), ARDUPLANE)
     return LAWS[law].parameters(found, altitude_m)[0]
 
 
 def read(law: str, values: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return every parameter of a law under its current name, in the autopilot's units, and which are defaults."""
+    """Return all parameters of a law by current name, in the units of the autopilot, and the names at defaults."""
     if law == "arduplane":
         return arduplane.read(values)
     found = {row.name: find(row, values) for row in LAWS[law].table}
@@ -85,7 +86,7 @@ def read(law: str, values: Mapping[str, float]) -> tuple[dict[str, float], tuple
 
 
 def blown(par: np.ndarray, w_n: float, w_e: float) -> np.ndarray:
-    """Return a copy of `par` that believes in a wind, NED, where it blows to [m/s]."""
+    """Return a copy of `par` with a wind, NED, direction it blows to [m/s]."""
     par = par.copy()
     par[W_N], par[W_E] = w_n, w_e
     return par
@@ -93,7 +94,7 @@ def blown(par: np.ndarray, w_n: float, w_e: float) -> np.ndarray:
 
 @inlined
 def mark(par: np.ndarray) -> float:
-    """Return the mark of the law; what ends in anything else than a mark is ArduPlane's."""
+    """Return the code of the law; a last element that is no code belongs to an ArduPlane vector."""
     return par[par.shape[0] + LAW]
 
 
@@ -110,7 +111,7 @@ def init(
     theta_c: float,
     delta_t: float,
 ) -> np.ndarray:
-    """Begin on leg `k`, without a bump from the pitch and throttle in force; arguments as for ArduPlane's `init`."""
+    """Initialise on leg `k` with bumpless transfer of pitch and throttle; arguments as for `arduplane.init`."""
     law = mark(par)
     if law == PX4:
         return px4_fixedwing.init(par, legs, k, start, p, v, euler, Va, theta_c, delta_t)
@@ -131,7 +132,7 @@ def engage(
     theta_c: float,
     delta_t: float,
 ) -> np.ndarray:
-    """Begin on the first leg as a controller that has been flying it for long; arguments as for `init`."""
+    """Initialise on the first leg in steady state of the speed demand; arguments as for `init`."""
     ctl = init(par, legs, 0, start, p, v, euler, Va, theta_c, delta_t)
     if mark(par) >= ARDUPLANE:
         settle(ctl, par, legs)
@@ -140,7 +141,7 @@ def engage(
 
 @kernel
 def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndarray) -> None:
-    """Go on to leg `k` from the aircraft's position `p`, NED (3,) [m]."""
+    """Switch to leg `k` at the aircraft position `p`, NED (3,) [m]."""
     law = mark(par)
     if law == PX4:
         px4_fixedwing.begin(ctl, par, legs, k, p)
@@ -162,7 +163,7 @@ def fly(
     Va_dot: float,
     dt: float,
 ) -> tuple[float, float, float, bool]:
-    """Fly the current leg for one step without leaving it; as `guide`, and whether the leg is over."""
+    """Run one guidance step on the current leg; return the result of `guide` and whether the leg is complete."""
     law = mark(par)
     if law == PX4:
         return px4_fixedwing.fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
@@ -183,7 +184,7 @@ def _guide_other(
     Va_dot: float,
     dt: float,
 ) -> tuple[float, float, float]:
-    """Fly the route for one step by any law but ArduPlane's."""
+    """Run one guidance step of a law other than ArduPlane."""
     phi_c, theta_c, delta_t, over = fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
     if over and int(ctl[LEG]) + 1 < legs.shape[0]:
         begin(ctl, par, legs, int(ctl[LEG]) + 1, p)
@@ -202,13 +203,13 @@ def guide(
     Va_dot: float,
     dt: float,
 ) -> tuple[float, float, float]:
-    """Fly the route for one step; goes on to the next leg by itself, holds the last. Made for 10 Hz.
+    """Run one guidance step at about 10 Hz; switch to the next leg when one is complete, and stay on the last.
 
-    Arguments and answer as for ArduPlane's `guide`.
+    Arguments and result as for `arduplane.guide`.
     """
     if mark(par) < ARDUPLANE:
         return _guide_other(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
-    # ArduPlane's `guide`, written out: behind one more call it would be a tenth slower
+    # `arduplane.guide` inlined: a further call costs 10 % of the time
     phi_c, theta_c, delta_t, over = fly_arduplane(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
     if over and int(ctl[LEG]) + 1 < legs.shape[0]:
         leg_rules.begin(ctl, par, legs, int(ctl[LEG]) + 1, p)
@@ -226,7 +227,7 @@ def stabilise(
     Va: float,
     dt: float,
 ) -> tuple[float, float, float]:
-    """Return the surfaces for a commanded attitude. Made for 50 Hz; arguments as for ArduPlane's `stabilise`."""
+    """Return the surfaces for a commanded attitude at about 50 Hz; arguments as for `arduplane.stabilise`."""
     law = mark(par)
     if law >= ARDUPLANE:
         return arduplane.stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
@@ -237,7 +238,7 @@ def stabilise(
 
 @kernel
 def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) -> None:
-    """Shift the integrators by what the outputs missed; arguments as for ArduPlane's `shift`."""
+    """Shift the integrators by the output residuals; arguments as for ArduPlane."""
     law = mark(par)
     if law == PX4:
         px4_fixedwing.shift(ctl, par, miss, told)
@@ -249,7 +250,7 @@ def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) 
 
 @kernel
 def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray) -> float:
-    """Return the height to be at, up positive above the origin [m]; p, v: position and ground velocity, NED, (3,)."""
+    """Return the height demand above the origin [m]; p, v: position and ground velocity, NED, (3,)."""
     law = mark(par)
     if law == PX4:
         return px4_fixedwing.height_demand(ctl, par, legs, p, hypot(v[0], v[1]))

@@ -1,7 +1,7 @@
-"""Shadow run: the controller flown on telemetry, so that its memory becomes that of the controller on board.
+"""Replay of the controller on telemetry, to synchronise its state with the controller on board.
 
-What telemetry does not show (filters, integrators, angle flown on a circle) follows from what it shows. What the run
-cannot know, an integrator's value at its beginning, is shifted at the end until the outputs meet the reported ones.
+The replay reconstructs states that telemetry does not contain: filters, integrators, angle flown on a circle. Initial
+integrator values are unknown; a shift at the end aligns the outputs with the reported ones.
 """
 
 from math import isfinite, nan, sqrt
@@ -15,13 +15,13 @@ from fleet.autopilots.laws import begin, engage, fly, shift, stabilise
 from fleet.frames import wrap
 from fleet.mission import SEQ
 
-_MEAN_OVER = 5.0  # outputs are matched over the last seconds [s]
-_LONGEST = 0.2  # a longer gap in the telemetry counts as one step of this length [s]
+_MEAN_OVER = 5.0  # window at the end for matching the outputs [s]
+_LONGEST = 0.2  # step length for longer gaps in telemetry [s]
 
 
 @kernel
 def _find(ctl: np.ndarray, legs: np.ndarray, seq: float) -> int:
-    """Return the leg of a reported item: the current or next such; -1 where the route has none."""
+    """Return the current or next leg with a reported item number; -1 if the route has none."""
     now, n = leg_rules.current(ctl, legs), legs.shape[0]
     for j in range(n):
         i = (max(now, 0) + j) % n
@@ -32,7 +32,7 @@ def _find(ctl: np.ndarray, legs: np.ndarray, seq: float) -> int:
 
 @kernel
 def _known(x: np.ndarray) -> bool:
-    """Return whether all three are finite; `numpy.all` would make an array each time."""
+    """Return whether all three elements are finite; unlike `numpy.all` without allocating an array."""
     return isfinite(x[0]) and isfinite(x[1]) and isfinite(x[2])
 
 
@@ -52,12 +52,12 @@ def shadow(
     delta: np.ndarray,
     seq: np.ndarray,
 ) -> tuple[np.ndarray, float]:
-    """Synchronise the controller with telemetry at about 10 Hz; rows with nan are passed over.
+    """Synchronise the controller with telemetry at about 10 Hz; rows with nan are skipped.
 
     Args:
         par: parameters of any law, see `laws`
-        legs: route from the item in force at t[0], (m, 9)
-        start: point before the first leg, NED, (3,) [m]; nan: where the aircraft is
+        legs: route from the current item at t[0], (m, 9)
+        start: point before the first leg, NED, (3,) [m]; nan: aircraft position
         t: time (n,) [s]
         p, v: position and ground velocity, NED, (n, 3) [m, m/s]
         euler, rates: phi theta psi, p q r, (n, 3) [rad, rad/s]
@@ -67,7 +67,7 @@ def shadow(
         seq: reported mission item, (n,)
     Returns:
         ctl at t[n-1], (S.N_CTL,)
-        root mean square of replayed minus reported phi_c [rad]; nan where none was reported
+        root mean square of replayed minus reported phi_c [rad]; nan if none is reported
     """
     n = t.shape[0]
     ctl = np.zeros(S.N_CTL)
@@ -99,21 +99,21 @@ def shadow(
 
 @making
 def _mean(values: np.ndarray, otherwise: float) -> float:
-    """Return the mean of what is finite."""
+    """Return the mean of the finite values, or the default if there are none."""
     kept = values[np.isfinite(values)]
     return np.mean(kept) if kept.size else otherwise
 
 
 @making
 def _median(values: np.ndarray, otherwise: float) -> float:
-    """Return the median of what is finite; a surface's short kick at a misdated command leaves it alone."""
+    """Return the median of the finite values, robust to short peaks from commands with a wrong time stamp."""
     kept = values[np.isfinite(values)]
     return np.median(kept) if kept.size else otherwise
 
 
 @making
 def _usual(miss: np.ndarray) -> np.ndarray:
-    """Return the usual miss of pitch, throttle and surfaces; 0 where none is known, (5,)."""
+    """Return the typical residual of pitch, throttle and surfaces; 0 without data, (5,)."""
     out = np.empty(5)
     for j in range(5):
         out[j] = _mean(miss[:, j], 0.0) if j < 2 else _median(miss[:, j], 0.0)
@@ -122,7 +122,7 @@ def _usual(miss: np.ndarray) -> np.ndarray:
 
 @kernel
 def _force(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, seq: float, p: np.ndarray) -> None:
-    """Fly the item that the aircraft reports: no leg ahead of it, none behind."""
+    """Switch to the leg of the mission item that the aircraft reports."""
     i = leg_rules.current(ctl, legs)
     if i < 0 or not np.isfinite(seq) or legs[i, SEQ] == seq:
         return

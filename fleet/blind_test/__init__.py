@@ -1,1 +1,1 @@
-"""Blind test of the diagnosis: conceal, seal, diagnose, commit, open, score, report."""
+"""Blind test of the diagnosis: simulate, encrypt labels, diagnose, commit hashes, decrypt, score, report."""

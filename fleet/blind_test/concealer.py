@@ -1,4 +1,4 @@
-"""`python -m fleet.blind_test.concealer`: fly the flights of a blind test, seal their labels, exit."""
+"""`python -m fleet.blind_test.concealer`: simulate the flights of a blind test and encrypt their labels."""
 
 import argparse
 import json
@@ -14,9 +14,9 @@ _EVERY = 10
 
 
 def _progress(name: str, done: int, of: int) -> None:
-    """Say how far it is; the order of flights says nothing."""
+    """Log the number of flights done; the order of the flights is independent of their labels."""
     if done % _EVERY == 0 or done == of:
-        tell("prove", f"{done} of {of} flights flown")
+        tell("prove", f"{done} of {of} flights simulated")
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -26,7 +26,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Conceal and seal."""
+    """Simulate the flights and encrypt their labels."""
     parser = argparse.ArgumentParser(prog="python -m fleet.blind_test.concealer", description=__doc__)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--flights", type=int, required=True)

@@ -1,4 +1,4 @@
-"""The course of an examination: conceal and seal, calibrate and diagnose blindly, commit, open, mark."""
+"""Steps of a blind test: simulate, encrypt labels, calibrate, diagnose, commit hashes, decrypt labels, grade."""
 
 import json
 from collections.abc import Callable
@@ -16,7 +16,7 @@ Say = Callable[[str], None]
 
 
 class Ended(Exception):
-    """A step ended early; `code` is for the shell."""
+    """Signal that a step failed or was stopped; `code` is the exit status."""
 
     def __init__(self, code: int) -> None:
         super().__init__(code)
@@ -25,13 +25,13 @@ class Ended(Exception):
 
 @dataclass(frozen=True)
 class Paper:
-    """One examination.
+    """Configuration of one blind test.
 
     Attributes:
-        seed, flights: what to fly
-        folder: for recordings, labels sealed, models and reports
-        jobs: processes
-        pages: draw figures and pages of every flight too
+        seed, flights: seed of all random draws, number of flights
+        folder: output folder for recordings, encrypted labels, models and reports
+        jobs: number of processes
+        write_pages: also write figures and a page for every flight
     """
 
     seed: int
@@ -42,13 +42,13 @@ class Paper:
 
     @property
     def sealed(self) -> Path:
-        """Return the place of the sealed labels."""
+        """Return the path of the encrypted labels."""
         return self.folder / "labels.sealed"
 
 
 @dataclass(frozen=True)
 class Marked:
-    """What an examination gave: marks in order of flights, and the hashes promised before the seal was opened."""
+    """Result of a blind test: graded flights, and the hashes committed before the labels were decrypted."""
 
     marks: list[Mark]
     sealed: str
@@ -56,26 +56,26 @@ class Marked:
 
 
 def examine(paper: Paper, stop: Event, say: Say) -> Marked:
-    """Run an examination.
+    """Run a blind test.
 
     Raises:
         Ended: when a step fails or is stopped.
-        ValueError: when the sealed labels were changed on the way.
+        ValueError: when the encrypted labels or the reports changed after their hash was committed.
     """
     with TemporaryDirectory(prefix="parauav-key-") as elsewhere:
         key = Path(elsewhere) / "key"
         _conceal(paper, key, stop)
         sealed, secret = digest(paper.sealed), taken(key)
-    say(f"labels sealed, the key in this process alone: sha256 {sealed}")
+    say(f"labels encrypted, key only in this process: sha256 {sealed}")
     written = [_diagnose(paper, folder, stop, say) for folder in _airframes(paper.folder)]
     reports = digest(*written)
     say(f"reports committed: sha256 {reports}")
     labels: dict[str, Any] = json.loads(unseal(paper.sealed, secret, sealed))
-    say("seal opened, hash as promised")
+    say("labels decrypted, hash matches")
     (paper.folder / "labels.json").write_text(json.dumps(labels, indent=1) + "\n")
     if digest(*written) != reports:
         raise ValueError(
-            "reports: found them changed after the seal was opened, expected them as committed; start anew"
+            "reports: found them changed after the labels were decrypted, expected the committed hash; restart the test"
         )
     told = {one["flight"]: one for path in written for one in json.loads(path.read_text())}
     marks = [mark(name, label, told.get(name)) for name, label in labels.items() if label["role"] != "nominal"]
@@ -83,7 +83,7 @@ def examine(paper: Paper, stop: Event, say: Say) -> Marked:
 
 
 def _airframes(folder: Path) -> list[Path]:
-    """Return the folders of the airframes flown."""
+    """Return the folders of the simulated airframes."""
     return sorted(path.parent for path in folder.glob("*/*.card.json"))
 
 
@@ -100,10 +100,10 @@ def _diagnose(paper: Paper, folder: Path, stop: Event, say: Say) -> Path:
     say(f"{folder.name}: calibrating on {len(nominal)} nominal flights")
     card = folder / f"{folder.name}.card.json"
     _step(stop, "twin_worker.diagnosis.learn", f"--airframe={card}", f"--out={model}", "--", *nominal)
-    say(f"{folder.name}: diagnosing {len(unknown)} flights, blindly")
+    say(f"{folder.name}: diagnosing {len(unknown)} flights without labels")
     pages = [f"--report={folder / 'pages'}"] if paper.pages else []
     told = [f"--model={model}", f"--json={reports}", f"--jobs={paper.jobs}", *pages]
-    _step(stop, "twin_worker.diagnosis", *told, "--", *unknown, fine=(0, 1))  # a flight refused is marked as missed
+    _step(stop, "twin_worker.diagnosis", *told, "--", *unknown, fine=(0, 1))  # a rejected flight is graded as missed
     return reports
 
 

@@ -1,4 +1,4 @@
-"""Mark one report against its label: named, located, when, how much, how sure; what the scores are made of."""
+"""Grade one report against its label: names, location, onset, parameters and standard deviations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -6,7 +6,7 @@ from typing import Any
 
 _ACTUATOR = ("actuator", "pitch", "roll", "yaw")
 _LOADS = ("lift", "drag", "force_x", "force_z")
-CHANNELS: Mapping[str, tuple[str, ...]] = {  # where an effect may rightly be said to live
+CHANNELS: Mapping[str, tuple[str, ...]] = {  # effect: correct channels
     "wind_steady": ("air",),
     "wind_shear": ("air",),
     "turbulence": ("air",),
@@ -42,13 +42,13 @@ CHANNELS: Mapping[str, tuple[str, ...]] = {  # where an effect may rightly be sa
     "heading_bias": ("heading",),
     "baro_bias": ("baro",),
 }
-_SPAN_DEG = 45.0  # a direction so far off is as wrong as a size of nothing
-_LEAST = {"density_ratio": 0.01, "scale": 0.01}  # of a ratio's distance from one
+_SPAN_DEG = 45.0  # direction error that counts as an error of 100 %
+_LEAST = {"density_ratio": 0.01, "scale": 0.01}  # smallest |ratio - 1| used as denominator
 
 
 @dataclass(frozen=True)
 class Size:
-    """One number told: its name, what was concealed, what was told, its standard deviation; None where not told."""
+    """One parameter: name, true value, reported value and its standard deviation; None where not reported."""
 
     name: str
     truth: float
@@ -57,7 +57,7 @@ class Size:
 
     @property
     def error(self) -> float:
-        """Return the error as a share of what was concealed; directions by 45 degrees, small angles by one."""
+        """Return the error relative to the true value; directions relative to 45 degrees, small angles to 1 degree."""
         if self.told is None:
             return 1.0
         if self.name == "from_deg":
@@ -69,30 +69,30 @@ class Size:
 
     @property
     def away(self) -> float:
-        """Return how far what was told is from the truth; directions on the circle."""
+        """Return |reported - true|; directions modulo 360 degrees."""
         off = (self.told or 0.0) - self.truth
         return abs((off + 180.0) % 360.0 - 180.0 if self.name == "from_deg" else off)
 
     @property
     def covered(self) -> bool | None:
-        """Return whether the truth lies within two standard deviations; None where none was told."""
+        """Return whether the true value lies within two standard deviations; None where none is reported."""
         return self.away <= 2.0 * self.sigma if self.sigma else None
 
 
 @dataclass(frozen=True)
 class Mark:
-    """What became of one flight.
+    """Grade of one flight.
 
     Attributes:
         flight, airframe, role: nominal, control, single, compound or unknown
-        concealed, named: names of effects, the latter best first
-        verdict: none, named or unknown; sentence: as reported
-        rivals: of each named one
-        late: onset told after the true one, by effect and whether a ramp's share excuses it  [s]
-        sizes: numbers of effects rightly named
-        located, surfaces: rightly or not, of effects rightly named
-        before, after: fit on held-out blocks, None where nothing was named
-        acts: how much the effect shows, in standard deviations of the sensors
+        concealed, named: names of the true and of the reported effects, reported best first
+        verdict: none, named or unknown; sentence: summary of the report
+        rivals: equivalent effects of each named one
+        late: reported minus true onset and its tolerance, for each effect [s]
+        sizes: parameters of correctly named effects
+        located, surfaces: whether channel and surface are correct, for correctly named effects
+        before, after: residual on held-out blocks, None where nothing was named
+        acts: strength of the effect in standard deviations of the sensors
     """
 
     flight: str
@@ -113,12 +113,12 @@ class Mark:
 
     @property
     def said(self) -> tuple[str, ...]:
-        """Return the names, or what was said instead of any."""
+        """Return the reported names, else `unknown` or `nothing`."""
         return self.named or ("unknown" if self.verdict == "unknown" else "nothing",)
 
     @property
     def hit(self) -> bool:
-        """Return whether it was answered as well as can be."""
+        """Return whether the report is correct for the role of the flight."""
         if self.role == "control":
             return not self.named and self.verdict != "unknown"
         if self.role == "unknown":
@@ -129,13 +129,13 @@ class Mark:
 
     @property
     def in_class(self) -> bool:
-        """Return whether a single effect is the first name or one that cannot be told from it."""
+        """Return whether a single effect is the first name or equivalent to it."""
         return self.hit or (bool(self.named) and self.concealed[0] in self.rivals[0])
 
 
 def mark(flight: str, label: Mapping[str, Any], report: Mapping[str, Any] | None) -> Mark:
-    """Mark one report; a flight without a report was given up."""
-    said = report or {"verdict": "none", "sentence": "no report: the flight was refused", "named": []}
+    """Grade one report; a flight without a report was rejected."""
+    said = report or {"verdict": "none", "sentence": "no report: the flight was rejected", "named": []}
     named = tuple(name.split(":")[0] for name in said["named"])
     late, sizes, located, surfaces = [], [], [], []
     for effect in label["effects"]:

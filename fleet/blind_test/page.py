@@ -1,4 +1,4 @@
-"""An examination as a page: hashes, scores, misses first, what was taken for what; each flight's own page behind it."""
+"""HTML page of a blind test: hashes, scores, flights with misses first, confusion matrix, links to flight pages."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -11,15 +11,15 @@ from fleet.blind_test.shown import confusion, fit, numbers, ordered
 from fleet.report.html import document, safe
 
 _HOW = (
-    "Every flight was flown by JSBSim, with effects made by its own physics or by faults of servos and sensors that "
-    "share no code with the diagnosis. The labels were encrypted, their hash printed; the reports were written and "
-    "their hash printed; only then was the seal opened."
+    "JSBSim simulates every flight. The effects come from its own physics or from faults of servos and sensors that "
+    "share no code with the diagnosis. The labels are encrypted and their hash is printed. The reports are written and "
+    "their hash is printed. Only then are the labels decrypted."
 )
 
 
 def write(paper: Paper, marked: Marked, scores: Mapping[str, Any]) -> Path:
     """Write `index.html`; return its path."""
-    title = f"Blind examination of {len(marked.marks)} flights, seed {paper.seed}"
+    title = f"Blind test of {len(marked.marks)} flights, seed {paper.seed}"
     body = "\n".join(
         (
             f"<h1>{title}</h1><p>{_HOW}</p>",
@@ -36,7 +36,7 @@ def write(paper: Paper, marked: Marked, scores: Mapping[str, Any]) -> Path:
 
 
 def _scores(scores: Mapping[str, Any]) -> str:
-    """Show each score beside what was asked."""
+    """Show each score beside its requirement."""
     cards = []
     for one in lines(scores):
         chip = '<span class="chip none">met</span>' if one.met else '<span class="chip named">missed</span>'
@@ -45,13 +45,13 @@ def _scores(scores: Mapping[str, Any]) -> str:
 
 
 def _flights(marks: Sequence[Mark]) -> str:
-    heads = ("", "flight", "concealed", "named", "told (true)", "onset", "held-out residual", "in a sentence")
+    heads = ("", "flight", "concealed", "named", "reported (true)", "onset", "held-out residual", "summary")
     head = "".join(f"<th>{word}</th>" for word in heads)
     return f'<table class="all"><tr>{head}</tr>{"".join(map(_flight, ordered(marks)))}</table>'
 
 
 def _flight(one: Mark) -> str:
-    chip = '<span class="chip none">right</span>' if one.hit else '<span class="chip named">miss</span>'
+    chip = '<span class="chip none">correct</span>' if one.hit else '<span class="chip named">miss</span>'
     cells = (
         chip,
         f'<a href="{one.airframe}/pages/{one.flight}.html">{safe(one.flight)}</a><br>{safe(one.airframe)}',
@@ -66,12 +66,12 @@ def _flight(one: Mark) -> str:
 
 
 def _confusion(marks: Sequence[Mark]) -> str:
-    """Show what was concealed against what was said, darker where it is wrong and frequent."""
+    """Show the confusion matrix of true and reported effects."""
     pairs = confusion(marks)
     rows, columns = (sorted({pair[i] for pair in pairs}) for i in (0, 1))
     head = "".join(f'<th class="up">{safe(name)}</th>' for name in columns)
     body = "".join(f"<tr><th>{safe(row)}</th>{''.join(_cells(row, columns, pairs))}</tr>" for row in rows)
-    return f'<h3>Concealed (rows) and said (columns)</h3><table class="grid"><tr><th></th>{head}</tr>{body}</table>'
+    return f'<h3>Concealed (rows) and reported (columns)</h3><table class="grid"><tr><th></th>{head}</tr>{body}</table>'
 
 
 def _cells(row: str, columns: Sequence[str], pairs: Mapping[tuple[str, str], int]) -> Iterator[str]:

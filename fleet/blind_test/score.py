@@ -1,4 +1,4 @@
-"""The scores of an examination, and what was asked of each."""
+"""Scores of a blind test and the requirement for each."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
@@ -11,24 +11,24 @@ from fleet.blind_test.mark import Mark
 _SAME = {("thrust_asymmetry", "thrust_loss"), ("stall", "drag_increase"), ("ground_effect", "drag_increase")}
 _PROMPT_S = 5.0
 
-ASKED = {  # score: least or most, and in words
+ASKED = {  # score: bound and meaning
     "top1_naming": (0.88, "single effects named first"),
-    "in_class": (0.94, "single effects named or in the class told"),
+    "in_class": (0.94, "single effects named or in the reported equivalence class"),
     "false_alarm": (-1 / 60, "controls with an alarm"),
     "compound_recall": (0.85, "effects of compound flights named"),
-    "compound_extra_per_flight": (-0.2, "wrong names on a compound flight"),
-    "unknown_abstained": (12 / 14, "effects outside the catalogue called unknown"),
-    "magnitude_median_err": (-0.05, "error of the numbers told, median"),
-    "onset_within_5s": (0.9, "onsets told within 5 s"),
-    "sigma2_coverage": (0.85, "truths within two standard deviations"),
-    "class_size_median": (-2.0, "names that cannot be told apart, median"),
-    "named_improving": (1.0, "named flights whose held-out fit improves"),
+    "compound_extra_per_flight": (-0.2, "wrong names per compound flight"),
+    "unknown_abstained": (12 / 14, "effects outside the catalogue reported as unknown"),
+    "magnitude_median_err": (-0.05, "relative error of reported parameters, median"),
+    "onset_within_5s": (0.9, "onsets reported within 5 s"),
+    "sigma2_coverage": (0.85, "true values within two standard deviations"),
+    "class_size_median": (-2.0, "size of the equivalence class, median"),
+    "named_improving": (1.0, "named flights whose held-out residual decreases"),
 }
-"""What is asked: at least, or with a minus sign at most."""
+"""Bounds: a positive value is a minimum, a negative value the negative of a maximum."""
 
 
 class Line(NamedTuple):
-    """One score beside what was asked, in words."""
+    """One score with its meaning and requirement, formatted."""
 
     met: bool
     words: str
@@ -37,23 +37,23 @@ class Line(NamedTuple):
 
 
 def lines(scores: Mapping[str, Any]) -> list[Line]:
-    """Lay out what was asked and reached."""
+    """Format every score with its requirement."""
     out = []
     for name, (asked, words) in ASKED.items():
         value = scores[name]
         bound = f"at most {-asked:.3g}" if asked < 0 else f"at least {asked:.3g}"
-        out.append(Line(met(name, value), words, bound, "nothing to score" if value is None else f"{value:.3g}"))
+        out.append(Line(met(name, value), words, bound, "no data" if value is None else f"{value:.3g}"))
     return out
 
 
 def met(name: str, value: float | None) -> bool:
-    """Return whether a score is as asked; one that nothing was there for is."""
+    """Return whether a score meets its requirement; a score without data does."""
     asked = ASKED[name][0]
     return value is None or (value <= -asked + 1e-9 if asked < 0 else value >= asked - 1e-9)
 
 
 def score(marks: Sequence[Mark]) -> dict[str, Any]:
-    """Score; None where nothing was there to be scored."""
+    """Compute all scores; None where no flight contributes."""
     role = {kind: [one for one in marks if one.role == kind] for kind in ("control", "single", "compound", "unknown")}
     sizes = [size for one in marks for _, size in one.sizes]
     errors = [size.error for size in sizes]

@@ -1,4 +1,4 @@
-"""A sealed letter: encrypted with a key that is kept elsewhere, known by its hash before anybody can read it."""
+"""Encryption of the labels: the key is stored apart, and the hash is published before decryption."""
 
 import hashlib
 import os
@@ -11,7 +11,7 @@ from fleet.process import private_files
 
 
 def digest(*paths: Path) -> str:
-    """Return the SHA-256 of files, one after the other."""
+    """Return the SHA-256 of the concatenated files."""
     told = hashlib.sha256()
     for path in paths:
         told.update(path.read_bytes())
@@ -19,24 +19,24 @@ def digest(*paths: Path) -> str:
 
 
 def seal(words: bytes, sealed: Path, key: Path) -> None:
-    """Encrypt into `sealed`, and put the key where only its owner reads it."""
+    """Encrypt data into a file and write the key to a file that only its owner can read."""
     secret = Fernet.generate_key()
     private_files.write(key, secret)
     sealed.write_bytes(Fernet(secret).encrypt(words))
 
 
 def taken(key: Path) -> bytes:
-    """Read a key and remove its file, so that no process that begins later can read it.
+    """Read a key and delete its file, so that no later process can read it.
 
     Raises:
-        ValueError: when others could have read or changed it.
+        ValueError: when other users could have read or changed it.
         OSError: when it cannot be read.
     """
     found = key.lstat()
     mode = stat.S_IMODE(found.st_mode)
     if not stat.S_ISREG(found.st_mode) or mode & 0o077 or found.st_uid != os.geteuid():
         raise ValueError(
-            f"{key}: found mode {mode:04o}, owner {found.st_uid}, expected a file for its owner alone; start anew"
+            f"{key}: found mode {mode:04o}, owner {found.st_uid}, expected a file for its owner only; restart the test"
         )
     secret = key.read_bytes()
     key.unlink()
@@ -44,14 +44,16 @@ def taken(key: Path) -> bytes:
 
 
 def unseal(sealed: Path, key: bytes, promised: str) -> bytes:
-    """Open a seal.
+    """Decrypt a file.
 
     Raises:
-        ValueError: when the letter is not the one whose hash was promised, or the key does not fit.
+        ValueError: when the file does not have the committed hash, or the key does not match.
     """
     if digest(sealed) != promised:
-        raise ValueError(f"{sealed.name}: found another hash than {promised[:16]}…, expected the labels; start anew")
+        raise ValueError(
+            f"{sealed.name}: found another hash than {promised[:16]}…, expected the labels; restart the test"
+        )
     try:
         return Fernet(key.strip()).decrypt(sealed.read_bytes())
     except (InvalidToken, ValueError):
-        raise ValueError(f"{sealed.name}: found a key of another seal, expected its own; start anew") from None
+        raise ValueError(f"{sealed.name}: found a wrong key, expected its own; restart the test") from None

@@ -1,4 +1,4 @@
-"""An examination as people read it in a terminal, and as other tools read it."""
+"""Result of a blind test as terminal tables and as JSON values."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from fleet.blind_test.score import ASKED, lines, met
 
 
 def written(paper: Paper, marked: Marked, scores: Mapping[str, Any]) -> dict[str, Any]:
-    """Return everything as plain values: the scores by their names, then hashes, what was asked, every flight."""
+    """Return the result as JSON values: scores, hashes, requirements met, confusion counts, every flight."""
     return {
         **scores,
         "seed": paper.seed,
@@ -29,7 +29,7 @@ def written(paper: Paper, marked: Marked, scores: Mapping[str, Any]) -> dict[str
 
 
 def confusion(marks: Sequence[Mark]) -> Counter[tuple[str, str]]:
-    """Count what was concealed against what was said: pairs of names, one for each effect concealed or said."""
+    """Count pairs of true and reported names, one pair for each true or reported effect."""
     pairs: Counter[tuple[str, str]] = Counter()
     for one in marks:
         right = set(one.concealed) & set(one.named)
@@ -45,18 +45,18 @@ def confusion(marks: Sequence[Mark]) -> Counter[tuple[str, str]]:
 
 
 def ordered(marks: Sequence[Mark]) -> list[Mark]:
-    """Put misses first."""
+    """Sort the flights, misses first."""
     return sorted(marks, key=lambda one: (one.hit, one.role, one.concealed, one.flight))
 
 
 def table(marks: Sequence[Mark], scores: Mapping[str, Any]) -> RenderableType:
-    """Lay out the flights, misses first, then the scores."""
+    """Render the flights, misses first, and the scores."""
     return Group(_flights(marks), Text(""), _scores(scores))
 
 
 def _flights(marks: Sequence[Mark]) -> Table:
     out = Table(box=None, pad_edge=False)
-    for heading in ("", "flight", "concealed", "named", "told (true)", "onset", "held out"):
+    for heading in ("", "flight", "concealed", "named", "reported (true)", "onset", "held out"):
         out.add_column(heading, overflow="fold")
     for one in ordered(marks):
         out.add_row(
@@ -72,23 +72,23 @@ def _flights(marks: Sequence[Mark]) -> Table:
 
 
 def numbers(one: Mark) -> list[str]:
-    """Say each number told, its doubt, and the truth."""
+    """Format each parameter: reported value, standard deviation and true value."""
     out = []
     for _, size in one.sizes:
-        told = "not told" if size.told is None else f"{size.told:.3g}"
+        told = "not reported" if size.told is None else f"{size.told:.3g}"
         doubt = f" ± {size.sigma:.2g}" if size.sigma else ""
         out.append(f"{size.name} {told}{doubt} ({size.truth:.3g})")
     return out
 
 
 def fit(one: Mark) -> str:
-    """Say the fit on held-out blocks before and after."""
+    """Format the residual on held-out blocks before and after."""
     return f"{one.before:.2f} → {one.after:.2f}" if one.before and one.after is not None else ""
 
 
 def _scores(scores: Mapping[str, Any]) -> Table:
     out = Table(box=None, pad_edge=False)
-    for heading in ("", "score", "asked", "reached"):
+    for heading in ("", "score", "required", "achieved"):
         out.add_column(heading)
     for one in lines(scores):
         out.add_row(Text("met", "green") if one.met else Text("missed", "red"), one.words, one.asked, one.reached)

@@ -1,15 +1,15 @@
-"""Effects: physics a simulation may lack, one candidate a file; all parameters zero means exactly nothing.
+"""Effects: candidates for missing physics, one file each; with all parameters zero an effect changes nothing.
 
-An effect acts at one stage of the loop, on numbers and on whole series alike, so the same function simulates it,
-gives its signature and is fitted to a flight:
+An effect acts at one stage of the loop, on scalars and on time series, so the same function serves simulation,
+signature and parameter estimation:
 
-    delta    act(u, memory, dt, par): what the servo does to a series of commands, in place; compiled, keeps memory
-    air      act(flow, *par): wind added, air density
+    delta    act(u, memory, dt, par): servo response to a series of commands, in place; compiled, stateful
+    air      act(flow, *par): increments of wind and air density
     wrench   act(flow, *par): increments of coefficients, thrust, moments
     mass     act(flow, *par): mass, centre of gravity
-    sensor   act(readings, *par): readings changed; `act` of minus the parameters undoes it
+    sensor   act(readings, *par): changed readings; `act` with negated parameters is the inverse
 
-An onset (step, ramp, bump) multiplies the parameters and is no business of the effect. A newcomer adds a file.
+An onset (step, ramp, bump) scales the parameters outside the effect. To add an effect, add a file.
 """
 
 import importlib.util
@@ -27,16 +27,16 @@ import numpy as np
 
 SURFACES = ("aileron", "elevator", "rudder")
 ALL_SURFACES = "all surfaces"
-MEMORY = 32  # numbers a servo may remember
-FOLDERS = "PARAUAV_EFFECTS"  # more folders of effects, separated like PATH
+MEMORY = 32  # state variables of a servo
+FOLDERS = "PARAUAV_EFFECTS"  # environment variable: further folders of effects, separated like PATH
 
 INCREMENTS: dict[str, str] = {
     "w_n": "wind, the direction it blows to, north [m/s]",
     "w_e": "the same, east [m/s]",
     "w_d": "the same, down [m/s]",
-    "rho": "air density, share added [-]",
-    "thrust": "thrust, share added [-]",
-    "lift": "lift coefficient, share added [-]",
+    "rho": "air density, relative increment [-]",
+    "thrust": "thrust, relative increment [-]",
+    "lift": "lift coefficient, relative increment [-]",
     "C_L": "lift coefficient added [-]",
     "C_D": "drag coefficient added [-]",
     "C_Y": "side force coefficient added [-]",
@@ -46,22 +46,22 @@ INCREMENTS: dict[str, str] = {
     "L": "rolling moment added [N m]",
     "M": "pitching moment added [N m]",
     "N": "yawing moment added [N m]",
-    "mass": "mass, share added [-]",
+    "mass": "mass, relative increment [-]",
     "x_cg": "centre of gravity moved forward [m]",
     "y_cg": "centre of gravity moved right [m]",
 }
-"""What `act` of an air, wrench or mass effect may return."""
+"""Increments that `act` of an air, wrench or mass effect may return."""
 
 READINGS = (
     *("v_n", "v_e", "v_d", "h", "phi", "theta", "psi", "p", "q", "r"),
     *("a_x", "a_y", "a_z", "Va", "baro"),
 )
-"""What a sensor effect may change: NED velocity [m/s], height [m], attitude [rad], gyros [rad/s], specific force FRD
-[m/s2], indicated airspeed [m/s], height by static pressure [m]; each (n,), beside `t` (n,) [s]."""
+"""Readings that a sensor effect may change: NED velocity [m/s], height [m], attitude [rad], gyros [rad/s], specific
+force FRD [m/s2], indicated airspeed [m/s], pressure height [m]; each (n,), with `t` (n,) [s]."""
 
 
 class Stage(StrEnum):
-    """Where in the loop an effect acts."""
+    """Stage of the loop at which an effect acts."""
 
     DELTA = "delta"
     AIR = "air"
@@ -71,7 +71,7 @@ class Stage(StrEnum):
 
 
 class Onset(StrEnum):
-    """How an effect may come: from the start, at once, growing, or passing by."""
+    """Time profile of an effect: constant, step, ramp or transient."""
 
     ALWAYS = "always"
     STEP = "step"
@@ -81,15 +81,15 @@ class Onset(StrEnum):
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an effect; zero means nothing.
+    """One parameter of an effect; zero means no effect.
 
     Attributes:
-        name: as it is reported, with its unit as a suffix
-        unit, meaning: for people
-        step: a change that shows but is small, for slopes
-        low, high: what is physically possible
-        aside: it comes along with the others and is no evidence: where a force acts is seldom known
-        least: what is smaller would be another effect
+        name: reported name, with its unit as a suffix
+        unit, meaning: for display
+        step: small observable change, for numerical derivatives
+        low, high: physical limits
+        aside: nuisance parameter, estimated with the others but no evidence, e.g. an unknown point of application
+        least: minimum magnitude; a smaller value indicates another effect
     """
 
     name: str
@@ -104,11 +104,11 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Body:
-    """What an effect may know of the aircraft; without a card a unit body, whose numbers mean shares.
+    """Airframe data for effects; the default is a unit body, with which parameters are relative values.
 
     Attributes:
         mass [kg], S [m2], b [m], c [m], D: propeller diameter [m]
-        lag: of the healthy servos [s]
+        lag: time constant of the healthy servos [s]
     """
 
     mass: float = 1.0
@@ -121,15 +121,15 @@ class Body:
 
 @dataclass
 class Flow:
-    """The air and the aircraft in it, as an effect sees them: numbers or series.
+    """State of air and aircraft as input of an effect: scalars or time series.
 
     Attributes:
         t: since the start of the flight [s]; h: above mean sea level, height: above the ground at the start [m]
         Va, alpha, beta: true airspeed [m/s] and flow angles [rad]; p q r: body rates [rad/s]
         rho: air density [kg/m3]; q_bar: dynamic pressure [Pa]
-        T: thrust of the healthy engine [N]; used: throttle integrated over time [s]; delta_t: throttle [-]
-        C_L: lift coefficient of the clean aircraft; pitch, yaw: its C_m by elevator and C_n by rudder [-]
-        body: the aircraft
+        T: thrust of the healthy engine [N]; throttle_time: integral of throttle [s]; delta_t: throttle [-]
+        C_L: lift coefficient of the clean aircraft; C_m_elevator, C_n_rudder: moments of the deflected surfaces [-]
+        body: airframe data
     """
 
     t: Any
@@ -161,20 +161,20 @@ class Effect:
     """One candidate for missing physics.
 
     Attributes:
-        name: the file's
-        stage: where it acts
-        channel: where it lives, in a word: air, actuator, roll, pitch, yaw, thrust, drag, lift, mass, airspeed, …
-        equation, source: for people
-        parameters: its numbers
-        act: see the stages above
-        told: `(effect, par, body)` to the numbers people want, by name with unit
-        onsets: how it may come
-        of: what it may befall, e.g. one of the surfaces; empty: the aircraft. Passed to `act` as `of=`, not for delta
-        starts: parameters to begin the search from where the slope at zero tells nothing
+        name: file name without suffix
+        stage: stage of the loop at which it acts
+        channel: affected part, one of air, actuator, roll, pitch, yaw, thrust, drag, lift, mass, airspeed, …
+        equation, source: for display
+        parameters: parameters in the order of `act`
+        act: function of the stage, see the module docstring
+        reported: `(effect, par, body)` to reported values by name with unit
+        onsets: possible time profiles
+        targets: affected parts, e.g. surfaces; empty: the aircraft. Passed to `act` as `of=`, except at stage delta
+        initial_guesses: start values of the search where the slope at zero is uninformative
         examples: three magnitudes, small to large
-        confused: effect -> what tells them apart
-        variance: it shows in the scatter of residuals, not in their mean
-        takes_lag: its first parameter adds to the healthy servo's lag, and it stands for both
+        confusable_with: effect -> distinguishing feature
+        variance: it changes the variance of residuals, not their mean
+        takes_lag: its first parameter adds to the healthy servo's lag, and the effect models both
     """
 
     name: str
@@ -200,16 +200,16 @@ class Effect:
 
     @property
     def price(self) -> int:
-        """Return the number of parameters that are evidence."""
+        """Return the number of parameters without nuisance parameters."""
         return sum(not p.aside for p in self.parameters)
 
 
 @cache
 def catalogue(folders: str | None = None) -> dict[str, Effect]:
-    """List the effects by name: the files beside this one, and those in `folders`, or those $PARAUAV_EFFECTS names.
+    """Return the effects by name: files of this package and of `folders`, by default those in $PARAUAV_EFFECTS.
 
     Raises:
-        ValueError: when a file holds no EFFECT of its own name.
+        ValueError: when a file defines no EFFECT with the name of the file.
     """
     named = os.environ.get(FOLDERS, "") if folders is None else folders
     homes = [Path(__file__).parent, *map(Path, filter(None, named.split(os.pathsep)))]
@@ -222,7 +222,7 @@ def _read(path: Path) -> Effect:
     module = importlib.import_module(f"{__name__}.{path.stem}") if own else _load(path)
     effect = getattr(module, "EFFECT", None)
     if not isinstance(effect, Effect) or effect.name != path.stem:
-        raise ValueError(f"{path.name}: found no EFFECT named {path.stem!r}, expected one; name it as the file")
+        raise ValueError(f"{path.name}: found no EFFECT named {path.stem!r}, expected one; name it like the file")
     return effect
 
 
@@ -234,5 +234,5 @@ def _load(path: Path) -> ModuleType:
     try:
         spec.loader.exec_module(module)
     except Exception as error:
-        raise ValueError(f"{path}: found {error!r} on reading it, expected an effect; mend the file") from None
+        raise ValueError(f"{path}: found {error!r} on import, expected an effect; correct the file") from None
     return module

@@ -1,4 +1,4 @@
-"""An accelerometer that reads a force where there is none: temperature, a mount under stress."""
+"""Accelerometer with a constant error: temperature, mount under stress."""
 
 from typing import Any
 
@@ -22,8 +22,8 @@ EFFECT = Effect(
     of=("x", "y", "z"),
     examples=((0.2,), (-0.4,), (0.8,)),
     confused={
-        "imu_misalignment": "turns with what is felt: fly turns and pull-ups",
-        "mass_change": "follows the load, and leaves what the velocity says: fly turns",
-        "drag_increase": "slows the aircraft, a bias only says so",
+        "imu_misalignment": "follows the specific force: fly turns and pull-ups",
+        "mass_change": "follows the load factor and is absent from the measured velocity: fly turns",
+        "drag_increase": "decelerates the aircraft, a bias does not",
     },
 )

@@ -1,4 +1,4 @@
-"""A servo that answers late: a slow link, a busy flight controller, a bus with a queue."""
+"""Servo with a delay: slow link, busy flight controller, bus with a queue."""
 
 import numpy as np
 
@@ -8,13 +8,13 @@ from fleet.physics.kernel import kernel
 
 @kernel
 def act(u: np.ndarray, memory: np.ndarray, dt: float, par: np.ndarray) -> None:
-    """Delay the commands, linearly between two remembered ones; memory[k] is the command k samples ago."""
+    """Delay the commands with linear interpolation; memory[k] is the command k samples ago."""
     last = len(memory) - 1
     for i in range(len(u)):
         for k in range(last, 0, -1):
             memory[k] = memory[k - 1]
         memory[0] = u[i]
-        steps = min(max(par[0, i] / dt, 0.0), float(last))  # what is older than the memory is forgotten
+        steps = min(max(par[0, i] / dt, 0.0), float(last))  # limited to the buffer length
         k = min(int(steps), last - 1)
         u[i] = memory[k] + (steps - k) * (memory[k + 1] - memory[k])
 
@@ -31,7 +31,7 @@ EFFECT = Effect(
     starts=((0.06,), (0.12,), (0.2,), (0.3,), (0.45,)),
     examples=((0.08,), (0.15,), (0.3,)),
     confused={
-        "actuator_lag": "alike at low frequency: fly sharp inputs",
+        "actuator_lag": "equal at low frequency: fly sharp inputs",
         "actuator_rate_limit": "a delay is the same for small and large inputs",
     },
 )

@@ -1,4 +1,4 @@
-"""A slow servo: a further first-order lag between command and surface."""
+"""Slow servo: an additional first-order lag between command and surface."""
 
 from math import exp
 
@@ -10,7 +10,7 @@ from fleet.physics.kernel import kernel
 
 @kernel
 def act(u: np.ndarray, memory: np.ndarray, dt: float, par: np.ndarray) -> None:
-    """Lag the commands, straight between two of them; memory: the surface, and the command before."""
+    """Apply a first-order lag to linearly interpolated commands; memory: surface position, previous command."""
     for i in range(len(u)):
         tau, now = par[0, i], u[i]
         if tau > 0.0:
@@ -21,7 +21,7 @@ def act(u: np.ndarray, memory: np.ndarray, dt: float, par: np.ndarray) -> None:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Return the whole lag, that of the healthy servo included."""
+    """Return the total lag, including that of the healthy servo."""
     return {"tau_s": float(par[0]) + body.lag}
 
 
@@ -38,5 +38,8 @@ EFFECT = Effect(
     of=(*SURFACES, ALL_SURFACES),
     starts=((0.06,), (0.12,), (0.2,), (0.3,), (0.45,), (0.7,)),
     examples=((0.15,), (0.25,), (0.5,)),
-    confused={"actuator_delay": "alike at low frequency: fly sharp inputs", "actuator_rate_limit": "large inputs"},
+    confused={
+        "actuator_delay": "equal at low frequency: fly sharp inputs",
+        "actuator_rate_limit": "affects large inputs",
+    },
 )

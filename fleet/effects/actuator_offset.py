@@ -1,4 +1,4 @@
-"""A surface beside where it should be: a bent rod, a spline set one tooth wrong, a trim lost."""
+"""Surface with a constant offset: bent rod, spline one tooth off, lost trim."""
 
 import numpy as np
 
@@ -24,10 +24,10 @@ EFFECT = Effect(
     of=SURFACES,
     examples=((0.05,), (-0.1,), (0.18,)),
     confused={
-        "actuator_stuck": "a stuck surface no longer answers: fly inputs",
-        "cg_shift": "an offset grows with dynamic pressure, weight does not: fly at two speeds",
-        "cg_shift_side": "an offset grows with dynamic pressure, weight does not: fly at two speeds",
-        "thrust_asymmetry": "a moment of thrust follows the throttle",
-        "prop_torque": "a moment of the propeller follows the throttle",
+        "actuator_stuck": "a stuck surface does not respond: fly inputs",
+        "cg_shift": "its moment does not grow with dynamic pressure: fly at two speeds",
+        "cg_shift_side": "its moment does not grow with dynamic pressure: fly at two speeds",
+        "thrust_asymmetry": "its moment follows the throttle",
+        "prop_torque": "its moment follows the throttle",
     },
 )

@@ -1,4 +1,4 @@
-"""A servo that cannot turn fast enough: low voltage, a heavy load, a worn gear."""
+"""Servo with a low maximum rate: low voltage, heavy load, worn gear."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from fleet.physics.kernel import kernel
 
 @kernel
 def act(u: np.ndarray, memory: np.ndarray, dt: float, par: np.ndarray) -> None:
-    """Limit the change from sample to sample; memory[0] is the surface."""
+    """Limit the change per sample; memory[0] is the surface position."""
     for i in range(len(u)):
         slow = par[0, i]
         if slow > 0.0:
@@ -17,7 +17,7 @@ def act(u: np.ndarray, memory: np.ndarray, dt: float, par: np.ndarray) -> None:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Return the rate itself."""
+    """Return the maximum rate."""
     return {"rate_per_s": 1.0 / float(par[0]) if par[0] > 0.0 else float("inf")}
 
 
@@ -36,6 +36,6 @@ EFFECT = Effect(
     confused={
         "actuator_lag": "a lag slows small inputs as much as large ones",
         "actuator_delay": "a delay is the same for small and large inputs",
-        "actuator_deadband": "play loses small movements, a limit large ones",
+        "actuator_deadband": "backlash attenuates small movements, a rate limit large ones",
     },
 )

@@ -1,4 +1,4 @@
-"""Travel lost at both ends: a stop that came loose, a horn that binds, end points set too narrow."""
+"""Reduced travel at both ends: loose stop, binding horn, end points set too narrow."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from fleet.physics.kernel import kernel
 
 @kernel
 def act(u: np.ndarray, memory: np.ndarray, dt: float, par: np.ndarray) -> None:
-    """Clip the commands to what travel is left."""
+    """Clip the commands to the remaining travel."""
     for i in range(len(u)):
         if par[0, i] > 0.0:
             u[i] = min(max(u[i], par[0, i] - 1.0), 1.0 - par[0, i])
@@ -20,14 +20,14 @@ EFFECT = Effect(
     channel="actuator",
     equation="|delta| <= 1 - lost",
     source="Stevens, Lewis & Johnson 2016, section 3.5 (limits of actuators)",
-    parameters=(Parameter("lost", "-", "travel lost at either end", step=0.1, low=0.0, high=0.99),),
+    parameters=(Parameter("lost", "-", "travel lost at each end", step=0.1, low=0.0, high=0.99),),
     act=act,
     of=SURFACES,
     starts=((0.5,), (0.6,), (0.7,), (0.8,), (0.88,), (0.94,)),
     examples=((0.6,), (0.75,), (0.85,)),
     confused={
-        "control_effectiveness_loss": "a share is lost of small and large movements alike",
-        "actuator_rate_limit": "a limit of travel holds for slow inputs too",
-        "actuator_stuck": "a stuck surface loses small movements too",
+        "control_effectiveness_loss": "the same fraction of small and large movements is lost",
+        "actuator_rate_limit": "a travel limit affects slow inputs too",
+        "actuator_stuck": "a stuck surface does not follow small movements either",
     },
 )

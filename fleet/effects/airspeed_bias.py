@@ -1,4 +1,4 @@
-"""An airspeed sensor that reads too much or too little by a constant: its zero was taken in wind."""
+"""Airspeed sensor with a constant error: zero calibrated in wind."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ EFFECT = Effect(
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((1.0,), (-2.0,), (4.0,)),
     confused={
-        "airspeed_scale": "a share grows with speed: fly at two speeds",
+        "airspeed_scale": "a scale error grows with speed: fly at two speeds",
         "wind_steady": "wind depends on heading: fly a full turn",
     },
 )

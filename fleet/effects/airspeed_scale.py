@@ -1,4 +1,4 @@
-"""An airspeed sensor that reads too much or too little by a share: a wrong ratio, a leak, ice on the tube."""
+"""Airspeed sensor with a scale error: wrong ratio, leak, ice on the pitot tube."""
 
 from math import exp
 from typing import Any
@@ -9,12 +9,12 @@ from fleet.effects import Body, Effect, Onset, Parameter, Stage
 
 
 def act(readings: dict[str, Any], log_scale: Any) -> dict[str, Any]:
-    """Scale the reading; the logarithm is undone by its negative."""
+    """Scale the reading by exp(log_scale), so that the negated parameter is the inverse."""
     return {"Va": readings["Va"] * np.exp(log_scale)}
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Return the scale itself."""
+    """Return the scale."""
     return {"scale": exp(float(par[0]))}
 
 
@@ -30,7 +30,7 @@ EFFECT = Effect(
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((-0.05,), (0.1,), (-0.2,)),
     confused={
-        "airspeed_bias": "a share grows with speed: fly at two speeds",
-        "air_density": "thin air takes moments and forces along, the sensor does not",
+        "airspeed_bias": "a scale error grows with speed: fly at two speeds",
+        "air_density": "low density reduces moments and forces too, a sensor error does not",
     },
 )

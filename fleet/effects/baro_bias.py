@@ -1,4 +1,4 @@
-"""A height by static pressure that is off: a blocked port, a wrong pressure setting, weather that moved on."""
+"""Pressure height with a constant error: blocked port, wrong pressure setting, changed weather."""
 
 from typing import Any
 
@@ -20,5 +20,5 @@ EFFECT = Effect(
     act=act,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((5.0,), (-12.0,), (30.0,)),
-    confused={"gps_latency": "vanishes in level flight", "air_density": "shows in airspeed and moments too"},
+    confused={"gps_latency": "vanishes in level flight", "air_density": "affects airspeed and moments too"},
 )

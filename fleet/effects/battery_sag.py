@@ -1,4 +1,4 @@
-"""A battery that empties: thrust at the same throttle falls with the charge used."""
+"""Battery discharge: thrust at the same throttle decreases with the charge used."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from fleet.effects import Effect, Flow, Onset, Parameter, Stage
 
 
 def act(flow: Flow, sag: Any) -> dict[str, Any]:
-    """Lessen thrust by what was used."""
+    """Reduce thrust in proportion to the integral of throttle."""
     return {"thrust": -sag * flow.used / 100.0}
 
 
@@ -17,13 +17,13 @@ EFFECT = Effect(
     equation="T = (1 - sag used / 100 s) T_full, used = integral of delta_t",
     source="Traub 2011, J. Aircraft 48(2) (discharge of batteries), to first order",
     parameters=(
-        Parameter("sag_per_100s", "-", "share of thrust lost in 100 s of full throttle", step=0.03, low=-0.1, high=1.0),
+        Parameter("sag_per_100s", "-", "thrust fraction lost in 100 s of full throttle", step=0.03, low=-0.1, high=1.0),
     ),
     act=act,
     onsets=(Onset.ALWAYS,),
     examples=((0.15,), (0.25,), (0.4,)),
     confused={
-        "thrust_loss": "comes at once or with time, not with the charge used",
+        "thrust_loss": "develops at once or with time, not with the charge used",
         "drag_increase": "drag grows with dynamic pressure, not with the charge used",
     },
 )

@@ -1,4 +1,4 @@
-"""A centre of gravity moved forward or aft: a payload that slid, a tank that emptied."""
+"""Centre of gravity moved forward or aft: shifted payload, emptied tank."""
 
 from typing import Any
 
@@ -16,12 +16,12 @@ EFFECT = Effect(
     channel="pitch",
     equation="M = M_0 + dx Z, N = N_0 - dx Y",
     source="Stevens, Lewis & Johnson 2016, section 2.4 (moments about another point)",
-    parameters=(Parameter("dx_m", "m", "moved forward", step=0.01, low=-0.5, high=0.5),),
+    parameters=(Parameter("dx_m", "m", "shift forward", step=0.01, low=-0.5, high=0.5),),
     act=act,
     examples=((0.015,), (-0.03,), (0.06,)),
     confused={
-        "mass_change": "shows in lift too; what drops out often does both: fly pull-ups",
-        "actuator_offset": "an offset of the elevator grows with dynamic pressure: fly at two speeds",
+        "mass_change": "changes lift too; a dropped payload often causes both: fly pull-ups",
+        "actuator_offset": "the moment of an elevator offset grows with dynamic pressure: fly at two speeds",
         "slipstream_tail": "follows the throttle",
     },
 )

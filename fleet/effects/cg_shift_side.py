@@ -1,4 +1,4 @@
-"""A centre of gravity moved aside: one wing tank fuller, a payload that hangs on one side."""
+"""Centre of gravity moved sideways: unequal wing tanks, payload on one side."""
 
 from typing import Any
 
@@ -16,11 +16,11 @@ EFFECT = Effect(
     channel="roll",
     equation="L = L_0 - dy Z, N = N_0 + dy X",
     source="Stevens, Lewis & Johnson 2016, section 2.4 (moments about another point)",
-    parameters=(Parameter("dy_m", "m", "moved to the right", step=0.01, low=-1.0, high=1.0),),
+    parameters=(Parameter("dy_m", "m", "shift to the right", step=0.01, low=-1.0, high=1.0),),
     act=act,
     examples=((0.01,), (-0.03,), (0.06,)),
     confused={
-        "actuator_offset": "an offset of the aileron grows with dynamic pressure: fly at two speeds",
+        "actuator_offset": "the moment of an aileron offset grows with dynamic pressure: fly at two speeds",
         "prop_torque": "follows the throttle",
     },
 )

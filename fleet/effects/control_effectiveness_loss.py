@@ -1,4 +1,4 @@
-"""A surface that does less: part of it torn off, a soft rod, a hinge with a gap."""
+"""Surface with reduced effectiveness: part torn off, soft rod, hinge gap."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from fleet.physics.kernel import kernel
 
 @kernel
 def act(u: np.ndarray, memory: np.ndarray, dt: float, par: np.ndarray) -> None:
-    """Lessen the commands by a share."""
+    """Reduce the commands by a fraction."""
     for i in range(len(u)):
         u[i] -= par[0, i] * u[i]
 
@@ -19,14 +19,14 @@ EFFECT = Effect(
     channel="actuator",
     equation="delta = (1 - loss) delta_c",
     source="Ducard 2009, Fault-tolerant Flight Control and Guidance Systems (loss of effectiveness)",
-    parameters=(Parameter("loss", "-", "share lost; below zero: it does more", step=0.1, low=-0.5, high=1.0),),
+    parameters=(Parameter("loss", "-", "fraction lost; below zero: more effective", step=0.1, low=-0.5, high=1.0),),
     act=act,
     of=SURFACES,
     examples=((0.2,), (0.35,), (0.5,)),
     confused={
-        "actuator_stuck": "a stuck surface does not answer at all: fly inputs",
-        "actuator_saturation": "lost travel shows in large inputs alone",
-        "actuator_lag": "a lag loses fast movements alone",
-        "slipstream_tail": "what a slipstream does follows the throttle",
+        "actuator_stuck": "a stuck surface does not respond at all: fly inputs",
+        "actuator_saturation": "lost travel affects large inputs only",
+        "actuator_lag": "a lag attenuates fast movements only",
+        "slipstream_tail": "the slipstream effect follows the throttle",
     },
 )

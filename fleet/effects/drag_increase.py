@@ -1,4 +1,4 @@
-"""More drag, whatever the lift: a door, a loose panel, ice on the struts, an unmodelled payload."""
+"""Additional drag independent of lift: open door, loose panel, ice on struts, unmodelled payload."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from fleet.effects import Effect, Flow, Onset, Parameter, Stage
 
 
 def act(flow: Flow, dCD: Any, dCm: Any) -> dict[str, Any]:
-    """Add drag, and the moment of it acting above or below the centre of gravity."""
+    """Add drag and its pitching moment about the centre of gravity."""
     return {"C_D": dCD, "C_m": dCm}
 
 
@@ -18,9 +18,7 @@ EFFECT = Effect(
     source="Beard & McLain 2012, eq. 4.11",
     parameters=(
         Parameter("dCD", "-", "drag coefficient added", step=0.005, low=-0.05, high=0.5),
-        Parameter(
-            "dCm", "-", "pitching moment coefficient that comes along", step=0.002, low=-0.3, high=0.3, aside=True
-        ),
+        Parameter("dCm", "-", "associated pitching moment coefficient", step=0.002, low=-0.3, high=0.3, aside=True),
     ),
     act=act,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),

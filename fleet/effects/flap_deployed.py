@@ -1,4 +1,4 @@
-"""A flap left down, or come down by itself: lift, drag and a pitching moment at once."""
+"""Flap left down or deployed unintentionally: lift, drag and pitching moment together."""
 
 from typing import Any
 
@@ -24,9 +24,9 @@ EFFECT = Effect(
     act=act,
     examples=((0.1, 0.006, -0.01), (0.2, 0.015, -0.02), (0.35, 0.035, -0.035)),
     confused={
-        "drag_increase": "without lift and moment: look at the angle of attack",
-        "icing": "ice takes lift, and comes slowly",
-        "mass_change": "less weight takes no more drag",
-        "actuator_offset": "an offset of the elevator brings neither lift nor drag",
+        "drag_increase": "changes neither lift nor moment: compare the angle of attack",
+        "icing": "ice reduces lift and develops slowly",
+        "mass_change": "less weight adds no drag",
+        "actuator_offset": "an elevator offset adds neither lift nor drag",
     },
 )

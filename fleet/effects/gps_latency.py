@@ -1,4 +1,4 @@
-"""Satellite velocity and height that come late: a slow receiver, a smoothing filter, a wrong time stamp."""
+"""Delayed satellite velocity and height: slow receiver, smoothing filter, wrong time stamp."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ LATE = ("v_n", "v_e", "v_d", "h")
 
 
 def act(readings: dict[str, Any], latency: Any) -> dict[str, Any]:
-    """Return what was a while ago; undone to first order."""
+    """Return the delayed readings; the negated parameter is the inverse to first order."""
     t = readings["t"]
     return {name: np.interp(t - latency, t, readings[name]) for name in LATE}
 
@@ -19,13 +19,17 @@ EFFECT = Effect(
     name="gps_latency",
     stage=Stage.SENSOR,
     channel="gps",
-    equation="v_reported(t) = v(t - latency), h alike",
+    equation="v_reported(t) = v(t - latency), same for h",
     source="Skog & Handel 2011, IEEE Trans. Intelligent Transportation Systems 12(4) (time errors of GPS-aided INS)",
-    parameters=(Parameter("latency_s", "s", "how late; below zero: the rest is late", step=0.05, low=-1.0, high=1.5),),
+    parameters=(
+        Parameter(
+            "latency_s", "s", "latency; below zero: the other sensors are delayed", step=0.05, low=-1.0, high=1.5
+        ),
+    ),
     act=act,
     examples=((0.1,), (0.2,), (0.4,)),
     confused={
-        "wind_steady": "wind leaves acceleration and attitude in step",
-        "imu_misalignment": "follows what is felt, not how it changes",
+        "wind_steady": "wind keeps velocity in phase with acceleration and attitude",
+        "imu_misalignment": "follows the measured vector, not its rate of change",
     },
 )

@@ -1,4 +1,4 @@
-"""A single gust along the ground that comes and goes: the bump of its onset has the shape 1 - cos."""
+"""Single horizontal gust: a transient of shape 1 - cos."""
 
 from fleet.effects import Effect, Onset, Parameter, Stage
 from fleet.effects.wind_steady import act, told
@@ -10,16 +10,16 @@ EFFECT = Effect(
     equation="w = w_max (1 - cos(2 pi (t - t0) / T)) / 2",
     source="MIL-F-8785C 1980, section 3.7 (discrete gust); FAR 25.341 (1 - cos)",
     parameters=(
-        Parameter("w_n", "m/s", "wind to the north at its height", step=0.5, low=-25.0, high=25.0),
-        Parameter("w_e", "m/s", "wind to the east at its height", step=0.5, low=-25.0, high=25.0),
+        Parameter("w_n", "m/s", "peak wind to the north", step=0.5, low=-25.0, high=25.0),
+        Parameter("w_e", "m/s", "peak wind to the east", step=0.5, low=-25.0, high=25.0),
     ),
     act=act,
     told=told,
     onsets=(Onset.BUMP,),
     examples=((2.0, -1.0), (-3.0, 4.0), (6.0, 6.0)),
     confused={
-        "turbulence": "one coherent bump, not scatter all along",
-        "wind_steady": "a gust passes, a change of wind stays",
-        "updraft": "a gust along the ground shows in airspeed and sideslip by heading, an updraft in angle of attack",
+        "turbulence": "random throughout the flight, not one coherent transient",
+        "wind_steady": "a gust ends, a change of wind persists",
+        "updraft": "a horizontal gust changes airspeed and sideslip, an updraft the angle of attack",
     },
 )

@@ -1,4 +1,4 @@
-"""A gyro that reads a rate where there is none: temperature, vibration, a start while moving."""
+"""Gyro with a constant error: temperature, vibration, initialisation while moving."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ def act(readings: dict[str, Any], bias: Any, of: str = "p") -> dict[str, Any]:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Return degrees per second."""
+    """Return the bias in degrees per second."""
     return {"bias_dps": float(np.degrees(par[0]))}
 
 

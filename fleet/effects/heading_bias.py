@@ -1,4 +1,4 @@
-"""A compass that points beside north: iron near by, a current, a declination set wrong."""
+"""Compass with a constant error: iron, electric current, wrong declination."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ def act(readings: dict[str, Any], bias: Any) -> dict[str, Any]:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Return degrees."""
+    """Return the bias in degrees."""
     return {"bias_deg": float(np.degrees(par[0]))}
 
 
@@ -29,8 +29,8 @@ EFFECT = Effect(
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((0.05,), (-0.12,), (0.25,)),
     confused={
-        "wind_steady": "wind keeps its direction over ground, a wrong compass turns along: fly a full turn",
-        "actuator_offset": "true sideslip is felt sideways, a wrong compass is not",
+        "wind_steady": "wind keeps its direction over ground, a heading error turns with the aircraft: fly a full turn",
+        "actuator_offset": "real sideslip causes lateral acceleration, a heading error does not",
         "gyro_bias": "a rate, not a constant angle",
     },
 )

@@ -1,4 +1,4 @@
-"""The propeller turns the aircraft the other way round."""
+"""Reaction torque of the propeller on the airframe."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ FULL = 0.25 * 9.80665  # thrust at full throttle, per mass [N/kg]
 
 
 def act(flow: Flow, ratio: Any) -> dict[str, Any]:
-    """Add a rolling moment in proportion to what the engine gives, whether or not the propeller pulls."""
+    """Add a rolling moment proportional to throttle, independent of thrust."""
     return {"L": ratio * flow.body.D * FULL * flow.body.mass * flow.delta_t}
 
 
@@ -17,12 +17,14 @@ EFFECT = Effect(
     stage=Stage.WRENCH,
     channel="roll",
     equation="L = ratio D 0.25 m g delta_t",
-    source="McCormick 1995, chapter 6 (the airframe bears the engine's torque); 0.25 m g is a round number",
-    parameters=(Parameter("ratio", "-", "torque per full thrust and diameter", step=0.02, low=-2.0, high=2.0),),
+    source="McCormick 1995, chapter 6 (reaction torque of the engine); 0.25 m g is a rough value",
+    parameters=(
+        Parameter("ratio", "-", "torque relative to full thrust times diameter", step=0.02, low=-2.0, high=2.0),
+    ),
     act=act,
     examples=((0.03,), (-0.08,), (0.15,)),
     confused={
-        "actuator_offset": "an offset follows dynamic pressure, torque the throttle: fly at two powers",
-        "cg_shift_side": "a weight beside the middle does not follow the throttle",
+        "actuator_offset": "an offset follows dynamic pressure, torque follows the throttle: fly at two power settings",
+        "cg_shift_side": "a lateral shift of weight does not follow the throttle",
     },
 )

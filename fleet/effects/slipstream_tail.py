@@ -1,4 +1,4 @@
-"""The propeller blows on the tail: elevator and rudder do more the more thrust there is."""
+"""Propeller slipstream on the tail: the effectiveness of elevator and rudder grows with thrust."""
 
 from typing import Any
 
@@ -6,12 +6,12 @@ import numpy as np
 
 from fleet.effects import Effect, Flow, Parameter, Stage
 
-SLOW = 20.0  # dynamic pressure below which momentum theory is not believed [Pa]
-MILLING = -0.5  # a windmilling propeller cannot take more than this from the flow
+SLOW = 20.0  # smallest dynamic pressure for momentum theory [Pa]
+MILLING = -0.5  # limit for a windmilling propeller
 
 
 def act(flow: Flow, share: Any) -> dict[str, Any]:
-    """Let the surfaces' moments grow with the dynamic pressure the propeller adds."""
+    """Scale the moments of the surfaces with the dynamic pressure that the propeller adds."""
     disc = np.pi * flow.body.D**2 / 4.0
     jet = share * np.maximum(flow.T / (np.maximum(flow.q_bar, SLOW) * disc), MILLING)
     return {"C_m": flow.pitch * jet, "C_n": flow.yaw * jet}
@@ -21,13 +21,13 @@ EFFECT = Effect(
     name="slipstream_tail",
     stage=Stage.WRENCH,
     channel="pitch",
-    equation="C_m = (1 + share T / (q_bar A)) C_m_delta_e delta_e, C_n alike by rudder, A = pi D^2 / 4",
+    equation="C_m = (1 + share T / (q_bar A)) C_m_delta_e delta_e, same for C_n of the rudder, A = pi D^2 / 4",
     source="McCormick 1995, chapter 6 (momentum theory); Selig 2014, J. Aircraft 51(6) (surfaces in the slipstream)",
-    parameters=(Parameter("share", "-", "share of the tail in the slipstream", step=0.1, low=-1.0, high=3.0),),
+    parameters=(Parameter("share", "-", "fraction of the tail in the slipstream", step=0.1, low=-1.0, high=3.0),),
     act=act,
     examples=((0.3,), (0.6,), (1.0,)),
     confused={
-        "control_effectiveness_loss": "does not follow the throttle: fly inputs at two powers",
+        "control_effectiveness_loss": "does not follow the throttle: fly inputs at two power settings",
         "cg_shift": "does not follow the throttle",
     },
 )

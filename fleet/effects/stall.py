@@ -1,4 +1,4 @@
-"""Flow that separates: above some angle of attack the wing lifts less than its slope says, and drags more."""
+"""Flow separation: above a break angle of attack lift is below the linear slope and drag is higher."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ BREAKS = {f"{angle} deg": np.radians(angle) for angle in (8, 10, 12, 14)}  # alp
 
 
 def act(flow: Flow, slope_lost: Any, drag_slope: Any, of: str = "12 deg") -> dict[str, Any]:
-    """Take lift and add drag in proportion to the angle beyond the break."""
+    """Reduce lift and add drag in proportion to the angle of attack beyond the break."""
     over = np.maximum(flow.alpha - BREAKS[of], 0.0)
     return {"C_L": -slope_lost * over, "C_D": drag_slope * over}
 
@@ -19,8 +19,8 @@ EFFECT = Effect(
     name="stall",
     stage=Stage.WRENCH,
     channel="lift",
-    equation="over = max(alpha - alpha_s, 0), C_L = C_L_clean - slope_lost over, C_D = C_D_clean + drag_slope over",
-    source="Beard & McLain 2012, eq. 4.9 (lift beyond the stall), here with straight lines",
+    equation="d = max(alpha - alpha_s, 0), C_L = C_L_clean - slope_lost d, C_D = C_D_clean + drag_slope d",
+    source="Beard & McLain 2012, eq. 4.9 (lift beyond the stall), here piecewise linear",
     parameters=(
         Parameter("slope_lost_per_rad", "1/rad", "lift slope lost beyond the break", step=0.5, low=0.0, high=15.0),
         Parameter("drag_slope_per_rad", "1/rad", "drag slope gained beyond the break", step=0.2, low=0.0, high=5.0),

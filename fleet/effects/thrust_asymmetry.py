@@ -1,4 +1,4 @@
-"""Thrust beside the middle: one of two engines weaker, a mount that is bent."""
+"""Asymmetric thrust: one of two engines weaker, bent mount."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from fleet.effects import Effect, Flow, Parameter, Stage
 
 
 def act(flow: Flow, arm: Any) -> dict[str, Any]:
-    """Add the yawing moment of thrust on an arm."""
+    """Add the yawing moment of thrust with a lever arm."""
     return {"N": arm * flow.T}
 
 
@@ -21,7 +21,7 @@ EFFECT = Effect(
     examples=((0.03,), (-0.08,), (0.2,)),
     confused={
         "p_factor": "follows the angle of attack: fly slow and fast at one power",
-        "actuator_offset": "an offset of the rudder does not follow the throttle",
-        "thrust_loss": "without a moment",
+        "actuator_offset": "a rudder offset does not follow the throttle",
+        "thrust_loss": "adds no moment",
     },
 )

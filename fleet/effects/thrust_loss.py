@@ -1,4 +1,4 @@
-"""Less thrust at the same throttle: a nicked propeller, a tired engine, a cold cylinder."""
+"""Less thrust at the same throttle: damaged propeller, worn engine, failed cylinder."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from fleet.effects import Effect, Flow, Onset, Parameter, Stage
 
 
 def act(flow: Flow, loss: Any) -> dict[str, Any]:
-    """Lessen thrust by a share."""
+    """Return the relative decrement of thrust."""
     return {"thrust": -loss}
 
 
@@ -16,14 +16,14 @@ EFFECT = Effect(
     channel="thrust",
     equation="T = (1 - loss) T_healthy",
     source="Beard & McLain 2012, section 4.3 (propeller thrust)",
-    parameters=(Parameter("loss", "-", "share lost; 1: the engine is out", step=0.05, low=-0.5, high=1.0),),
+    parameters=(Parameter("loss", "-", "fraction lost; 1: engine off", step=0.05, low=-0.5, high=1.0),),
     act=act,
     onsets=(Onset.ALWAYS, Onset.STEP, Onset.RAMP),
     examples=((0.08,), (0.15,), (0.3,)),
     confused={
         "drag_increase": "drag grows with dynamic pressure, thrust with throttle: fly at two speeds",
-        "battery_sag": "a battery sags as charge is used, not with time",
-        "icing": "ice takes lift along",
-        "mass_change": "more weight takes more lift",
+        "battery_sag": "battery sag follows the charge used, not time",
+        "icing": "ice reduces lift too",
+        "mass_change": "more weight needs more lift",
     },
 )

@@ -1,4 +1,4 @@
-"""A wind that changes with height: calm at 100 m, where a mean wind is given, and stronger away from it."""
+"""Wind gradient: wind change proportional to the height difference from 100 m."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from fleet.effects import Body, Effect, Flow, Onset, Parameter, Stage
 
-REFERENCE = 100.0  # height at which it is nothing, so that a mean wind is not counted twice [m]
+REFERENCE = 100.0  # height of zero change, so that a mean wind is not counted twice [m]
 
 
 def act(flow: Flow, w_n: Any, w_e: Any) -> dict[str, Any]:
@@ -16,7 +16,7 @@ def act(flow: Flow, w_n: Any, w_e: Any) -> dict[str, Any]:
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Return the change every 100 m, and where what is added higher up blows from."""
+    """Return the change per 100 m and the direction from which the wind added above blows."""
     w_n, w_e = map(float, par[:2])
     return {"mps_per_100m": float(np.hypot(w_n, w_e)), "from_deg": float(np.degrees(np.arctan2(-w_e, -w_n)) % 360.0)}
 
@@ -28,8 +28,8 @@ EFFECT = Effect(
     equation="w = w_per_100m (height - 100 m) / 100 m",
     source="MIL-F-8785C 1980, section 3.7.3 (wind shear), to first order about 100 m",
     parameters=(
-        Parameter("w_n", "m/s", "wind to the north gained in 100 m of height", step=0.5, low=-20.0, high=20.0),
-        Parameter("w_e", "m/s", "wind to the east gained in 100 m of height", step=0.5, low=-20.0, high=20.0),
+        Parameter("w_n", "m/s", "change of north wind per 100 m of height", step=0.5, low=-20.0, high=20.0),
+        Parameter("w_e", "m/s", "change of east wind per 100 m of height", step=0.5, low=-20.0, high=20.0),
     ),
     act=act,
     told=told,

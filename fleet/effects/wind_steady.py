@@ -1,4 +1,4 @@
-"""A mean wind, the same everywhere; from an onset on, a change of it."""
+"""Uniform mean wind, or a change of it from an onset on."""
 
 from typing import Any
 
@@ -8,12 +8,12 @@ from fleet.effects import Body, Effect, Flow, Onset, Parameter, Stage
 
 
 def act(flow: Flow, w_n: Any, w_e: Any) -> dict[str, Any]:
-    """Add wind."""
+    """Add uniform wind."""
     return {"w_n": w_n, "w_e": w_e}
 
 
 def told(effect: Effect, par: np.ndarray, body: Body) -> dict[str, float]:
-    """Return speed and where it blows from."""
+    """Return speed and the direction from which the wind blows."""
     w_n, w_e = map(float, par[:2])
     return {"speed_mps": float(np.hypot(w_n, w_e)), "from_deg": float(np.degrees(np.arctan2(-w_e, -w_n)) % 360.0)}
 
@@ -34,6 +34,6 @@ EFFECT = Effect(
     examples=((2.0, -1.0), (-3.0, 4.0), (6.0, 6.0)),
     confused={
         "airspeed_bias": "wind depends on heading: fly a full turn",
-        "heading_bias": "a wrong compass turns with the aircraft: fly a full turn",
+        "heading_bias": "a heading error turns with the aircraft: fly a full turn",
     },
 )

@@ -1,4 +1,4 @@
-"""ArduPlane's control law, from its equations: L1 guides, TECS shares energy, PIDs hold attitude.
+"""ArduPlane control law from its equations: L1 guidance, TECS for energy, PID loops for attitude.
 
     route --legs--> line or circle --l1--> phi_c ----------------+
       +--legs--> height and speed --tecs--> theta_c, delta_t ------+--attitude--> delta_a, delta_e, delta_r
@@ -10,11 +10,11 @@
     delta_a, delta_e, delta_r = stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
 
 All but `parameters` are compiled and change `ctl` in place; ctl[LEG] is the index of the current leg. Airspeeds are
-equivalent, as the sensor reports them; true airspeed is made inside. `fleet.autopilots.shadow` synchronises it with
-telemetry. Not modelled: terrain following, flaps, reverse thrust, the yaw damper (off by default) and the gain
-reduction of oscillating loops.
+equivalent, as reported by the sensor, and converted to true airspeed inside. `fleet.autopilots.shadow` synchronises
+the state with telemetry. Not modelled: terrain following, flaps, reverse thrust, the yaw damper (off by default) and
+the gain reduction of oscillating loops.
 
-Source: Park, Deyst & How (2004) for L1; Lambregts (1983) for TECS; ArduPlane 4.x for the law as flown.
+Source: Park, Deyst & How (2004) for L1; Lambregts (1983) for TECS; ArduPlane 4.x for the implementation.
 """
 
 from fleet.autopilots.arduplane.attitude import stabilise

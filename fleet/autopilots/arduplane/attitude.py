@@ -1,9 +1,9 @@
-"""Attitude to rates to surfaces: one loop for roll, the same for pitch.
+"""Attitude and rate loops: attitude error to rate demand to surface, for roll and pitch.
 
     p_d = (phi_c - phi) / T        s = SCALING_SPEED / Va
     surface = FF p_t s / EAS2TAS + s^2 (P (p_t - p) + I + D d/dt(p_t - p))        p_t: p_d low-passed
 
-Gains give degrees of surface per deg/s of rate, 45 deg being full throw.
+Gains are in degrees of surface per deg/s of rate; 45 deg is full throw.
 Source: ArduPlane roll and pitch controllers (fixed-wing rate PID).
 """
 
@@ -17,12 +17,12 @@ from fleet.autopilots.common.kernels import clip, kernel
 from fleet.frames import G
 
 FULL = radians(45.0)  # full throw [rad]
-_P, _I, _D, _IMAX, _FLTT, _FLTD = 1, 2, 3, 4, 5, 6  # gains behind FF in `par`, the same order for roll and pitch
+_P, _I, _D, _IMAX, _FLTT, _FLTD = 1, 2, 3, 4, 5, 6  # offsets of the gains from FF in `par`, for roll and pitch
 
 
 @kernel
 def scaler(par: np.ndarray, Va: float) -> float:
-    """Return the gain for dynamic pressure, SCALING_SPEED / Va, limited [-]; nan airspeed counts as cruise."""
+    """Return the dynamic-pressure scaler SCALING_SPEED / Va, limited [-]; nan airspeed is replaced by cruise."""
     V = Va if np.isfinite(Va) else par[P.VA_CRUISE]
     low = min(0.5, par[P.VA_SCALING] / (2.0 * par[P.VA_MAX]))
     high = max(2.0, par[P.VA_SCALING] / (0.7 * par[P.VA_MIN]))
@@ -31,13 +31,13 @@ def scaler(par: np.ndarray, Va: float) -> float:
 
 @kernel
 def _share(hertz: float, dt: float) -> float:
-    """Return a low-pass filter's share of the new value; 0 Hz: no filter."""
+    """Return the gain of a first-order low-pass filter; 0 Hz: no filter."""
     return dt / (dt + 1.0 / (2 * pi * hertz)) if hertz > 0.0 else 1.0
 
 
 @kernel
 def _rate_loop(ctl: np.ndarray, par: np.ndarray, pitch: bool, wanted: float, rate: float, s: float, dt: float) -> float:
-    """Turn a wanted rate [rad/s] into a surface -1..1."""
+    """Convert a rate demand [rad/s] to a surface deflection -1..1."""
     t, i, e, d, last = (S.Q_T, S.I_E, S.E_E, S.D_E, S.S_E) if pitch else (S.P_T, S.I_A, S.E_A, S.D_A, S.S_A)
     ff = P.PITCH_FF if pitch else P.ROLL_FF
     ctl[t] += _share(par[ff + _FLTT], dt) * (wanted - ctl[t])
@@ -45,7 +45,7 @@ def _rate_loop(ctl: np.ndarray, par: np.ndarray, pitch: bool, wanted: float, rat
     ctl[d] += _share(par[ff + _FLTD], dt) * ((error - ctl[e]) / dt - ctl[d])
     ctl[e] = error
     step = error * par[ff + _I] * dt
-    if abs(ctl[last]) < 1.0 or step * ctl[last] < 0.0:  # at full throw the integrator may only come back
+    if abs(ctl[last]) < 1.0 or step * ctl[last] < 0.0:  # anti-windup: at full throw integrate only towards zero
         ctl[i] = clip(ctl[i] + step, -par[ff + _IMAX], par[ff + _IMAX])
     total = par[ff] * ctl[t] * s / par[P.EAS2TAS] + par[ff + _P] * error + ctl[i] + par[ff + _D] * ctl[d]
     ctl[last] = total / FULL
@@ -54,7 +54,7 @@ def _rate_loop(ctl: np.ndarray, par: np.ndarray, pitch: bool, wanted: float, rat
 
 @kernel
 def _limited(rate: float, down: float, up: float) -> float:
-    """Limit a rate where limits are set (zero: none)."""
+    """Limit a rate; a zero limit is inactive."""
     if up > 0.0 and rate > up:
         return up
     return -down if down > 0.0 and rate < -down else rate
@@ -62,7 +62,7 @@ def _limited(rate: float, down: float, up: float) -> float:
 
 @kernel
 def rate_demands(par: np.ndarray, phi_c: float, theta_c: float, euler: np.ndarray, Va: float) -> tuple[float, float]:
-    """Return the roll and pitch rates wanted, the pitch rate of the turn included [rad/s]."""
+    """Return the roll and pitch rate demands, including the pitch rate of a turn [rad/s]."""
     V = max(Va if np.isfinite(Va) else par[P.VA_CRUISE], par[P.VA_MIN]) * par[P.EAS2TAS]
     phi = clip(euler[0], -1.396, 1.396)
     p_d = _limited((phi_c - euler[0]) / par[P.ROLL_TC], par[P.ROLL_RMAX], par[P.ROLL_RMAX])
@@ -82,11 +82,11 @@ def stabilise(
     Va: float,
     dt: float,
 ) -> tuple[float, float, float]:
-    """Return the surfaces for a commanded attitude. Made for 50 Hz.
+    """Return the surface deflections for a commanded attitude, at about 50 Hz.
 
     Args:
         ctl, par: controller state, parameters
-        phi_c, theta_c: commanded roll and pitch, as `guide` gives them [rad]
+        phi_c, theta_c: commanded roll and pitch from `guide` [rad]
         euler: phi, theta, psi (3,) [rad]
         rates: p, q, r body FRD (3,) [rad/s]
         Va: equivalent airspeed; nan: no sensor [m/s]

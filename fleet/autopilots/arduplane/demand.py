@@ -1,7 +1,7 @@
-"""What TECS starts from: the airspeed as filtered, and the speed and height it is to aim at just now.
+"""Inputs of TECS: filtered airspeed, and rate-limited speed and height demands.
 
-Inside, speeds are true airspeeds and heights are up.
-Source: ArduPlane TECS; the braking law read off flights of ArduPlane 4.7.
+Speeds are true airspeeds; heights are positive upward.
+Source: ArduPlane TECS; the deceleration limit is identified from flights of ArduPlane 4.7.
 """
 
 from math import cos, sin, sqrt
@@ -14,8 +14,8 @@ from fleet.autopilots.common.kernels import clip, kernel
 from fleet.frames import G
 
 _W = 2.0  # bandwidth of the airspeed filter [rad/s]
-SLOWEST = 3.0  # the airspeed filter goes no lower [m/s]
-_SMOOTH = 0.2  # lag on the acceleration taken from velocity differences [s]
+SLOWEST = 3.0  # lower limit of the airspeed filter [m/s]
+_SMOOTH = 0.2  # time constant for acceleration from velocity differences [s]
 
 
 @kernel
@@ -28,8 +28,8 @@ def update_speed(
         ctl, par: controller state, parameters
         v: ground velocity, NED, (3,) [m/s]
         euler: phi, theta, psi (3,) [rad]
-        Va: equivalent airspeed; nan: no sensor, cruise is assumed [m/s]
-        Va_dot: forward acceleration; nan: taken from the change of `v` [m/s2]
+        Va: equivalent airspeed; nan: no sensor, cruise speed is used [m/s]
+        Va_dot: forward acceleration; nan: derived from `v` [m/s2]
         dt: step [s]
     """
     sense(ctl, v, euler, Va_dot, dt)
@@ -39,7 +39,7 @@ def update_speed(
 
 @kernel
 def sense(ctl: np.ndarray, v: np.ndarray, euler: np.ndarray, Va_dot: float, dt: float) -> None:
-    """Keep the forward acceleration in ctl[S.ACCEL]; without one, from the change of the ground velocity.
+    """Update the forward acceleration ctl[S.ACCEL], from `Va_dot` or else from ground velocity differences.
 
     Args:
         ctl: controller state
@@ -59,7 +59,7 @@ def sense(ctl: np.ndarray, v: np.ndarray, euler: np.ndarray, Va_dot: float, dt: 
 
 @kernel
 def filter_speed(ctl: np.ndarray, tas: float, otherwise: float, dt: float) -> None:
-    """Filter a true airspeed [m/s] with the acceleration sensed; nan: `otherwise` is assumed."""
+    """Filter a true airspeed [m/s] with the forward acceleration; nan: use `default`."""
     if not np.isfinite(tas):
         ctl[S.V_HAT], ctl[S.V_DOT_HAT] = otherwise, 0.0
         return
@@ -72,21 +72,21 @@ def filter_speed(ctl: np.ndarray, tas: float, otherwise: float, dt: float) -> No
 
 @kernel
 def slowest(par: np.ndarray, phi: float) -> float:
-    """Return the least true airspeed, raised with the load factor of the bank [m/s]."""
+    """Return the minimum true airspeed, increased with the load factor of the bank [m/s]."""
     return par[P.VA_MIN] * par[P.EAS2TAS] / sqrt(max(cos(phi), 0.2))
 
 
 @kernel
 def demand_speed(ctl: np.ndarray, par: np.ndarray, va_c: float, phi: float, dt: float) -> float:
-    """Move the speed demand as power and drag allow; return its rate above its slow part [m/s2].
+    """Rate-limit the speed demand by power and drag; return its high-passed rate [m/s2].
 
-    Up with half the climb power, down with 0.9 of the drag, which is SINK_MIN at cruise and grows with V^2.
+    Acceleration uses half the climb power, deceleration 0.9 of the drag (SINK_MIN at cruise, growing with V^2).
     """
     V = ctl[S.V_HAT]
     fastest = 0.5 * par[P.CLIMB_MAX] * ctl[S.UP] * G / V
     braking = -0.9 * par[P.SINK_MIN] * G * V * V / (par[P.VA_CRUISE] * par[P.EAS2TAS]) ** 3
     low, high = slowest(par, phi), par[P.VA_MAX] * par[P.EAS2TAS]
-    if ctl[S.THR_SAT] > 0.0:  # no power left: wind the ceiling down
+    if ctl[S.THR_SAT] > 0.0:  # no power left: lower the upper limit
         ctl[S.V_TOP] = max(ctl[S.V_TOP] + braking * dt, min(par[P.VA_CRUISE] * par[P.EAS2TAS], high))
     else:
         ctl[S.V_TOP] = min(ctl[S.V_TOP] + max(fastest, 0.0) * dt, high)
@@ -115,7 +115,7 @@ def demand_height(ctl: np.ndarray, par: np.ndarray, h_sp: float, dt: float) -> f
 
 @kernel
 def _yield(ctl: np.ndarray, share: float) -> None:
-    """Let the height demand wait for an aircraft whose throttle or pitch is at its limit."""
+    """Reduce the climb or sink limit while throttle or pitch is saturated, else restore it."""
     up = ctl[S.THETA_SAT] > 0.0 or ctl[S.THR_SAT] > 0.0
     down = ctl[S.THETA_SAT] < 0.0 or ctl[S.THR_SAT] < 0.0
     if up and ctl[S.H_DEM] > ctl[S.H_LAST]:

@@ -1,4 +1,4 @@
-"""The whole guidance step: route, L1 and TECS together, 10 Hz."""
+"""Complete guidance step at 10 Hz: route, L1 and TECS."""
 
 import numpy as np
 
@@ -25,17 +25,17 @@ def init(
     theta_c: float,
     delta_t: float,
 ) -> np.ndarray:
-    """Begin on leg `k`, without a bump from the pitch and throttle in force.
+    """Initialise on leg `k` with bumpless transfer of pitch and throttle.
 
     Args:
         par: parameters (N_PAR,)
         legs: route (m, 9)
         k: leg to fly
-        start: point where its line begins, NED, (3,) [m]; nan: where the aircraft is
+        start: start point of its line, NED, (3,) [m]; nan: aircraft position
         p, v: position and ground velocity, NED, (3,) [m, m/s]
         euler: phi, theta, psi (3,) [rad]
         Va: equivalent airspeed; nan: no sensor [m/s]
-        theta_c, delta_t: pitch command and throttle in force, nan unknown [rad, 0..1]
+        theta_c, delta_t: current pitch command and throttle; nan: unknown [rad, 0..1]
     Returns:
         ctl (S.N_CTL,)
     """
@@ -51,7 +51,7 @@ def init(
 
 @kernel
 def speed(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray) -> float:
-    """Return the airspeed commanded on the current leg, equivalent [m/s]."""
+    """Return the commanded equivalent airspeed on the current leg [m/s]."""
     i = leg_rules.current(ctl, legs)
     return legs[i, VA_C] if i >= 0 and legs[i, VA_C] > 0.0 else par[P.VA_CRUISE]
 
@@ -68,7 +68,7 @@ def fly(
     Va_dot: float,
     dt: float,
 ) -> tuple[float, float, float, bool]:
-    """Fly the current leg for one step without leaving it; as `guide`, and whether the leg is over."""
+    """Run one guidance step on the current leg; return the result of `guide` and whether the leg is complete."""
     dt = max(dt, 1e-3)
     a_lat, over = leg_rules.steer(ctl, par, legs, p, v, euler, dt)
     phi_c = l1.to_roll(par, a_lat, euler[1])
@@ -91,14 +91,14 @@ def guide(
     Va_dot: float,
     dt: float,
 ) -> tuple[float, float, float]:
-    """Fly the route for one step; goes on to the next leg by itself, holds the last. Made for 10 Hz.
+    """Run one guidance step at about 10 Hz; switch to the next leg when one is complete, and stay on the last.
 
     Args:
         ctl, par, legs: controller state (changed), parameters, route
         p, v: position and ground velocity, NED, (3,) [m, m/s]
         euler: phi, theta, psi (3,) [rad]
-        Va: equivalent airspeed as the sensor reports it; nan: no sensor [m/s]
-        Va_dot: forward acceleration, x_body . v_dot; nan: taken from the change of `v` [m/s2]
+        Va: equivalent airspeed from the sensor; nan: no sensor [m/s]
+        Va_dot: forward acceleration, x_body . v_dot; nan: derived from `v` [m/s2]
         dt: step [s]
     Returns:
         phi_c, theta_c [rad], delta_t 0..1
@@ -111,18 +111,18 @@ def guide(
 
 @kernel
 def settle(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray) -> None:
-    """Take the commanded speed as long in force: what a controller found in flight demands, more likely than not."""
+    """Set the speed demand to the commanded speed, as in steady flight."""
     ctl[S.V_DEM] = speed(ctl, par, legs) * par[P.EAS2TAS]
 
 
 @kernel
 def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) -> None:
-    """Shift the integrators by what the outputs missed, and put the slewed outputs where the reported ones are.
+    """Shift the integrators by the output residuals, and set slew-limited outputs to the reported values.
 
     Args:
         ctl, par: controller state, parameters
-        miss: reported minus replayed theta_c, delta_t, delta_a, delta_e, delta_r; 0 unknown, (5,)
-        told: reported phi_c, theta_c, delta_t and airspeed at the end, nan where missing, (4,)
+        residual: reported minus replayed theta_c, delta_t, delta_a, delta_e, delta_r; 0: unknown, (5,)
+        reported: reported phi_c, theta_c, delta_t and airspeed at the end, nan where missing, (4,)
     """
     room = 0.5 * (par[P.THR_MAX] - par[P.THR_MIN])
     ctl[S.I_SEB] += miss[0] * ctl[S.V_HAT] * G

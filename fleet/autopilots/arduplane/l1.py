@@ -1,8 +1,8 @@
-"""L1: where to accelerate sideways to follow a line or a circle.
+"""L1 guidance: lateral acceleration to follow a line or a circle.
 
     L1 = zeta T v_g / pi        K = 4 zeta^2        a_lat = K v_g^2 / L1 sin(nu)
 
-`nu` is the angle from the ground velocity to a point L1 ahead on the path. Right is positive.
+`nu` is the angle from the ground velocity to a point on the path at distance L1 ahead. Right is positive.
 Source: Park, Deyst & How, "A New Nonlinear Guidance Logic for Trajectory Tracking" (2004); ArduPlane L1 controller.
 """
 
@@ -16,14 +16,14 @@ from fleet.autopilots.common.kernels import angle_to, clip, hypot, kernel
 from fleet.frames import G, wrap
 from fleet.mission import P_E, P_N
 
-_SHALLOW = 0.0873  # crosstrack angle below which its integral runs: 5 deg [rad]
-_STEEP = 0.7071  # sine of the steepest approach to a line: 45 deg [-]
+_SHALLOW = 0.0873  # crosstrack angle below which the integral is active: 5 deg [rad]
+_STEEP = 0.7071  # sine of the maximum intercept angle: 45 deg [-]
 _MOST = 0.1  # limit of the crosstrack integral [rad]
 
 
 @kernel
 def ground_track(v: np.ndarray, psi: float) -> tuple[float, float, float]:
-    """Give ground velocity north, east and speed; the heading at 0.1 m/s where the wind carries it backwards [m/s]."""
+    """Return ground velocity north, east and speed; when flying backwards 0.1 m/s along the heading [m/s]."""
     speed = hypot(v[0], v[1])
     if speed < 0.1 or v[0] * cos(psi) + v[1] * sin(psi) < 0.0:
         return 0.1 * cos(psi), 0.1 * sin(psi), 0.1
@@ -38,13 +38,13 @@ def distance(par: np.ndarray, speed: float) -> float:
 
 @kernel
 def to_roll(par: np.ndarray, a_lat: float, theta: float) -> float:
-    """Turn lateral acceleration [m/s2] into the bank that gives it in a level turn, limited [rad]."""
+    """Convert lateral acceleration [m/s2] to the limited bank angle of a level turn [rad]."""
     return clip(atan(a_lat / (G * max(cos(theta), 0.5))), -par[P.ROLL_LIMIT], par[P.ROLL_LIMIT])
 
 
 @kernel
 def decided(ctl: np.ndarray, nu: float, n: float, e: float, psi: float) -> float:
-    """Keep turning the way chosen before while the target (n, e) lies nearly behind; remembers `nu` [rad]."""
+    """Keep the turn direction while the target (n, e) is nearly behind; store and return `nu` [rad]."""
     before = ctl[S.NU]
     if abs(nu) > 0.9 * pi and abs(before) > 0.9 * pi and nu * before < 0.0:
         behind = abs(wrap(atan2(e, n) - psi)) > 2 * pi / 3
@@ -57,7 +57,7 @@ def decided(ctl: np.ndarray, nu: float, n: float, e: float, psi: float) -> float
 def follow_line(
     ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, v: np.ndarray, psi: float, dt: float
 ) -> float:
-    """Follow the line from the point before to the leg's target.
+    """Return the lateral acceleration to follow the line from the previous point to the target of the leg.
 
     Three regimes: far behind the start, fly to the start; more than 3 s past the end, fly to the end; else capture
     the line with nu = asin(crosstrack / L1) + integral + course error.
@@ -96,7 +96,7 @@ def follow_line(
 
 @kernel
 def circle_radius(par: np.ndarray, radius: float) -> float:
-    """Widen a radius [m] for thin air, or for the bank limit of loiters where one is set [m]."""
+    """Return a radius [m] increased for low air density, or for the loiter bank limit if set [m]."""
     if par[P.LIM_BANK] > 0.0:
         tas = par[P.VA_CRUISE] * par[P.EAS2TAS]
         return max(radius, tas * tas / (G * max(np.tan(par[P.LIM_BANK]), 0.01)))
@@ -107,7 +107,7 @@ def circle_radius(par: np.ndarray, radius: float) -> float:
 def follow_circle(
     ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, v: np.ndarray, psi: float, radius: float
 ) -> tuple[float, bool]:
-    """Capture a circle, then hold it: omega = 2 pi / T, a = d (omega^2 (r - R) + 2 zeta omega r_dot + v_t^2 / r).
+    """Capture and follow a circle: omega = 2 pi / T, a = d (omega^2 (r - R) + 2 zeta omega r_dot + v_t^2 / r).
 
     Args:
         ctl, par, leg: controller state, parameters, row of the route (its target is the centre)

@@ -1,6 +1,6 @@
-"""Which leg is flown, when it is over, and how high to be on it.
+"""Leg sequencing and height demand along the route.
 
-A line is over within the turn distance of its end or once the finish line through its end is crossed.
+A line is complete within the turn distance of its end, or beyond the line through its end at right angles.
 Source: ArduPlane mission logic, waypoint switching and altitude slope.
 """
 
@@ -33,20 +33,20 @@ from fleet.mission import (
 )  # fmt: skip
 
 _CLIMB_AT_ONCE = 1 << 14  # FLIGHT_OPTIONS: climb to the next altitude at once
-_EXIT = pi / 18  # leave a circle within 10 deg of the way out, 10 deg more each extra turn [rad]
-_FAR = 3.0  # farther from a circle than so many radii its line is followed, not the circle
+_EXIT = pi / 18  # exit from a circle within 10 deg of the exit course, plus 10 deg per extra turn [rad]
+_FAR = 3.0  # distance in radii beyond which the line to a circle is followed
 _LEVEL = 5.0  # altitude error that ends LOITER_TO_ALT [m]
 
 
 @kernel
 def current(ctl: np.ndarray, legs: np.ndarray) -> int:
-    """Return the index of the leg in force; -1 when the route is empty."""
+    """Return the index of the current leg; -1 if the route is empty."""
     return min(max(int(ctl[S.LEG]), 0), legs.shape[0] - 1)
 
 
 @kernel
 def along_line(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> tuple[float, float]:
-    """Return the way made along the current line, and the line's length [m]."""
+    """Return the along-track distance on the current line, and the length of the line [m]."""
     t_n, t_e = leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]
     length = hypot(t_n, t_e)
     if length < 0.1:
@@ -56,7 +56,7 @@ def along_line(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> tuple[float, 
 
 @kernel
 def set_leg(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, from_p: np.ndarray) -> None:
-    """Begin leg `k` (clamped to the route) on the line from `from_p`, NED (3,) [m]; not finite: from its own target."""
+    """Start leg `k` (clamped to the route) on the line from `from_p`, NED (3,) [m]; not finite: from its target."""
     ctl[: S.N_LEG] = 0.0
     ctl[S.READY] = -1.0
     ctl[S.LEG] = max(k, 0)
@@ -75,9 +75,10 @@ def set_leg(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, from_p: 
 
 @kernel
 def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndarray) -> None:
-    """Go on to leg `k` from the aircraft's position `p`, NED (3,) [m].
+    """Switch to leg `k` at the aircraft position `p`, NED (3,) [m].
 
-    The new line begins where the old one ended, except after a circle or takeoff, or where its end is passed already.
+    The new line starts at the end of the previous one, but at the aircraft after a circle, after takeoff, or beyond its
+    own end.
     """
     i = current(ctl, legs)
     onward = i >= 0 and k == i + 1 and int(legs[i, KIND]) == WAYPOINT
@@ -95,7 +96,7 @@ def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndar
 def steer(
     ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray, euler: np.ndarray, dt: float
 ) -> tuple[float, bool]:
-    """Guide along the current leg without leaving it.
+    """Compute lateral guidance on the current leg.
 
     Args:
         ctl, par, legs: controller state, parameters, route
@@ -103,7 +104,7 @@ def steer(
         euler: phi, theta, psi (3,) [rad]
         dt: step [s]
     Returns:
-        lateral acceleration, right positive [m/s2]; whether the leg is over
+        lateral acceleration, right positive [m/s2]; whether the leg is complete
     """
     i = current(ctl, legs)
     if i < 0:
@@ -113,7 +114,7 @@ def steer(
     if kind == TAKEOFF:
         return 0.0, p[2] <= leg[P_D]
     if kind in (WAYPOINT, LAND):
-        if hypot(leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]) < 0.1:  # no line: make one from here
+        if hypot(leg[P_N] - ctl[S.PREV_N], leg[P_E] - ctl[S.PREV_E]) < 0.1:  # no line: start one here
             ctl[S.PREV_N], ctl[S.PREV_E] = p[0], p[1]
         a_lat = l1.follow_line(ctl, par, leg, p, v, euler[2], dt)
         return a_lat, kind == WAYPOINT and _arrived(ctl, par, leg, p, v, euler[2])
@@ -139,7 +140,7 @@ def _arrived(ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, v
     along, length = along_line(ctl, leg, p)
     if along <= length + max(-accept, 0.0):
         return False
-    if par[P.WP_MAX_RADIUS] > 0.0 and to_go > par[P.WP_MAX_RADIUS]:  # past it but too far off: try again from here
+    if par[P.WP_MAX_RADIUS] > 0.0 and to_go > par[P.WP_MAX_RADIUS]:  # passed too far away: fly to it again from here
         ctl[S.PREV_N], ctl[S.PREV_E], ctl[S.PREV_D] = p[0], p[1], p[2]
         return False
     return True
@@ -147,7 +148,7 @@ def _arrived(ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, v
 
 @kernel
 def _count(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, around: bool, d: float, dt: float) -> None:
-    """Add up the angle and the time flown since the circle was reached."""
+    """Integrate angle and time since reaching the circle."""
     bearing = atan2(leg[P_E] - p[1], leg[P_N] - p[0])
     ctl[S.AROUND] = 1.0 if around else 0.0
     if ctl[S.ON] > 0.0:
@@ -169,7 +170,7 @@ def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.nda
             return False
         ctl[S.READY] = max(ctl[S.ANGLE], 0.0)
     out_n, out_e = legs[i + 1, P_N] - p[0], legs[i + 1, P_E] - p[1]
-    if hypot(legs[i + 1, P_N] - leg[P_N], legs[i + 1, P_E] - leg[P_E]) < wide:  # the way out never comes into view
+    if hypot(legs[i + 1, P_N] - leg[P_N], legs[i + 1, P_E] - leg[P_E]) < wide:  # the next target is inside the circle
         return True
     v_n, v_e, _ = l1.ground_track(v, psi)
     extra = np.floor(max(ctl[S.ANGLE] - ctl[S.READY], 0.0) / (2 * pi))
@@ -178,7 +179,7 @@ def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.nda
 
 @kernel
 def ready(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> bool:
-    """Return whether turns, time or height of a circle are flown; p: NED, (3,) [m]."""
+    """Return whether the turns, time or height of a circle are complete; p: NED, (3,) [m]."""
     kind = int(leg[KIND])
     if kind == LOITER_TURNS:
         return ctl[S.ANGLE] >= 2 * pi * leg[TURNS]
@@ -189,7 +190,7 @@ def ready(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray) -> bool:
 
 @kernel
 def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray) -> float:
-    """Return the height to be at, up positive above the origin [m]: linear along a sloped leg, at once on a flat one.
+    """Return the height demand above the origin [m]: linear along a sloped leg, constant on a flat one.
 
     Args:
         ctl, par, legs: controller state, parameters, route

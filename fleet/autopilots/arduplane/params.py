@@ -1,4 +1,4 @@
-"""ArduPlane's parameters -> one vector in SI for the compiled controller.
+"""ArduPlane parameters as one SI vector for the compiled controller.
 
 Source: ArduPlane 4.x parameter list (names, defaults, units); older names from its release notes.
 """
@@ -72,7 +72,7 @@ TABLE = (
     Row("KFF_RDDRMIX", 0.5, 1, 0, 2),
 )
 
-# Where each of them lies in `par`; the order is the table's.
+# Index of each parameter in `par`, in the order of the table.
 (
     PERIOD, DAMPING, XTRACK_I, LIM_BANK, WP_RADIUS, WP_MAX_RADIUS, LOITER_RAD, SLOPE_MIN, OPTIONS, ROLL_LIMIT,
     PITCH_HIGH, PITCH_LOW, PITCH_TRIM, CLIMB_MAX, SINK_MIN, SINK_MAX, TIME_CONST, THR_DAMP, PITCH_DAMP, INTEG,
@@ -82,7 +82,7 @@ TABLE = (
     PITCH_TC, PITCH_UP, PITCH_DOWN, PITCH_ROLL, PITCH_FF, PITCH_P, PITCH_I, PITCH_D, PITCH_IMAX, PITCH_FLTT, PITCH_FLTD,
     RUDDER_MIX,
 ) = range(len(TABLE))  # fmt: skip
-EAS2TAS = len(TABLE)  # true over equivalent airspeed [-]
+EAS2TAS = len(TABLE)  # ratio of true to equivalent airspeed [-]
 N_PAR = EAS2TAS + 1
 
 NAMES = tuple(row.name for row in TABLE)
@@ -90,21 +90,21 @@ DEFAULTS: dict[str, float] = {row.name: float(row.default) for row in TABLE}
 
 
 def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Turn autopilot parameters into the vector the kernels read.
+    """Convert autopilot parameters to the vector for the kernels.
 
     Args:
-        values: parameters as the autopilot names and scales them, current or older names
+        values: parameters in the names (current or older) and units of the autopilot
         altitude_m: height above mean sea level, for true airspeed [m]
     Returns:
         par: SI and rad, throttles 0..1, (N_PAR,)
-        absent: names that were missing, not finite or absurd; their defaults are in `par`
+        absent: names that are missing, not finite or out of range; `par` contains their defaults
     """
     found, absent = read(values)
     return vector(found, altitude_m), absent
 
 
 def read(values: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return every parameter of the law under its current name, in the autopilot's units, and which are defaults."""
+    """Return all parameters by current name, in the units of the autopilot, and the names at defaults."""
     given = {**_old_gains(values), **{k: float(v) for k, v in values.items()}}
     found, absent = {}, []
     for row in TABLE:
@@ -117,7 +117,7 @@ def read(values: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]
 
 
 def vector(found: Mapping[str, float], altitude_m: float = 0.0) -> np.ndarray:
-    """Turn what `read` found into SI, with true over equivalent airspeed at a height [m], (N_PAR,)."""
+    """Convert the result of `read` to SI and append the airspeed ratio at a height [m], (N_PAR,)."""
     par = np.empty(N_PAR)
     par[:EAS2TAS] = [found[row.name] * row.factor for row in TABLE]
     par[THR_MIN] = max(par[THR_MIN], 0.0)  # reverse thrust is not modelled
@@ -126,7 +126,7 @@ def vector(found: Mapping[str, float], altitude_m: float = 0.0) -> np.ndarray:
 
 
 def _order(found: dict[str, float]) -> list[str]:
-    """Put back to defaults what contradicts itself: a lower limit at or above its upper one."""
+    """Reset inconsistent limits to defaults: a lower limit at or above the upper one."""
     wrong: list[str] = []
     if not found["AIRSPEED_MIN"] < found["AIRSPEED_MAX"]:
         wrong += ["AIRSPEED_CRUISE", "AIRSPEED_MIN", "AIRSPEED_MAX"]

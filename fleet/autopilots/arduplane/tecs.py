@@ -1,8 +1,8 @@
-"""TECS: throttle holds the total energy, pitch shares it between height and speed.
+"""TECS: throttle controls total energy, pitch its distribution between height and speed.
 
     SPE = g h      SKE = V^2 / 2      STE = SPE + SKE (throttle)      SEB = w_p SPE - w_k SKE (pitch)
 
-Inside, speeds are true airspeeds and heights are up.
+Speeds are true airspeeds; heights are positive upward.
 Source: Lambregts, "Total Energy Based Flight Control System" (1983); ArduPlane TECS.
 """
 
@@ -19,7 +19,7 @@ from fleet.frames import G
 
 @kernel
 def pitch_limits(par: np.ndarray) -> tuple[float, float]:
-    """Return the lowest and highest pitch demand [rad]; a TECS limit of zero defers to the general one."""
+    """Return the lowest and highest pitch demand [rad]; a TECS limit of zero selects the general limit."""
     low = max(par[P.TECS_LOW], par[P.PITCH_LOW]) if par[P.TECS_LOW] < 0.0 else par[P.PITCH_LOW]
     high = min(par[P.TECS_HIGH], par[P.PITCH_HIGH]) if par[P.TECS_HIGH] > 0.0 else par[P.PITCH_HIGH]
     return low, high
@@ -27,13 +27,13 @@ def pitch_limits(par: np.ndarray) -> tuple[float, float]:
 
 @kernel
 def energy_rates(ctl: np.ndarray, par: np.ndarray) -> tuple[float, float]:
-    """Return the specific total energy rates of idle and full throttle [m2/s3]."""
+    """Return the specific total energy rates at idle and full throttle [m2/s3]."""
     return -par[P.SINK_MIN] * G, max(par[P.CLIMB_MAX] * ctl[S.UP], 0.1) * G
 
 
 @kernel
 def _flags(ctl: np.ndarray, par: np.ndarray, h: float, phi: float, error: float, rate: float) -> None:
-    """Notice underspeed (latched until the height is regained) and a descent at full throttle."""
+    """Detect underspeed (latched until the height is regained) and descent at full throttle."""
     too_slow = ctl[S.V_HAT] < 0.9 * slowest(par, phi) and ctl[S.THR] + ctl[S.I_THR] >= 0.95 * par[P.THR_MAX]
     ctl[S.SLOW] = 1.0 if too_slow or (ctl[S.SLOW] > 0.0 and h < ctl[S.H_IN]) else 0.0
     full = ctl[S.THR] + ctl[S.I_THR] >= 0.9 * par[P.THR_MAX]
@@ -65,7 +65,7 @@ def _throttle(ctl: np.ndarray, par: np.ndarray, h: float, h_dot: float, v_rate: 
 
 @kernel
 def _slew(ctl: np.ndarray, par: np.ndarray, thr: float, dt: float) -> float:
-    """Slew-limit the throttle, add its integrator, note saturation, limit."""
+    """Slew-limit the throttle, add its integrator, store the saturation flag, limit."""
     step = par[P.THR_SLEW] * (par[P.THR_MAX] - par[P.THR_MIN]) * dt
     ctl[S.THR] = clip(thr, ctl[S.THR] - step, ctl[S.THR] + step) if step > 0.0 else thr
     thr = ctl[S.THR] + ctl[S.I_THR]
@@ -121,7 +121,7 @@ def _pitch(ctl: np.ndarray, par: np.ndarray, h: float, h_dot: float, h_dot_c: fl
 
 @kernel
 def _integrate(ctl: np.ndarray, par: np.ndarray, demand: float, error: float, excess: float, dt: float) -> None:
-    """Integrate the balance error and the speed excess; fade both while the pitch is at its limit."""
+    """Integrate the balance error and the speed excess; decay both while pitch is at its limit."""
     low, high = pitch_limits(par)
     gain = ctl[S.V_HAT] * G
     floor, ceiling = gain * (low - 0.0873) - demand, gain * (high + 0.0873) - demand
@@ -151,7 +151,7 @@ def update(
     blind: bool,
     dt: float,
 ) -> tuple[float, float]:
-    """Return pitch and throttle for a height and a speed; call `demand.update_speed` first.
+    """Return pitch and throttle for height and speed demands; call `demand.update_speed` first.
 
     Args:
         ctl, par: controller state, parameters
@@ -159,7 +159,7 @@ def update(
         va_c: airspeed demand, equivalent [m/s]
         h, h_dot: height and climb rate, up positive [m, m/s]
         phi: roll [rad]
-        blind: no airspeed sensor
+        no_airspeed: no airspeed sensor is available
         dt: step [s]
     Returns:
         theta_c [rad], delta_t 0..1
@@ -172,7 +172,7 @@ def update(
 
 @kernel
 def reset(ctl: np.ndarray, par: np.ndarray, h: float, h_dot: float, Va: float, theta_c: float, delta_t: float) -> None:
-    """Begin without a bump: holding height `h` [m] and airspeed `Va` [m/s] takes `theta_c` [rad] and `delta_t`."""
+    """Initialise with `theta_c` [rad] and `delta_t` as trim at height `h` [m] and airspeed `Va` [m/s]."""
     V = max((Va if np.isfinite(Va) else par[P.VA_CRUISE]) * par[P.EAS2TAS], SLOWEST)
     ctl[S.V_HAT], ctl[S.V_DEM], ctl[S.V_TOP] = V, V, par[P.VA_MAX] * par[P.EAS2TAS]
     ctl[S.H_IN], ctl[S.H_LIMITED], ctl[S.H_DEM], ctl[S.H_LAST] = h, h, h, h

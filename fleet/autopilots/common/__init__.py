@@ -1,1 +1,1 @@
-"""What all control laws share: controller state, parameter vector, small compiled functions."""
+"""Common parts of all control laws: controller state, parameter vector, small compiled functions."""

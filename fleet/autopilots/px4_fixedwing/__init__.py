@@ -1,4 +1,4 @@
-"""PX4's fixed-wing control law, from its equations: NPFG guides, TECS shares energy, rate loops hold attitude.
+"""PX4 fixed-wing control law from its equations: NPFG guidance, TECS for energy, rate loops for attitude.
 
     route --path--> line or circle --npfg--> phi_c ----------------+
       +--path--> height and speed --tecs--> theta_c, delta_t --------+--attitude--> delta_a, delta_e, delta_r
@@ -9,11 +9,11 @@
     phi_c, theta_c, delta_t, over = fly(ctl, par, legs, p, v, euler, Va, Va_dot, dt)
     delta_a, delta_e, delta_r = stabilise(ctl, par, phi_c, theta_c, euler, rates, Va, dt)
 
-`fleet.autopilots.laws` makes `guide` and the shadow run of them. NPFG flies by the wind that the autopilot believes
-in: par[W_N], par[W_E] of `fleet.autopilots.common.parameter_vector`. Not modelled: terrain following, flaps,
+`fleet.autopilots.laws` provides `guide`, `fleet.autopilots.shadow` the replay. NPFG uses the wind estimate of the
+autopilot: par[W_N], par[W_E] of `fleet.autopilots.common.parameter_vector`. Not modelled: terrain following, flaps,
 landing, the upper bound of the period in wind on circles, throttle compensation for airspeed and air density.
 
-Source: see `npfg`, `tecs`; PX4 1.13 to 1.16 for the law as flown.
+Source: see `npfg`, `tecs`; PX4 1.13 to 1.16 for the implementation.
 """
 
 from fleet.autopilots.px4_fixedwing.attitude import stabilise

@@ -1,10 +1,10 @@
-"""Attitude to rates to surfaces as PX4 does it: body rates of a coordinated turn, one rate loop an axis.
+"""PX4 attitude and rate loops: body rates of a coordinated turn, one rate loop per axis.
 
     phi_dot_c = (phi_c - phi) / R_TC      theta_dot_c = (theta_c - theta) / P_TC
     psi_dot_c = g tan(phi) cos(theta) / V
     surface = FF rate_c s + s^2 (P (rate_c - rate) + I)        s = AIRSPD_TRIM / Va
 
-Gains give shares of full throw per rad/s. The derivative gains, zero by default, are not modelled.
+Gains are in fractions of full throw per rad/s. The derivative gains, zero by default, are not modelled.
 Source: PX4 fixed-wing attitude and rate controllers.
 """
 
@@ -18,19 +18,19 @@ from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import state as X
 from fleet.frames import G
 
-_STEEPEST = 1.4  # bank reckoned with in turns [rad]
-_P, _I, _IMAX = 1, 2, 3  # gains behind FF in `par`, the same order for each axis
+_STEEPEST = 1.4  # limit of roll and pitch in the turn equations [rad]
+_P, _I, _IMAX = 1, 2, 3  # offsets of the gains from FF in `par`, for each axis
 
 
 @kernel
 def _known(par: np.ndarray, Va: float) -> float:
-    """Return the airspeed within its limits; nan counts as cruise [m/s]."""
+    """Return the limited airspeed; nan is replaced by cruise [m/s]."""
     return clip(Va, par[P.VA_MIN], par[P.VA_MAX]) if np.isfinite(Va) else par[P.VA_CRUISE]
 
 
 @kernel
 def scaler(par: np.ndarray, Va: float) -> float:
-    """Return the gain for dynamic pressure [-]."""
+    """Return the dynamic-pressure scaler [-]."""
     return par[P.VA_CRUISE] / _known(par, Va) if par[P.SCALED] > 0.0 else 1.0
 
 
@@ -38,7 +38,7 @@ def scaler(par: np.ndarray, Va: float) -> float:
 def rate_demands(
     par: np.ndarray, phi_c: float, theta_c: float, euler: np.ndarray, Va: float
 ) -> tuple[float, float, float]:
-    """Return the body rates wanted [rad/s]."""
+    """Return the body rate demands [rad/s]."""
     phi, theta = clip(euler[0], -_STEEPEST, _STEEPEST), clip(euler[1], -_STEEPEST, _STEEPEST)
     phi_dot, theta_dot = (phi_c - euler[0]) / par[P.ROLL_TC], (theta_c - euler[1]) / par[P.PITCH_TC]
     psi_dot = G * tan(phi) * cos(theta) / (_known(par, Va) * par[P.EAS2TAS])
@@ -56,11 +56,11 @@ def rate_demands(
 def _rate_loop(
     ctl: np.ndarray, par: np.ndarray, slots: tuple[int, int, int], wanted: float, rate: float, s: float, dt: float
 ) -> float:
-    """Turn a wanted rate [rad/s] into a surface -1..1; slots: FF in `par`, integrator and last surface in `ctl`."""
+    """Convert a rate demand [rad/s] to a surface -1..1; slots: FF in `par`, integrator and last surface in `ctl`."""
     ff, i, last = slots
     error = wanted - rate
     step = error * par[ff + _I] * dt
-    if abs(ctl[last]) < 1.0 or step * ctl[last] < 0.0:  # at full throw the integrator may only come back
+    if abs(ctl[last]) < 1.0 or step * ctl[last] < 0.0:  # anti-windup: at full throw integrate only towards zero
         ctl[i] = clip(ctl[i] + step, -par[ff + _IMAX], par[ff + _IMAX])
     ctl[last] = par[ff] * wanted * s + s * s * (par[ff + _P] * error + ctl[i])
     return clip(ctl[last], -1.0, 1.0)
@@ -77,7 +77,7 @@ def stabilise(
     Va: float,
     dt: float,
 ) -> tuple[float, float, float]:
-    """Return the surfaces for a commanded attitude; arguments and signs as for ArduPlane's `stabilise`."""
+    """Return the surface deflections for a commanded attitude; arguments and signs as for `arduplane.stabilise`."""
     dt = max(dt, 1e-4)
     s = scaler(par, Va)
     p_d, q_d, r_d = rate_demands(par, phi_c, theta_c, euler, Va)

@@ -1,4 +1,4 @@
-"""The whole guidance step of PX4: route, NPFG and TECS together, and how a shadow run ends."""
+"""Complete guidance step of PX4: route, NPFG and TECS; and the integrator alignment after a replay."""
 
 from math import hypot
 
@@ -28,7 +28,7 @@ def init(
     theta_c: float,
     delta_t: float,
 ) -> np.ndarray:
-    """Begin on leg `k`, without a bump; arguments as for ArduPlane's `init`."""
+    """Initialise on leg `k` with bumpless transfer; arguments as for `arduplane.init`."""
     theta_c = theta_c if np.isfinite(theta_c) else euler[1]
     delta_t = delta_t if np.isfinite(delta_t) else par[P.THR_TRIM]
     ctl = np.zeros(S.N_CTL)
@@ -42,7 +42,7 @@ def init(
 
 @kernel
 def speed(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray) -> float:
-    """Return the airspeed commanded on the current leg, equivalent [m/s]."""
+    """Return the commanded equivalent airspeed on the current leg [m/s]."""
     i = leg_rules.current(ctl, legs)
     return legs[i, VA_C] if i >= 0 and legs[i, VA_C] > 0.0 else par[P.VA_CRUISE]
 
@@ -59,7 +59,7 @@ def fly(
     Va_dot: float,
     dt: float,
 ) -> tuple[float, float, float, bool]:
-    """Fly the current leg for one step without leaving it; as ArduPlane's `guide`, and whether the leg is over."""
+    """Run one guidance step on the current leg; return the result of `arduplane.guide` and whether it is complete."""
     dt = max(dt, 1e-3)
     demand.sense(ctl, v, euler, Va_dot, dt)
     demand.filter_speed(ctl, Va * par[P.EAS2TAS], par[P.VA_CRUISE] * par[P.EAS2TAS], dt)
@@ -73,9 +73,9 @@ def fly(
 
 @kernel
 def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) -> None:
-    """Shift the integrators by what the outputs missed, and put the slewed outputs where the reported ones are.
+    """Shift the integrators by the output residuals, and set slew-limited outputs to the reported values.
 
-    Arguments as for ArduPlane's `shift`.
+    Arguments as for ArduPlane.
     """
     ctl[X.I_THETA] += miss[0]
     ctl[S.THETA] = told[1] - par[P.PITCH_OFFSET] if np.isfinite(told[1]) else ctl[S.THETA] + miss[0]

@@ -1,11 +1,11 @@
-"""NPFG: which way to fly through the air so that the ground track comes back to a path and stays on it.
+"""NPFG: lateral acceleration so that the ground track converges to a path in wind.
 
     e_b = v_g tau      la = pi/2 (min(|e|/e_b, 1) - 1)^2      bearing = cos(la) towards the path + sin(la) along it
     air course from the wind triangle      a_lat = p V sin(d_chi) + curvature feed-forward, p = 4 pi zeta / T
 
-`e` is how far right of the path the aircraft is. Right is positive.
+`e` is the distance to the right of the path. Right is positive.
 Source: Stastny & Siegwart, "On Flying Backwards" (2019), and Stastny, "Low-Altitude Control and Local Re-Planning
-Strategies for Small Fixed-Wing UAVs" (2020), as flown by PX4 (NPFG).
+Strategies for Small Fixed-Wing UAVs" (2020), as implemented in PX4 (NPFG).
 """
 
 from math import atan, cos, hypot, pi, sin, sqrt
@@ -17,34 +17,34 @@ from fleet.autopilots.common.parameter_vector import W_E, W_N
 from fleet.autopilots.px4_fixedwing import params as P
 from fleet.frames import G
 
-_TIGHTEST = 0.1  # of a circle's radius: the feed-forward knows no smaller one [-]
-_FARTHEST = 500.0  # longest switch distance [m]
-_SLOWEST = 3.0  # least airspeed reckoned with [m/s]
+_TIGHTEST = 0.1  # lower limit of 1 - kappa e in the feed-forward [-]
+_FARTHEST = 500.0  # maximum switch distance [m]
+_SLOWEST = 3.0  # minimum airspeed in the equations [m/s]
 
 
 @kernel
 def period(par: np.ndarray) -> float:
-    """Return the period in force: as set, but no faster than the roll loop can follow [s]."""
+    """Return the period: the parameter, but not below the limit of the roll loop [s]."""
     least = pi * par[P.NPFG_TC] / par[P.DAMPING] * par[P.PERIOD_SF]
     return max(par[P.PERIOD], least) if par[P.LB_PERIOD] > 0.0 else par[P.PERIOD]
 
 
 @kernel
 def error_bound(par: np.ndarray, speed: float) -> float:
-    """Return the distance from which the path is flown at squarely, for a ground speed [m]."""
+    """Return the distance beyond which the path is approached at right angles, for a ground speed [m]."""
     tau = period(par) * par[P.DAMPING]
     return speed * tau if speed > 1.0 else 0.5 * tau * (speed * speed + 1.0)
 
 
 @kernel
 def switch_distance(par: np.ndarray, speed: float) -> float:
-    """Return the distance at which a waypoint is left for the next [m]."""
+    """Return the distance to a waypoint at which the next leg starts [m]."""
     return max(min(par[P.SWITCH] * error_bound(par, speed), _FARTHEST), par[P.ACC_RAD])
 
 
 @kernel
 def _air_course(par: np.ndarray, b_n: float, b_e: float, V: float) -> tuple[float, float, bool]:
-    """Return the air velocity that makes good the bearing b in the wind; into the wind where none does."""
+    """Return the air velocity for ground course b in wind, and whether it exists; else the upwind direction."""
     across = par[W_N] * b_e - par[W_E] * b_n
     if abs(across) < V:
         ahead = sqrt(V * V - across * across)
@@ -55,7 +55,7 @@ def _air_course(par: np.ndarray, b_n: float, b_e: float, V: float) -> tuple[floa
 
 @kernel
 def _turn_with(par: np.ndarray, t_n: float, t_e: float, v: np.ndarray, V: float, e: float, kappa: float) -> float:
-    """Return the lateral acceleration through the air that the path's own curvature `kappa` [1/m] asks for [m/s2]."""
+    """Return the lateral acceleration through the air for the path curvature `kappa` [1/m] [m/s2]."""
     w_t, w_c = par[W_N] * t_n + par[W_E] * t_e, par[W_N] * t_e - par[W_E] * t_n
     ratio = 1.0 + w_t / sqrt(max(V * V - w_c * w_c, 1.0))
     along = max(v[0] * t_n + v[1] * t_e, 0.0)
@@ -66,15 +66,15 @@ def _turn_with(par: np.ndarray, t_n: float, t_e: float, v: np.ndarray, V: float,
 def follow(
     par: np.ndarray, t_n: float, t_e: float, e: float, kappa: float, v: np.ndarray, psi: float, V: float
 ) -> float:
-    """Follow a path.
+    """Return the lateral acceleration to follow a path.
 
     Args:
-        par: parameters, the wind believed in among them
+        par: parameters, including the wind estimate
         t_n, t_e: unit vector along the path at its nearest point
         e: distance right of it [m]
         kappa: its curvature, positive to the right [1/m]
         v: ground velocity, NED, (3,) [m/s]
-        psi: heading, where there is no air velocity [rad]
+        psi: heading, used without air velocity [rad]
         V: true airspeed [m/s]
     Returns:
         lateral acceleration, right positive [m/s2]
@@ -98,7 +98,7 @@ def follow(
 
 @kernel
 def to_roll(par: np.ndarray, a_lat: float, before: float, dt: float) -> float:
-    """Turn lateral acceleration [m/s2] into bank, limited, and slewed from the bank demanded before [rad]."""
+    """Convert lateral acceleration [m/s2] to bank, limited and slew-limited from the previous demand [rad]."""
     phi = clip(atan(a_lat / G), -par[P.ROLL_LIMIT], par[P.ROLL_LIMIT])
     step = par[P.ROLL_SLEW] * dt
     return clip(phi, before - step, before + step) if step > 0.0 else phi

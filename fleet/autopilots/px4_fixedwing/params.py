@@ -1,4 +1,4 @@
-"""PX4's parameters for fixed wings -> one vector in SI for the compiled controller.
+"""PX4 fixed-wing parameters as one SI vector for the compiled controller.
 
 Source: PX4 parameter reference 1.13 to 1.16 (names, defaults, units); older names from its release notes.
 """
@@ -73,7 +73,7 @@ TABLE = (
     Row("FW_YR_IMAX", 0.2, 1, 0, 1),
 )
 
-# Where each of them lies in `par`; the order is the table's.
+# Index of each parameter in `par`, in the order of the table.
 (
     PERIOD, DAMPING, NPFG_TC, SWITCH, PERIOD_SF, LB_PERIOD, ROLL_LIMIT, ROLL_SLEW, ACC_RAD, LOITER_RAD, ALT_RAD,
     CLIMB_MAX, SINK_MIN, SINK_MAX, CLIMB, SINK, ALT_TC, TAS_TC, H_RATE_FF, PITCH_DAMP, THR_DAMP, I_PITCH, I_THROTTLE,
@@ -82,25 +82,25 @@ TABLE = (
     ROLL_TC, PITCH_TC, ROLL_RMAX, PITCH_UP, PITCH_DOWN, YAW_RMAX, SCALED,
     ROLL_FF, ROLL_P, ROLL_I, ROLL_IMAX, PITCH_FF, PITCH_P, PITCH_I, PITCH_IMAX, YAW_FF, YAW_P, YAW_I, YAW_IMAX,
 ) = range(len(TABLE))  # fmt: skip
-EAS2TAS = len(TABLE)  # true over equivalent airspeed [-]
+EAS2TAS = len(TABLE)  # ratio of true to equivalent airspeed [-]
 
 NAMES = tuple(row.name for row in TABLE)
 DEFAULTS: dict[str, float] = {row.name: float(row.default) for row in TABLE}
-_TOGETHER = (  # lower, upper, and what falls back with them where they contradict each other
+_TOGETHER = (  # lower limit, upper limit, value: all reset to defaults if inconsistent
     (VA_MIN, VA_MAX, VA_CRUISE),
     (THR_MIN, THR_MAX, THR_TRIM),
 )
 
 
 def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Turn autopilot parameters into the vector the kernels read.
+    """Convert autopilot parameters to the vector for the kernels.
 
     Args:
-        values: parameters as the autopilot names and scales them, current or older names
+        values: parameters in the names (current or older) and units of the autopilot
         altitude_m: height above mean sea level, for true airspeed [m]
     Returns:
-        par: SI and rad, throttles 0..1, calm air, (N_PAR,)
-        absent: names that were missing, not finite or absurd; their defaults are in `par`
+        par: SI and rad, throttles 0..1, no wind, (N_PAR,)
+        absent: names that are missing, not finite or out of range; `par` contains their defaults
     """
     given = {name: float(value) for name, value in values.items()}
     found = [find(row, given) for row in TABLE]

@@ -1,6 +1,6 @@
-"""Which path is flown, when its leg is over, and how high to be on it.
+"""Path, leg sequencing and height demand of PX4.
 
-A waypoint is reached within the switch distance and the height accepted; what was missed is flown to again.
+A waypoint is reached within the switch distance and the height tolerance; a missed waypoint is approached again.
 Source: PX4 navigator (mission items) and its fixed-wing mode manager (lines, circles, first-order altitude hold).
 """
 
@@ -17,13 +17,13 @@ from fleet.autopilots.px4_fixedwing import state as X
 from fleet.frames import wrap
 from fleet.mission import ACCEPT, KIND, LAND, LOITER_UNLIMITED, P_D, P_E, P_N, RADIUS, TAKEOFF, WAYPOINT
 
-_EXIT = pi / 15  # leave a circle within 12 deg of the way out, where that is asked for [rad]
-_ON = 1.2  # of the switch distance: so near to a circle its time runs [-]
+_EXIT = pi / 15  # exit from a circle within 12 deg of the exit course, if required [rad]
+_ON = 1.2  # distance to a circle, in switch distances, that counts as reached [-]
 
 
 @kernel
 def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndarray) -> None:
-    """Go on to leg `k`; its line begins at the point of the leg before, else at the aircraft `p`, NED (3,) [m]."""
+    """Switch to leg `k`; its line starts at the point of the previous leg, else at the aircraft `p`, NED (3,) [m]."""
     i = leg_rules.current(ctl, legs)
     onward = i >= 0 and k == i + 1 and int(legs[i, KIND]) != TAKEOFF
     leg_rules.set_leg(ctl, par, legs, k, legs[i, P_N : P_D + 1] if onward else p)
@@ -32,7 +32,7 @@ def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndar
 
 @kernel
 def _to_point(n: float, e: float, p: np.ndarray) -> tuple[float, float, float]:
-    """Return the straight way to a point: direction, no error."""
+    """Return the direction to a point, and zero crosstrack error."""
     d_n, d_e = n - p[0], e - p[1]
     far = max(hypot(d_n, d_e), 0.1)
     return d_n / far, d_e / far, 0.0
@@ -40,7 +40,7 @@ def _to_point(n: float, e: float, p: np.ndarray) -> tuple[float, float, float]:
 
 @kernel
 def _line(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, reach: float) -> tuple[float, float, float]:
-    """Return direction and error of the line; before its begin the way there, past its end the way back."""
+    """Return direction and crosstrack error of the line; beyond its ends the direction to the nearer end."""
     a_n, a_e = ctl[S.PREV_N], ctl[S.PREV_E]
     along, length = leg_rules.along_line(ctl, leg, p)
     if length < 1.0 or along > length:
@@ -73,7 +73,7 @@ def steer(
     V: float,
     dt: float,
 ) -> tuple[float, bool]:
-    """Guide along the current leg without leaving it.
+    """Compute lateral guidance on the current leg.
 
     Args:
         ctl, par, legs: controller state, parameters, route
@@ -82,7 +82,7 @@ def steer(
         V: true airspeed [m/s]
         dt: step [s]
     Returns:
-        lateral acceleration, right positive [m/s2]; whether the leg is over
+        lateral acceleration, right positive [m/s2]; whether the leg is complete
     """
     i = leg_rules.current(ctl, legs)
     if i < 0:
@@ -105,7 +105,7 @@ def _along_line(
     par: np.ndarray, ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, v: np.ndarray, psi: float, V: float,
     reach: float, radius: float,
 ) -> tuple[float, bool]:  # fmt: skip
-    """Follow the line to a waypoint; circle there while the height is still far off."""
+    """Follow the line to a waypoint; circle there while the height error is large."""
     to_go, off = hypot(leg[P_N] - p[0], leg[P_E] - p[1]), abs(p[2] - leg[P_D])
     waypoint = int(leg[KIND]) == WAYPOINT
     if waypoint and to_go < 2.0 * abs(radius) and off > 2.0 * par[P.ALT_RAD] and (to_go < reach or ctl[S.AROUND] > 0):
@@ -124,7 +124,7 @@ def _along_line(
 def _count(
     ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, radius: float, reach: float, dt: float
 ) -> None:
-    """Add up the angle and the time flown since the circle was reached, at its height."""
+    """Integrate angle and time since reaching the circle at its height."""
     out_n, out_e = leg[P_N] - p[0], leg[P_E] - p[1]
     bearing = atan2(out_e, out_n)
     if ctl[S.ON] > 0.0:
@@ -137,7 +137,7 @@ def _count(
 
 @kernel
 def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.ndarray) -> bool:
-    """Tell whether a circle is flown: its time or height is over, and it heads the way out where that is asked for."""
+    """Return whether a circle is complete: time or height reached, and exit course if required."""
     leg = legs[i]
     if i + 1 >= legs.shape[0] or int(leg[KIND]) == LOITER_UNLIMITED or ctl[S.ON] == 0.0:
         return False
@@ -150,7 +150,7 @@ def _circled(ctl: np.ndarray, legs: np.ndarray, i: int, p: np.ndarray, v: np.nda
 
 @kernel
 def height_demand(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, speed: float) -> float:
-    """Return the height to be at, up positive [m]: linear in the way left to the switch distance, else at once.
+    """Return the height demand [m]: linear in the remaining distance to the switch distance, else constant.
 
     Args:
         ctl, par, legs: controller state, parameters, route

@@ -1,10 +1,10 @@
-"""The flat memory of PX4's controller: slots of `ctl` by name.
+"""State of the PX4 controller: indices of `ctl` by name.
 
-The leg, the airspeed filter and the throttle and pitch in force lie where ArduPlane's controller has them
-(`arduplane.state`), so that both share the code for them. The slots below mean something else here.
+Leg, airspeed filter, throttle and pitch have the indices of the ArduPlane controller (`common.controller_state`), so
+that both share code. The indices below have a different meaning here.
 """
 
-NEAREST = 10  # least distance to the waypoint so far, -1 before [m]
+NEAREST = 10  # minimum distance to the waypoint so far, -1 before [m]
 PHI = 12  # roll demand, slew-limited [rad]
 H_REF, H_DOT_REF = 25, 26  # height reference, up positive [m], and its rate [m/s]
 STE_DOT = 31  # filtered total energy rate [m2/s3]

@@ -1,9 +1,9 @@
-"""TECS as PX4 has it: throttle holds the rate of total energy, pitch the rate at which height and speed share it.
+"""TECS of PX4: throttle controls the total energy rate, pitch the energy balance rate of height and speed.
 
     h_dot_c = (h_ref - h) / ALT_TC + HRATE_FF h_dot_ref        V_dot_c = (V_c - V) / TAS_TC
     STE_dot = g h_dot + V V_dot (throttle)        SEB_dot = w_p g h_dot - w_k V V_dot (pitch)
 
-Inside, speeds are true airspeeds and heights are up.
+Speeds are true airspeeds; heights are positive upward.
 Source: Lambregts, "Total Energy Based Flight Control System" (1983); PX4 TECS.
 """
 
@@ -18,12 +18,12 @@ from fleet.autopilots.px4_fixedwing import params as P
 from fleet.autopilots.px4_fixedwing import state as X
 from fleet.frames import G
 
-_MARGIN = 0.15  # of cruise: below the least speed by this much, underspeed begins; by twice, it is complete [-]
+_MARGIN = 0.15  # fraction of cruise: underspeed starts one margin below minimum speed, and is full at two [-]
 
 
 @kernel
 def _reference(ctl: np.ndarray, par: np.ndarray, h_sp: float, dt: float) -> None:
-    """Move the height reference: its rate changes by VERT_ACC at most, and it comes to rest on the set point."""
+    """Advance the height reference to the set point with limited rate and acceleration (VERT_ACC)."""
     off = h_sp - ctl[X.H_REF]
     fastest = min(sqrt(2.0 * par[P.VERT_ACC] * abs(off)), abs(off) / dt)
     wanted = min(fastest, par[P.CLIMB]) if off > 0.0 else -min(fastest, par[P.SINK])
@@ -34,7 +34,7 @@ def _reference(ctl: np.ndarray, par: np.ndarray, h_sp: float, dt: float) -> None
 
 @kernel
 def _underspeed(ctl: np.ndarray, par: np.ndarray, blind: bool) -> float:
-    """Return how far underspeed is, 0..1."""
+    """Return the degree of underspeed, 0..1."""
     if blind:
         return 0.0
     margin = _MARGIN * par[P.VA_CRUISE] * par[P.EAS2TAS]
@@ -64,7 +64,7 @@ def _pitch(ctl: np.ndarray, par: np.ndarray, h_dot: float, wanted: tuple[float, 
 
 @kernel
 def trim_throttle(par: np.ndarray, ste_dot: float) -> float:
-    """Return the throttle that a total energy rate [m2/s3] is known to take: linear between idle, trim and full."""
+    """Return the trim throttle for a total energy rate [m2/s3]: linear between idle, trim and full."""
     if ste_dot >= 0.0:
         return par[P.THR_TRIM] + ste_dot / (par[P.CLIMB_MAX] * G) * (par[P.THR_MAX] - par[P.THR_TRIM])
     return par[P.THR_TRIM] - ste_dot / (par[P.SINK_MIN] * G) * (par[P.THR_MIN] - par[P.THR_TRIM])
@@ -109,9 +109,9 @@ def update(
     blind: bool,
     dt: float,
 ) -> tuple[float, float]:
-    """Return pitch and throttle for a height and a speed; arguments as for ArduPlane's `tecs.update`.
+    """Return pitch and throttle for height and speed demands; arguments as for `arduplane.tecs.update`.
 
-    Call `demand.sense` and `demand.filter_speed` first.
+    Call `demand.update_acceleration` and `demand.filter_speed` first.
     """
     _reference(ctl, par, h_sp, dt)
     h_dot_c = (ctl[X.H_REF] - h) / par[P.ALT_TC] + par[P.H_RATE_FF] * ctl[X.H_DOT_REF]
@@ -128,7 +128,7 @@ def update(
 
 @kernel
 def reset(ctl: np.ndarray, par: np.ndarray, h: float, h_dot: float, Va: float, theta_c: float, delta_t: float) -> None:
-    """Begin without a bump: climbing on at `h_dot` [m/s] at airspeed `Va` [m/s] takes `theta_c` [rad] and `delta_t`."""
+    """Initialise with `theta_c` [rad] and `delta_t` as trim at climb rate `h_dot` [m/s] and airspeed `Va` [m/s]."""
     V = max((Va if np.isfinite(Va) else par[P.VA_CRUISE]) * par[P.EAS2TAS], SLOWEST)
     ctl[S.V_HAT] = V
     ctl[X.H_REF], ctl[X.H_DOT_REF], ctl[X.STE_DOT] = h, clip(h_dot, -par[P.SINK], par[P.CLIMB]), G * h_dot

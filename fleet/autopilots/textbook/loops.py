@@ -1,6 +1,6 @@
-"""Loops within loops: course to bank, height to pitch, airspeed to throttle, attitude to surfaces.
+"""Cascaded loops: course to bank, height to pitch, airspeed to throttle, attitude to surfaces.
 
-Source: Beard & McLain, "Small Unmanned Aircraft" (2012), chapter 6; the feed-forwards are ours.
+Source: Beard & McLain, "Small Unmanned Aircraft" (2012), chapter 6; the feed-forward terms are additions.
 """
 
 from math import asin, atan2, cos, hypot
@@ -17,8 +17,8 @@ from fleet.autopilots.textbook import state as X
 from fleet.frames import G, wrap
 from fleet.mission import VA_C
 
-_CLIMB_S = 4.0  # a height error is worked off in such a time at first [s]
-_NEAR = 10.0  # height error the proportional and integral parts see at most [m]
+_CLIMB_S = 4.0  # time constant from height error to climb rate [s]
+_NEAR = 10.0  # limit of the height error in the proportional and integral terms [m]
 
 
 @making
@@ -34,7 +34,7 @@ def init(
     theta_c: float,
     delta_t: float,
 ) -> np.ndarray:
-    """Begin on leg `k`, without a bump; arguments as for ArduPlane's `init`."""
+    """Initialise on leg `k` with bumpless transfer; arguments as for `arduplane.init`."""
     theta_c = theta_c if np.isfinite(theta_c) else euler[1]
     delta_t = delta_t if np.isfinite(delta_t) else par[P.THR_TRIM]
     ctl = np.zeros(S.N_CTL)
@@ -60,7 +60,7 @@ def fly(
     Va_dot: float,
     dt: float,
 ) -> tuple[float, float, float, bool]:
-    """Fly the current leg for one step without leaving it; as ArduPlane's `guide`, and whether the leg is over."""
+    """Run one guidance step on the current leg; return the result of `arduplane.guide` and whether it is complete."""
     dt, speed = max(dt, 1e-3), hypot(v[0], v[1])
     demand.sense(ctl, v, euler, Va_dot, dt)
     demand.filter_speed(ctl, Va * par[P.EAS2TAS], par[P.CRUISE] * par[P.EAS2TAS], dt)
@@ -116,7 +116,7 @@ def stabilise(
     Va: float,
     dt: float,
 ) -> tuple[float, float, float]:
-    """Return the surfaces for a commanded attitude; arguments and signs as for ArduPlane's `stabilise`."""
+    """Return the surface deflections for a commanded attitude; arguments and signs as for `arduplane.stabilise`."""
     delta_a = clip(par[P.K_P_PHI] * (phi_c - euler[0]) - par[P.K_D_PHI] * rates[0] + ctl[X.I_A], -1.0, 1.0)
     free = par[P.K_P_THETA] * (theta_c - euler[1]) - par[P.K_D_THETA] * rates[1] + ctl[X.I_E]
     delta_e = clip(free, -1.0, 1.0)
@@ -127,7 +127,7 @@ def stabilise(
 
 @kernel
 def shift(ctl: np.ndarray, par: np.ndarray, miss: np.ndarray, told: np.ndarray) -> None:
-    """Shift the integrators by what the outputs missed; arguments as for ArduPlane's `shift`."""
+    """Shift the integrators by the output residuals; arguments as for ArduPlane."""
     ctl[X.I_H] += miss[0]
     ctl[X.I_V] += miss[1]
     ctl[X.I_A] = clip(ctl[X.I_A] + miss[2], -1.0, 1.0)

@@ -1,6 +1,6 @@
-"""The numbers of the textbook's autopilot, by the names of the book -> one vector for the compiled controller.
+"""Parameters of the textbook autopilot, with the names of the book, as one vector for the compiled controller.
 
-The defaults are ours, for a small aircraft.
+The defaults suit a small aircraft.
 """
 
 from collections.abc import Mapping
@@ -49,7 +49,7 @@ DEFAULTS: dict[str, float] = {row.name: float(row.default) for row in TABLE}
 
 
 def parameters(values: Mapping[str, float], altitude_m: float = 0.0) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Turn parameters into the vector the kernels read; arguments and answer as for PX4's `parameters`."""
+    """Convert parameters to the vector for the kernels; arguments and result as for PX4."""
     given = {name: float(value) for name, value in values.items()}
     found = [find(row, given) for row in TABLE]
     own = [row.default if value is None else value for row, value in zip(TABLE, found, strict=True)]

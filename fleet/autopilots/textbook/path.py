@@ -1,4 +1,4 @@
-"""Which course to fly: the vector field of a line, of an orbit, of a fillet between two lines.
+"""Course demand: vector field of a line, of an orbit and of a fillet between two lines.
 
 Source: Beard & McLain, "Small Unmanned Aircraft" (2012), sections 10.1, 10.2 and 11.1.
 """
@@ -15,13 +15,13 @@ from fleet.autopilots.textbook import state as X
 from fleet.frames import G, wrap
 from fleet.mission import KIND, LAND, LOITER_UNLIMITED, P_D, P_E, P_N, RADIUS, TAKEOFF, WAYPOINT
 
-_ON = 1.3  # of its radius: so near to an orbit its time runs [-]
-_SHARPEST = 2.6  # turn that a fillet is reckoned for [rad]
+_ON = 1.3  # distance to the centre, in radii, that counts as orbit reached [-]
+_SHARPEST = 2.6  # maximum turn angle of a fillet [rad]
 
 
 @kernel
 def _turn(ctl: np.ndarray, leg: np.ndarray, after: np.ndarray) -> tuple[float, float, float, float, float]:
-    """Return the direction of this line and of the next, and the turn between them, right positive [rad]."""
+    """Return the directions of this line and the next, and the turn angle between them, right positive [rad]."""
     here = atan2(leg[P_E] - ctl[S.PREV_E], leg[P_N] - ctl[S.PREV_N])
     there = atan2(after[P_E] - leg[P_E], after[P_N] - leg[P_N])
     return cos(here), sin(here), cos(there), sin(there), wrap(there - here)
@@ -29,13 +29,13 @@ def _turn(ctl: np.ndarray, leg: np.ndarray, after: np.ndarray) -> tuple[float, f
 
 @kernel
 def _cut(par: np.ndarray, turn: float) -> float:
-    """Return how far from the corner the fillet touches the lines [m]."""
+    """Return the distance from the corner to the tangent points of the fillet [m]."""
     return par[P.FILLET] * tan(min(abs(turn), _SHARPEST) / 2)
 
 
 @kernel
 def begin(ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, k: int, p: np.ndarray) -> None:
-    """Go on to leg `k` over a fillet, or from the aircraft `p`, NED (3,) [m], where two lines do not meet."""
+    """Switch to leg `k` over a fillet, or from the aircraft `p`, NED (3,) [m], if the lines do not meet."""
     i = leg_rules.current(ctl, legs)
     onward = i >= 0 and k == i + 1 and k < legs.shape[0] and int(legs[i, KIND]) == WAYPOINT
     if not onward:
@@ -63,7 +63,7 @@ def _to_line(ctl: np.ndarray, par: np.ndarray, leg: np.ndarray, p: np.ndarray, c
 
 @kernel
 def _to_orbit(par: np.ndarray, n: float, e: float, radius: float, p: np.ndarray, v: np.ndarray) -> tuple[float, float]:
-    """Return course and bank on an orbit round (n, e), radius positive clockwise [m]. Source: eq. 10.13."""
+    """Return course and bank on an orbit around (n, e), radius positive clockwise [m]. Source: eq. 10.13."""
     d, wide = 1.0 if radius > 0.0 else -1.0, max(abs(radius), 1.0)
     out_n, out_e = p[0] - n, p[1] - e
     chi = atan2(out_e, out_n) + d * (pi / 2 + atan(par[P.K_ORBIT] * (hypot(out_n, out_e) - wide) / wide))
@@ -75,12 +75,12 @@ def _to_orbit(par: np.ndarray, n: float, e: float, radius: float, p: np.ndarray,
 def course(
     ctl: np.ndarray, par: np.ndarray, legs: np.ndarray, p: np.ndarray, v: np.ndarray, chi: float, dt: float
 ) -> tuple[float, float, bool]:
-    """Return course and bank of the path, and whether the leg is over.
+    """Return course and bank demands of the path, and whether the leg is complete.
 
     Args:
         ctl, par, legs: controller state, parameters, route
         p, v: position and ground velocity, NED, (3,) [m, m/s]
-        chi: course flown [rad]
+        chi: current course [rad]
         dt: step [s]
     """
     i = leg_rules.current(ctl, legs)
@@ -107,7 +107,7 @@ def course(
 
 @kernel
 def _orbited(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, radius: float, dt: float) -> bool:
-    """Add up what is flown of an orbit; tell whether it is enough."""
+    """Integrate angle and time on an orbit; return whether it is complete."""
     n, e = leg[P_N] - p[0], leg[P_E] - p[1]
     bearing = atan2(e, n)
     if ctl[S.ON] > 0.0:
@@ -121,7 +121,7 @@ def _orbited(ctl: np.ndarray, leg: np.ndarray, p: np.ndarray, radius: float, dt:
 
 @kernel
 def height_demand(ctl: np.ndarray, legs: np.ndarray, p: np.ndarray) -> float:
-    """Return the height to be at, up positive: linear along a line that begins at a waypoint, at once elsewhere [m].
+    """Return the height demand: linear along a line that starts at a waypoint, else constant [m].
 
     Args:
         ctl, legs: controller state, route

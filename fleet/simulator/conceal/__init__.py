@@ -1,15 +1,15 @@
-"""The concealer of a blind examination: it flies JSBSim flights and hides in some what no simulation of theirs knows.
+"""Simulation of blind test flights with JSBSim, some with hidden effects.
 
-    effects      THE TABLE of what may be hidden, on which airframe, how large
-    roles        how many flights hide nothing, one effect, two, one that no catalogue lists; which effects go together
-    paths        missions of an examination, and the test pilot's inputs
-    plan         one planned flight: aircraft, mission, weather, what is hidden since when
-    record       fly it, with and without what is hidden; keep it in a sane envelope
-    acts         does it act: the difference over the noise
-    truth        what is hidden in the units a report uses, by JSBSim's own account
-    cards        what an operator knows of the aircraft
-    exam         the whole examination
+    effects      table of the hidden effects: airframe, channel, time profile, magnitude
+    roles        number of flights with no, one, two or one uncatalogued effect; which effects are separable
+    paths        missions of the blind test, and the inputs of the test pilot
+    plan         one planned flight: aircraft, mission, weather, hidden effects and their onset
+    record       simulate a flight with and without the effects; check the flight envelope
+    acts         strength of an effect: difference over sensor noise
+    truth        true parameters in the units of a report, from the draw or from JSBSim
+    cards        airframe data that an operator has
+    exam         all flights of a blind test
 
-The effects are JSBSim's own physics, and faults of servos and sensors; nothing of the twin's effects, simulation or
-diagnosis is imported: one code must never both conceal and find.
+The effects come from JSBSim and from faults of servos and sensors. The package imports nothing from the effects,
+simulation or diagnosis of the twin, so that the same code never both conceals and identifies an effect.
 """

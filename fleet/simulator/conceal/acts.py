@@ -1,8 +1,7 @@
-"""Does a hidden effect act on its flight: what it changes, over the noise of the sensors.
+"""Strength of a hidden effect on its flight, relative to sensor noise.
 
-Two comparisons. Within one flight, ten times a second: the same aircraft in the same state with the effect and without,
-in commands, readings, forces and moments; it decides. And two flights of one seed, one with the effect and one without:
-whatever acts makes them part.
+Two comparisons. The first is decisive: within one flight, at 10 Hz, commands, readings, forces and moments of the same
+state with and without the effect. The second compares two flights of the same seed, with and without the effect.
 """
 
 import numpy as np
@@ -16,19 +15,19 @@ from fleet.simulator.faults.physics import CHANGES, WINDS
 from fleet.simulator.flight.uav import PretendUav
 from fleet.simulator.vehicle.jsbsim import DT
 
-_AT_ONCE: dict[str, float] = {  # what can be seen in one channel of one instant, as `sensors` has it
-    **dict.fromkeys(("aileron", "elevator", "rudder", "throttle"), 0.01),  # share of full travel
+_AT_ONCE: dict[str, float] = {  # noise per channel and sample, as in `sensors`
+    **dict.fromkeys(("aileron", "elevator", "rudder", "throttle"), 0.01),  # fraction of full travel
     **dict.fromkeys(("p", "q", "r"), 0.003),  # [rad/s]
     **dict.fromkeys(("a_x", "a_y", "a_z"), 0.07),  # [m/s2]
     **dict.fromkeys(("phi", "theta", "psi"), 0.0044),  # [rad]
     **dict.fromkeys(("v_n", "v_e", "v_d"), 0.075),  # [m/s]
     "Va": 0.25,
     "baro": 0.4,  # [m/s], [m]
-    **dict.fromkeys(("p_dot", "q_dot", "r_dot"), 0.006),  # of the gyros, derived up to 1.5 Hz [rad/s2]
+    **dict.fromkeys(("p_dot", "q_dot", "r_dot"), 0.006),  # derivative of the gyros up to 1.5 Hz [rad/s2]
     **dict.fromkeys(("f_x", "f_y", "f_z"), 0.07),  # [m/s2]
     **dict.fromkeys(("w_n", "w_e", "w_d"), 0.25),  # [m/s]
 }
-_FLOWN: dict[str, float] = {  # columns of `Log.seen`
+_FLOWN: dict[str, float] = {  # columns of `ExamFlightLog.channels`
     **{name: _AT_ONCE[name] for name in ("p", "q", "r", "a_x", "a_y", "a_z", "phi", "theta", "psi")},
     **{name: _AT_ONCE[name] for name in ("v_n", "v_e", "v_d")},
     **dict.fromkeys(("p_n", "p_e", "p_d"), 0.5),  # [m]
@@ -37,21 +36,21 @@ _FLOWN: dict[str, float] = {  # columns of `Log.seen`
     "satellites": 1.5,  # [m/s], [m], [m]
     **{name: _AT_ONCE[name] for name in ("aileron", "elevator", "throttle", "rudder")},
 }
-_LATE = ("turbulence", "flap_deployed", "thrust_loss", "_surging_engine")  # no instant tells them
+_LATE = ("turbulence", "flap_deployed", "thrust_loss", "_surging_engine")  # not observable in a single sample
 _SHAKEN = ("p", "q", "r", "a_y", "a_z", "Va")
 LEAST = 2.0  # rms over the noise
 
 
 def acts(planned: Planned, fault: Fault, log: Log) -> dict[str, object]:
-    """Tell how strongly one hidden effect acts while it is there.
+    """Compute the strength of one hidden effect while it is active.
 
     Args:
         planned: the flight
-        fault: one of those it hides
-        log: the flight with all it hides
+        fault: one of its hidden faults
+        log: the flight with all hidden faults
     Returns:
-        name; over_noise, channel: rms over the noise in the most telling channel; flown_over_noise, flown_channel: rms
-        difference between two flights
+        name; over_noise, channel: largest rms over noise and its channel; flown_over_noise, flown_channel: the same for
+        the difference of two flights
     """
     without, _ = fly(planned, tuple(x for x in planned.hidden if x is not fault))
     there = np.array([fault.share(t) > 0 for t in log.t])
@@ -68,7 +67,7 @@ def acts(planned: Planned, fault: Fault, log: Log) -> dict[str, object]:
 
 
 def _flown(with_it: np.ndarray, without: np.ndarray, shaken: bool) -> tuple[float, str]:
-    """Compare two flights; what only shakes is seen in the scatter. Where it flew is no evidence."""
+    """Compare two flights; turbulence by its variance. Horizontal position and velocity are no evidence."""
     names = list(_FLOWN)
     difference = with_it - without
     turns = [names.index(name) for name in ("phi", "psi")]
@@ -87,7 +86,7 @@ def _most(rms: dict[str, float], telling: object) -> tuple[float, str]:
 
 
 def _at_once(planned: Planned, fault: Fault, there: np.ndarray) -> tuple[float, str]:
-    """Fly again, and compare within the flight."""
+    """Repeat the flight and compare with and without the fault at each sample."""
     rows: list[np.ndarray] = []
     fly(planned, planned.hidden, look=lambda uav: rows.append(_changed(uav, fault)))
     size = np.sqrt(np.mean(np.array(rows)[there] ** 2, axis=0)) / np.array(list(_AT_ONCE.values()))
@@ -95,7 +94,7 @@ def _at_once(planned: Planned, fault: Fault, there: np.ndarray) -> tuple[float, 
 
 
 def _changed(uav: PretendUav, fault: Fault) -> np.ndarray:
-    """Return what one fault changes at this instant, columns as in `_AT_ONCE`."""
+    """Return the changes by one fault at this instant, columns as in `_NOISE`."""
     t, carried = uav.tick * DT, uav.carried
     assert carried is not None
     felt, blown = np.zeros(6), np.zeros(3)
@@ -107,7 +106,7 @@ def _changed(uav: PretendUav, fault: Fault) -> np.ndarray:
 
 
 def _forces(uav: PretendUav, carried: Carried, fault: Fault, t: float) -> np.ndarray:
-    """Work out moments and forces with and without a fault; servos move on a little each time, so with it twice."""
+    """Return the change of moments and forces by a fault; evaluate twice with it, since servos advance each time."""
     before = uav.aircraft.ponder()
     carried.press(t, without=fault)
     without = uav.aircraft.ponder()

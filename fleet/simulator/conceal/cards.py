@@ -1,4 +1,4 @@
-"""What an operator knows of an aircraft before any flight: mass with the average load, inertia, geometry, throws."""
+"""Airframe data that an operator has before any flight: mass with average payload, inertia, geometry, throws."""
 
 from math import degrees
 
@@ -10,7 +10,7 @@ from fleet.simulator.vehicle.jsbsim import KG_TO_LB, Aircraft
 from fleet.simulator.vehicle.weather import FT
 
 _SLUG_FT2 = 1.3558179483  # [kg m2]
-_FULL_DEG = {  # down and up, left and right, by the sign of the command: + rolls right, pitches up, yaws right
+_FULL_DEG = {  # for command -1 and +1; + rolls right, pitches up, yaws right
     "c172p": {"aileron": [-20.0, 15.0], "elevator": [-23.0, 28.0], "rudder": [-16.0, 16.0]},
     "small": {name: [-degrees(0.4363), degrees(0.4363)] for name in ("aileron", "elevator", "rudder")},
 }
@@ -19,7 +19,7 @@ _PROPELLER_M = {"c172p": 1.905, "small": 0.508}
 
 
 def card(airframe: str) -> dict[str, object]:
-    """Return the operator's card of an airframe in SI; throws in degrees."""
+    """Return the data of an airframe in SI; throws in degrees."""
     kind = altered(airframe)
     aircraft = Aircraft(FIELD, 0, kind=kind)
     aircraft[f"inertia/pointmass-weight-lbs{kind.varied}"] = sum(kind.payload_kg) / 2 * KG_TO_LB
@@ -32,7 +32,7 @@ def card(airframe: str) -> dict[str, object]:
         "b": aircraft["metrics/bw-ft"] * FT,
         "c": aircraft["metrics/cbarw-ft"] * FT,
         **inertia,
-        "Ixz": -aircraft["inertia/ixz-slugs_ft2"] * _SLUG_FT2,  # the integral of x z; JSBSim tells the matrix element
+        "Ixz": -aircraft["inertia/ixz-slugs_ft2"] * _SLUG_FT2,  # product of inertia; JSBSim returns the matrix element
         "Dprop": _PROPELLER_M[airframe],
         "surface_full_deg": _FULL_DEG[airframe],
     }

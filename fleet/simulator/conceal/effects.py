@@ -1,7 +1,7 @@
-"""THE TABLE of what may be hidden: on which airframe, in which channel, how it comes, how large.
+"""Table of hidden effects: airframe, channel, time profile and magnitude.
 
-Magnitudes are what an engineer would call a real defect; `told` are the numbers a report should give, in its units,
-where they are known beforehand. Names that begin with _ stand in no catalogue.
+Magnitudes are those of realistic defects. `reported` lists the values that a report should contain, in its units, where
+they are known beforehand. Names that begin with _ are not in the catalogue.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,21 +13,21 @@ from fleet.simulator.faults.servos import SURFACES
 
 Values = dict[str, float]
 Draw = Callable[[np.random.Generator, bool], Values]
-"""(source of chance, is it the small one) to the fault's values."""
+"""(random generator, is the small aircraft) to the values of the fault."""
 
 BOTH, CESSNA, SMALL = ("c172p", "small"), ("c172p",), ("small",)
-SERVO_LAG_S = {"c172p": 0.0, "small": 1 / 22}  # of the healthy servo, as its aircraft file says
+SERVO_LAG_S = {"c172p": 0.0, "small": 1 / 22}  # of the healthy servo, from the aircraft file
 
 
 class Hidden(NamedTuple):
-    """One effect that may be hidden."""
+    """One effect that can be hidden."""
 
-    channel: str  # two of one channel hide each other
+    channel: str  # effects of one channel are not separable
     draw: Draw
-    comes: tuple[str, ...] = ("always", "step")  # ways it may come; of each equally often
+    comes: tuple[str, ...] = ("always", "step")  # time profiles, equally probable
     airframes: tuple[str, ...] = BOTH
     of: tuple[str, ...] = ("",)
-    told: tuple[str, ...] | None = ()  # values that a report should give; None: all of them
+    told: tuple[str, ...] | None = ()  # values that a report should contain; None: all
 
 
 def _signed(rng: np.random.Generator, low: float, high: float) -> float:
@@ -105,7 +105,7 @@ HIDDEN: dict[str, Hidden] = {
     "gyro_bias": Hidden("imu", _either("bias_dps", *_same(0.7, 2.0)), of=("p", "q", "r"), told=None),
     "accel_bias": Hidden("imu", _either("bias_mps2", *_same(0.3, 0.8)), of=("x", "y", "z"), told=None),
     "heading_bias": Hidden("heading", _either("bias_deg", *_same(6.0, 15.0)), told=None),
-    # a constant one is the sea level pressure of the day
+    # a constant bias is equivalent to a different sea level pressure
     "baro_bias": Hidden("baro", _either("bias_m", (10.0, 25.0), (8.0, 20.0)), _STEPS, told=None),
 }
 UNKNOWN: dict[str, Hidden] = {
@@ -122,7 +122,7 @@ UNKNOWN: dict[str, Hidden] = {
 
 
 def told(name: str, airframe: str, values: Mapping[str, float]) -> Values:
-    """Return what a report should say, as far as the draw knows; a servo's lag is told with the healthy one's."""
+    """Return the expected report values known from the draw; a servo lag includes that of the healthy servo."""
     if name == "thrust_loss" and airframe == "small":
         return dict(values)
     if name == "actuator_lag":

@@ -1,4 +1,4 @@
-"""A whole examination: who hides what is drawn, flown in several processes, checked, and told to the caller alone."""
+"""All flights of a blind test: draw the hidden effects, simulate in several processes, check, return the labels."""
 
 import json
 import multiprocessing
@@ -27,19 +27,19 @@ Labels = dict[str, Label]
 def exam(
     seed: int, flights: int, out: Path, progress: Callable[[str, int, int], None] = lambda *_: None, jobs: int = 2
 ) -> Labels:
-    """Fly an examination into a folder and return its labels.
+    """Simulate the flights of a blind test into a folder and return the labels.
 
     Args:
-        seed: draws everything
-        flights: recordings to be examined; nominal ones come on top
-        out: folder; recordings come into one folder an airframe, beside `<airframe>.card.json`
-        progress: called with the name of every flight, and how many of how many are done
-        jobs: processes
+        seed: seed of all random draws
+        flights: number of test recordings, without the nominal ones
+        out: folder; one subfolder per airframe with recordings and `<airframe>.card.json`
+        progress: called for every flight with its name, the number done and the total
+        processes: number of processes
     Returns:
         {flight: {role, airframe, seed, effects, flown_s, acts, redrawn}}, times since its first ATTITUDE [s]
     Raises:
-        ValueError: when there are too few flights to hide anything among.
-        RuntimeError: when an effect would not act however often it was drawn.
+        ValueError: when there are too few flights for all roles.
+        RuntimeError: when an effect stays too weak in all attempts.
     """
     wanted = jobs_of(seed, flights)
     for airframe in AIRFRAMES:
@@ -53,7 +53,7 @@ def exam(
 
 
 def jobs_of(seed: int, flights: int) -> list[Job]:
-    """Draw who hides what; in an order, and under names, that say nothing of it."""
+    """Draw the effects of all flights; order and names are independent of them."""
     rng = np.random.default_rng((seed, 22))
     wanted: list[tuple[str, str, tuple[str, ...]]] = []
     for k, (role, count) in enumerate(roles.counts(flights).items()):
@@ -80,7 +80,7 @@ def _names(rng: np.random.Generator, role: str, airframe: str, count: int) -> li
 
 
 def _flown(tasks: list[tuple[Job, int, Path]], jobs: int) -> Iterator[tuple[str, Label]]:
-    """Fly in this process, or shared among several that end with this one."""
+    """Simulate in this process, or in several processes that end with this one."""
     if jobs == 1:
         yield from map(_fly, tasks)
         return
@@ -91,7 +91,7 @@ def _flown(tasks: list[tuple[Job, int, Path]], jobs: int) -> Iterator[tuple[str,
 
 
 def _begin(parent: int) -> None:
-    """Leave Ctrl-C to the parent, and end with it however it ended."""
+    """Ignore Ctrl-C, which the parent handles, and exit when the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_outlive_nobody, args=(parent,), daemon=True).start()
 
@@ -103,7 +103,7 @@ def _outlive_nobody(parent: int) -> None:
 
 
 def _fly(task: tuple[Job, int, Path]) -> tuple[str, Label]:
-    """Draw a flight until it is sane and all it hides acts; record it."""
+    """Draw a flight until it stays in the envelope and all hidden effects are strong enough; record it."""
     job, seed, out = task
     refused: list[str] = []
     for attempt in range(_ATTEMPTS):
@@ -111,18 +111,18 @@ def _fly(task: tuple[Job, int, Path]) -> tuple[str, Label]:
         label = _tried(planned, out / job.airframe / f"{job.name}.tlog", refused)
         if label is not None:
             return job.name, label | {"redrawn": refused}
-    raise RuntimeError(f"{job.name}: {job.wanted} on {job.airframe} refused {_ATTEMPTS} times: {', '.join(refused)}")
+    raise RuntimeError(f"{job.name}: {job.wanted} on {job.airframe} rejected {_ATTEMPTS} times: {', '.join(refused)}")
 
 
 def _tried(planned: Planned, path: Path, refused: list[str]) -> Label | None:
-    """Record one flight and describe it, or note why it will not do."""
+    """Record one flight and return its label, or append the reason for rejection and return None."""
     log, first = fly(planned, planned.hidden, path)
     why = why_not_sane(planned, log)
     shown: list[Label] = []
     for fault in planned.hidden if not why else ():
         shown.append(acts(planned, fault, log))
         if shown[-1]["over_noise"] < LEAST:
-            why = f"{fault.name} {fault.of} acts {shown[-1]['over_noise']} in {shown[-1]['channel']}"
+            why = f"{fault.name} {fault.of} has strength {shown[-1]['over_noise']} in {shown[-1]['channel']}"
     if why:
         refused.append(why)
         path.unlink()

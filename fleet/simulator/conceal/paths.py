@@ -1,4 +1,4 @@
-"""Missions of an examination, livelier than daily ones, and the test pilot who excites what autopilots do not."""
+"""Missions of a blind test, with more manoeuvres than usual, and test pilot inputs for excitation."""
 
 from math import atan2, cos, hypot, pi, radians, sin
 from typing import NamedTuple
@@ -11,19 +11,19 @@ from fleet.simulator.vehicle.missions import ABSOLUTE, DO_CHANGE_SPEED, DO_JUMP,
 from fleet.simulator.vehicle.situation import Pilot
 
 FIELD = Origin(536_500_000, 80_500_000, 5_000)  # marshland by the sea [1e-7 deg, 1e-7 deg, mm]
-"""Near sea level: JSBSim's turbulence goes with the wind at 20 ft only below 1000 ft above the sea."""
+"""Near sea level: the turbulence of JSBSim scales with the wind at 20 ft only below 1000 ft above sea level."""
 _LEGS = 14
 _SPEEDS = (0.90, 0.95, 1.0, 1.06, 1.12)  # of cruise
 _TURNS_DEG = (30, 50, 70, 90, 110, 140)
 
 
 class Ground(NamedTuple):
-    """What missions of one airframe look like."""
+    """Limits of the missions of one airframe."""
 
     cruise: float  # [m/s]
-    leg: tuple[float, float]  # least and greatest length [m]
-    reach: float  # waypoints stay so near to home [m]
-    height: tuple[float, float]  # least and greatest above home [m]
+    leg: tuple[float, float]  # minimum and maximum length [m]
+    reach: float  # maximum distance of waypoints from home [m]
+    height: tuple[float, float]  # minimum and maximum above home [m]
     slope: tuple[float, float]  # steepest climb and descent [-]
     circle: float  # radius [m]
 
@@ -38,9 +38,9 @@ def plan(rng: np.random.Generator, airframe: str, steep: bool = False) -> tuple[
     """Draw a mission that turns both ways, climbs, descends and changes speed every other leg.
 
     Args:
-        rng: source of chance
-        airframe: one of `GROUNDS`
-        steep: climb and descend as far as it goes, for what changes with height
+        rng: random generator
+        airframe: key of `MISSION_LIMITS`
+        steep: climb and descend over the full height range, for effects that depend on height
     """
     ground = GROUNDS[airframe]
     spots = _walk(rng, ground, steep)
@@ -62,7 +62,7 @@ def plan(rng: np.random.Generator, airframe: str, steep: bool = False) -> tuple[
 
 
 def _walk(rng: np.random.Generator, ground: Ground, steep: bool) -> list[tuple[float, float, float]]:
-    """Draw spots, NED from home [m]; turns alternate more often than not."""
+    """Draw waypoints, NED from home [m]; most turns alternate in direction."""
     bearing = rng.uniform(-pi, pi)
     n, e = 0.4 * ground.reach * cos(bearing), 0.4 * ground.reach * sin(bearing)
     h, course, side = rng.uniform(*ground.height), rng.uniform(-pi, pi), float(rng.choice([-1, 1]))
@@ -86,13 +86,13 @@ def _walk(rng: np.random.Generator, ground: Ground, steep: bool) -> list[tuple[f
 def _before(
     rng: np.random.Generator, spot: tuple[float, ...], then: tuple[float, ...], ground: Ground, seq: int
 ) -> Start:
-    """Stand before the first spot, flying to it and then on in about the same direction."""
+    """Return a start state before the first waypoint, roughly in the direction of the second."""
     course = wrap(atan2(then[1] - spot[1], then[0] - spot[0]) + rng.uniform(-0.6, 0.6))
     back = 10.0 * ground.cruise
     return Start(seq, np.array([spot[0] - back * cos(course), spot[1] - back * sin(course), spot[2]]), course)
 
 
-_AMPLITUDES = {  # aileron, elevator, rudder, throttle, shares of full travel
+_AMPLITUDES = {  # aileron, elevator, rudder, throttle, fractions of full travel
     "c172p": (0.07, 0.05, 0.2, 0.15),
     "small": (0.06, 0.05, 0.12, 0.12),
 }
@@ -101,7 +101,7 @@ _SURFACE_HZ, _THROTTLE_HZ = (0.12, 1.6), (0.02, 0.25)
 
 
 def multisine(rng: np.random.Generator, airframe: str, strength: float) -> Pilot:
-    """Draw a test pilot's inputs: on every input its own frequencies, so that they do not correlate.
+    """Draw test pilot inputs: different frequencies on each input, so that they do not correlate.
 
     Source: Morelli & Klein 2016, Aircraft System Identification, ch. 9 (orthogonal multisines), with random phases.
     """

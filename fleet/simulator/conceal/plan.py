@@ -1,4 +1,4 @@
-"""One planned flight of an examination: everything about it follows from its seeds."""
+"""One planned flight of a blind test, determined by its seeds."""
 
 from math import inf, pi
 from typing import NamedTuple
@@ -13,32 +13,32 @@ from fleet.simulator.vehicle.altered import altered
 from fleet.simulator.vehicle.situation import Situation, Weather
 from fleet.simulator.vehicle.types import Type
 
-SETTLE_S = 20.0  # flown before the recording begins
+SETTLE_S = 20.0  # simulated before the recording starts
 NOMINAL_S, EXAMINED_S = 210.0, 200.0
-EXCITED = (1.0, 0.8, 0.4, 0.0, 0.0)  # the test pilot's strength on the nominal flights
+EXCITED = (1.0, 0.8, 0.4, 0.0, 0.0)  # amplitude of the test pilot inputs on the nominal flights
 _ONSET_S, _PASSES_S = (50.0, 110.0), (45.0, 140.0)
-_QUIET = {"propulsion/engine/propeller-sense": 0.0, "conceal/slipstream": 0.0}  # hidden only where it is the effect
-_MORE = {"c172p": {"KFF_RDDRMIX": 0.3}, "small": {}}  # its rudder would hardly move
+_QUIET = {"propulsion/engine/propeller-sense": 0.0, "conceal/slipstream": 0.0}  # zero except as a hidden effect
+_MORE = {"c172p": {"KFF_RDDRMIX": 0.3}, "small": {}}  # otherwise its rudder hardly moves
 _W20_MPS = 1.5  # light turbulence
-_STEEP = 0.35  # share of flights that climb and descend as far as it goes
+_STEEP = 0.35  # fraction of flights over the full height range
 
 
 class Job(NamedTuple):
-    """What is wanted of one flight."""
+    """Requirements for one flight."""
 
-    name: str  # of the file, without its ending
+    name: str  # file name without suffix
     airframe: str
     role: str
     wanted: tuple[str, ...]  # effects
-    number: int  # in the examination
+    number: int  # index in the blind test
     excited: float = 0.0
 
 
 class Planned(NamedTuple):
-    """One flight, drawn."""
+    """One flight with all random draws."""
 
     job: Job
-    seed: int  # of the examination: draws the aircraft
+    seed: int  # of the blind test: draws the aircraft
     flight: int  # draws everything else
     hidden: tuple[Fault, ...]
     steep: bool
@@ -46,7 +46,7 @@ class Planned(NamedTuple):
     seconds: float
 
     def uav(self, faults: tuple[Fault, ...]) -> PretendUav:
-        """Put the aircraft in the air with `faults`, which may be all that is hidden, some, or none."""
+        """Create the aircraft with `faults`: all hidden faults, some or none."""
         rng = np.random.default_rng((self.flight, 20))
         airframe = self.job.airframe
         way = plan(rng, airframe, self.steep)
@@ -56,20 +56,20 @@ class Planned(NamedTuple):
         return PretendUav(0, self.seed, origin=FIELD, aircraft=airframe, more=more, faults=faults, situation=situation)
 
     def _weather(self, rng: np.random.Generator) -> Weather:
-        """Draw the wind: none for the Cessna, who would hardly notice it."""
+        """Draw the wind; none for the Cessna, where it has little effect."""
         mean, towards = rng.uniform(1.0, 5.0), rng.uniform(-pi, pi)
         mean = 0.0 if self.job.airframe == "c172p" else float(mean)
         return Weather(mean, float(towards), exponent=0.0, drift=0.5, w20_mps=self.w20_mps)
 
 
 def quiet(airframe: str) -> Type:
-    """Return the type with knobs, and with everything off that may be hidden."""
+    """Return the instrumented type with all hidden effects disabled."""
     kind = altered(airframe)
     return kind._replace(settings=_QUIET) if kind.shipped else kind
 
 
 def draw(job: Job, seed: int, attempt: int) -> Planned:
-    """Draw a flight; another attempt draws another one."""
+    """Draw a flight; each attempt gives a different one."""
     flight = int(np.random.SeedSequence((seed, job.number, attempt)).generate_state(1)[0])
     rng = np.random.default_rng((flight, 21))
     hidden = tuple(_fault(rng, name, job.airframe) for name in job.wanted)
@@ -87,7 +87,7 @@ def _fault(rng: np.random.Generator, name: str, airframe: str) -> Fault:
 
 
 def _times(rng: np.random.Generator, what: Hidden, steps: bool) -> tuple[float, float, float]:
-    """Draw onset, ramp or edge, and end [s since the world began]; a wind that is usual can only change."""
+    """Draw onset, ramp or edge duration, and end [s since simulation start]; `force_step` selects a step."""
     comes = "step" if steps else str(rng.choice(what.comes))
     onset = SETTLE_S + float(rng.uniform(*_ONSET_S))
     if comes == "pass":

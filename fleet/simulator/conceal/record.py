@@ -1,4 +1,4 @@
-"""Fly a planned flight: into a recording, or only to see what it does; and whether it stays where flying is sane."""
+"""Simulate a planned flight, optionally into a recording, and check that it stays in the flight envelope."""
 
 import struct
 from collections.abc import Callable, Iterable
@@ -16,10 +16,10 @@ from fleet.simulator.vehicle.jsbsim import Truth
 from fleet.simulator.vehicle.sensors import Estimate, pressure_height
 
 LOG_S = 0.1
-LOSS, FADES_S = 0.02, 45.0  # share of frames lost; mean time between two silences [s]
+LOSS, FADES_S = 0.02, 45.0  # fraction of frames lost; mean time between two fades [s]
 _ATTITUDE = bytes((30, 0, 0))  # MAVLink message id
-_SANE = {"c172p": 0.20, "small": 0.21}  # greatest angle of attack: the wing is attached [rad]
-_LOW_M, _BANK, _SLIP, _SPEEDS = 30.0, np.radians(75), np.radians(16), (0.72, 1.4)  # speeds in shares of cruise
+_SANE = {"c172p": 0.20, "small": 0.21}  # maximum angle of attack with attached flow [rad]
+_LOW_M, _BANK, _SLIP, _SPEEDS = 30.0, np.radians(75), np.radians(16), (0.72, 1.4)  # speeds relative to cruise
 
 
 _Row = tuple[float, Truth, Estimate, tuple[int, ...]]
@@ -28,8 +28,8 @@ _Row = tuple[float, Truth, Estimate, tuple[int, ...]]
 class Log(NamedTuple):
     """A flight at 10 Hz."""
 
-    t: np.ndarray  # since the world began, (n,) [s]
-    seen: np.ndarray  # what is recorded, columns as in `acts.NOISE`, (n, 21)
+    t: np.ndarray  # since simulation start, (n,) [s]
+    seen: np.ndarray  # recorded channels, columns as in `acts._FLIGHT_NOISE`, (n, 21)
     Va: np.ndarray  # true airspeed, (n,) [m/s]
     alpha: np.ndarray
     beta: np.ndarray
@@ -44,10 +44,10 @@ def fly(
     path: Path | None = None,
     look: Callable[[PretendUav], None] = lambda _: None,
 ) -> tuple[Log, float]:
-    """Fly with `faults`, into a recording if a path is given; let somebody look at the aircraft ten times a second.
+    """Simulate with `faults`, into a recording if a path is given; call `observe` with the aircraft at 10 Hz.
 
     Returns:
-        the log, and the time of the first ATTITUDE recorded, since the world began [s]
+        the log, and the time of the first recorded ATTITUDE since simulation start [s]
     """
     uav = planned.uav(faults)
     uav.step(SETTLE_S)
@@ -83,7 +83,7 @@ def first_attitude(frames: Iterable[bytes]) -> float:
 
 
 def why_not_sane(planned: Planned, log: Log) -> str:
-    """Say why a flight is none to be examined; an empty string when it is one."""
+    """Return the reason to reject a flight; empty if it is acceptable."""
     airframe = planned.job.airframe
     speed = log.Va / {"c172p": 48.0, "small": 23.0}[airframe]
     limits = {

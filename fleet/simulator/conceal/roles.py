@@ -1,4 +1,4 @@
-"""How many flights hide what: controls, one effect, two that do not hide each other, one in no catalogue."""
+"""Roles of the flights: control, one effect, two separable effects, one uncatalogued effect."""
 
 from math import ceil
 
@@ -7,7 +7,7 @@ import numpy as np
 from fleet.simulator.conceal.effects import HIDDEN, UNKNOWN
 
 _SINGLE, _COMPOUND, _UNKNOWN = 50 / 140, 16 / 140, 14 / 140
-_BLUR = (  # channels that hide what happens in one another
+_BLUR = (  # pairs of channels that are not separable
     {"air", "airspeed"},
     {"air", "heading"},
     {"air", "gps"},
@@ -16,16 +16,16 @@ _BLUR = (  # channels that hide what happens in one another
     {"force", "pitch"},
     {"gps", "baro"},
 )
-_ALIKE = {"air_density", "turbulence"}  # changes everything: no partner
+_ALIKE = {"air_density", "turbulence"}  # affect all channels: never combined
 Wanted = tuple[str, ...]
-"""Names of the effects one flight hides."""
+"""Names of the hidden effects of one flight."""
 
 
 def counts(flights: int) -> dict[str, int]:
-    """Share flights among the roles.
+    """Distribute the flights over the roles.
 
     Raises:
-        ValueError: when there are too few for one of each.
+        ValueError: when there are fewer than 6 flights.
     """
     if flights < 6:
         raise ValueError(f"flights: found {flights}, expected 6 at least, so that each role has one; ask for more")
@@ -36,17 +36,17 @@ def counts(flights: int) -> dict[str, int]:
 
 
 def singles(rng: np.random.Generator, airframe: str, n: int) -> list[Wanted]:
-    """Draw `n` effects; none comes twice before all have come."""
+    """Draw `n` effects without repetition until all are used."""
     return [(name,) for name in _round(rng, [x for x, h in HIDDEN.items() if airframe in h.airframes], n)]
 
 
 def unknowns(rng: np.random.Generator, airframe: str, n: int) -> list[Wanted]:
-    """Draw `n` effects that no catalogue lists."""
+    """Draw `n` uncatalogued effects."""
     return [(name,) for name in _round(rng, [x for x, h in UNKNOWN.items() if airframe in h.airframes], n)]
 
 
 def compounds(rng: np.random.Generator, airframe: str, n: int) -> list[Wanted]:
-    """Draw `n` pairs."""
+    """Draw `n` separable pairs, least used effects first."""
     names = [x for x, h in HIDDEN.items() if airframe in h.airframes]
     pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :] if go_together(a, b)]
     used: dict[str, int] = dict.fromkeys(names, 0)
@@ -61,7 +61,7 @@ def compounds(rng: np.random.Generator, airframe: str, n: int) -> list[Wanted]:
 
 
 def go_together(a: str, b: str) -> bool:
-    """Return whether two effects can both be seen in one flight."""
+    """Return whether two effects are separable in one flight."""
     if {a, b} & _ALIKE:
         return False
     channels = {HIDDEN[a].channel, HIDDEN[b].channel}

@@ -1,4 +1,4 @@
-"""What is hidden, in the units a report uses: as drawn where the draw knows, else by JSBSim's own account."""
+"""True parameters of hidden effects in the units of a report, from the draw or else from JSBSim."""
 
 import numpy as np
 
@@ -13,8 +13,8 @@ from fleet.simulator.vehicle.sensors import pressure_at
 
 _R = 287.05  # of dry air [J/(kg K)]
 _SEA_LEVEL_K, _LAPSE_K = 288.15, 0.0065  # standard atmosphere [K, K/m]
-_SPEEDS, _THROTTLES = (44.0, 48.0, 52.0), (0.6, 0.75, 0.9)  # of the Cessna at work [m/s, -]
-_SPOOL_S = 6.0  # until the propeller turns steadily
+_SPEEDS, _THROTTLES = (44.0, 48.0, 52.0), (0.6, 0.75, 0.9)  # operating range of the Cessna [m/s, -]
+_SPOOL_S = 6.0  # time for the propeller to reach steady speed
 
 
 def effect(planned: Planned, fault: Fault, log: Log, first: float) -> dict[str, object]:
@@ -22,11 +22,11 @@ def effect(planned: Planned, fault: Fault, log: Log, first: float) -> dict[str, 
 
     Args:
         planned: the flight
-        fault: one of those it hides
-        log: the flight with all it hides
-        first: time of the first ATTITUDE recorded, since the world began [s]
+        fault: one of its hidden faults
+        log: the flight with all hidden faults
+        first_attitude_s: time of the first recorded ATTITUDE since simulation start [s]
     Returns:
-        name, of, surface, params in a report's units, and times in seconds since that ATTITUDE
+        name, of, surface, params in the units of a report, times since that ATTITUDE [s]
     """
     params = told(fault.name, planned.job.airframe, fault.values) | _measured(planned, fault, log)
     out: dict[str, object] = {"name": fault.name, "params": {key: round(x, 6) for key, x in params.items()}}
@@ -50,21 +50,21 @@ def _measured(planned: Planned, fault: Fault, log: Log) -> dict[str, float]:
 
 
 def density_ratio(log: Log) -> float:
-    """Return air density over that of the standard day at the same height, mean over a flight."""
+    """Return the ratio of air density to the standard atmosphere, mean over a flight."""
     height = log.height + FIELD.alt_mm * 1e-3
     standard = [pressure_at(h) / (_R * (_SEA_LEVEL_K - _LAPSE_K * h)) for h in height]
     return float(np.mean(log.rho / np.array(standard)))
 
 
 def thrust_lost(planned: Planned, fault: Fault) -> float:
-    """Return the share of thrust lost at the same throttle and speed, mean over a few of each."""
+    """Return the fraction of thrust lost at equal throttle and speed, mean over several of each."""
     aircraft = Aircraft(FIELD, planned.seed, kind=quiet(planned.job.airframe))
     lost = [1 - _thrust(aircraft, v, u, fault) / _thrust(aircraft, v, u, None) for v in _SPEEDS for u in _THROTTLES]
     return float(np.mean(lost))
 
 
 def _thrust(aircraft: Aircraft, Va: float, delta_t: float, fault: Fault | None) -> float:
-    """Hold the engine at one throttle and about one speed until it turns steadily; return its thrust [lbf]."""
+    """Run the engine at constant throttle and speed to steady state; return its thrust [lbf]."""
     name = aircraft.kind.strength
     usual = aircraft[name]
     aircraft.start(np.array([0.0, 0.0, -200.0]), 0.0, Va, (0.0, 0.0))

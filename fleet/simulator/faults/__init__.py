@@ -1,11 +1,11 @@
-"""Faults a pretend aircraft may carry: of its servos, of its sensors, of the physics JSBSim flies.
+"""Faults of a simulated aircraft: servos, sensors and JSBSim physics.
 
-    fault        one fault: what, of which part, how much, since when
-    servos       what a servo makes of its command, after the telemetry has told the command
-    sensing      what a sensor makes of the truth: the autopilot flies on it and reports it
-    physics      what the air, the engine or the airframe does, by JSBSim's own properties
-    kinds        the table of them, and how one is written on a command line
-    carried      all faults of one aircraft: the one thing `PretendUav` knows of
+    fault        one fault: name, part, values, onset
+    servos       servo response to a command, after the telemetry of the command
+    sensing      errors of the estimate that the autopilot uses and reports
+    physics      air, engine and airframe, changed through JSBSim properties
+    kinds        table of the faults, and their syntax on the command line
+    carried      all faults of one aircraft, the interface for `SimulatedUav`
 
-Nothing of the twin's own effects is used here: one code must never both conceal and find.
+The package uses nothing from the effects of the twin, so that the same code never both conceals and identifies.
 """

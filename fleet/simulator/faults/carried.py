@@ -1,4 +1,4 @@
-"""All faults of one aircraft, in the four places where the aircraft asks for them."""
+"""All faults of one aircraft: physics, wind, estimate and commands."""
 
 from collections.abc import Callable, Sequence
 
@@ -14,16 +14,16 @@ from fleet.simulator.vehicle.sensors import Estimate
 
 
 class Carried:
-    """The faults one aircraft carries."""
+    """Faults of one aircraft."""
 
     def __init__(self, faults: Sequence[Fault], aircraft: Aircraft, tick_s: float, sense_s: float):
-        """Return every fault its place.
+        """Assign each fault to physics, wind, estimate or commands.
 
         Args:
-            faults: what is wrong
+            faults: faults of the aircraft
             aircraft: started
-            tick_s: time between two calls of `move` [s]
-            sense_s: time between two calls of `sense` [s]
+            tick_s: time between two calls of `apply_to_commands` [s]
+            estimate_s: time between two calls of `apply_to_estimate` [s]
         """
         self.faults = faults
         odd = [(fault, ODD[fault.name](fault.values, aircraft)) for fault in faults if fault.name in ODD]
@@ -33,11 +33,11 @@ class Carried:
         self._spoils = [(fault, SPOILS[fault.name](fault, sense_s)) for fault in faults if fault.name in SPOILS]
         self._spoils += [(fault, oddity.sense) for fault, oddity in odd]
         self._world = World([fault for fault in faults if fault.name in CHANGES or fault.name in WINDS], aircraft)
-        self.moved = {fault: np.zeros(4) for fault in faults}  # what each last did to the commands
-        self.spoilt = {fault: np.zeros(14) for fault in faults}  # and to the estimate, see `numbers`
+        self.moved = {fault: np.zeros(4) for fault in faults}  # last change of the commands by each fault
+        self.spoilt = {fault: np.zeros(14) for fault in faults}  # last change of the estimate, see `estimate_vector`
 
     def press(self, t: float, without: Fault | None = None) -> None:
-        """Change the physics, by all faults or by all but one."""
+        """Apply the physics faults, all or all but one."""
         self._world.press(t, without)
         for fault, press in self._presses:
             press(t, 0.0 if fault is without else fault.share(t))
@@ -47,14 +47,14 @@ class Carried:
         return self._world.wind(t, height)
 
     def sense(self, t: float, e: Estimate) -> Estimate:
-        """Return what the autopilot believes."""
+        """Return the estimate with sensor faults."""
         for fault, spoil in self._spoils:
             good, e = e, spoil(e, fault.share(t))
             self.spoilt[fault] = numbers(e) - numbers(good)
         return e
 
     def move(self, t: float, commands: Commands) -> Commands:
-        """Return where surfaces and motor go."""
+        """Return surface and motor positions with servo faults."""
         for fault, move in self._moves:
             told, commands = commands, move(t, fault.share(t), commands)
             self.moved[fault] = np.subtract(commands, told)
@@ -62,12 +62,12 @@ class Carried:
 
 
 def numbers(e: Estimate) -> np.ndarray:
-    """Lay out rates, force, euler, v, Va and height, (14,)."""
+    """Return rates, force, euler, v, Va and height as one vector, (14,)."""
     return np.concatenate([e.rates, e.force, e.euler, e.v, [e.Va, -e.p[2]]])
 
 
 def _one(fault: Fault, move: Move) -> Callable[[float, float, Commands], Commands]:
-    """Let a servo's fault act on its own surface."""
+    """Apply a servo fault to its surface only."""
     i = SURFACES.index(fault.of)
 
     def moved(t: float, share: float, commands: Commands) -> Commands:

@@ -1,4 +1,4 @@
-"""One fault: what it is, of which part, how much, and since when."""
+"""One fault: name, part, values and time profile."""
 
 from collections.abc import Mapping
 from math import cos, inf, pi
@@ -9,20 +9,20 @@ class Fault(NamedTuple):
     """One fault of one aircraft."""
 
     name: str  # in `kinds.KINDS`
-    of: str  # the part: a surface, an axis; empty where there is but one
-    values: Mapping[str, float]  # its parameters, units in their names; faults are told apart by identity
-    t0: float = 0.0  # begins [s since the flight began]
-    ramp_s: float = 0.0  # grows for so long; of what passes: the length of either edge [s]
-    t1: float = inf  # is over [s]
+    of: str  # surface or axis; empty if there is only one
+    values: Mapping[str, float]  # parameters, units in their names; faults compare by identity
+    t0: float = 0.0  # onset [s since simulation start]
+    ramp_s: float = 0.0  # ramp duration; edge duration of a transient [s]
+    t1: float = inf  # end [s]
 
     def __hash__(self) -> int:
-        """Tell faults apart."""
+        """Hash by identity."""
         return id(self)
 
     def share(self, t: float) -> float:
-        """Return how much of it is there at `t` [s]: 0 nothing, 1 all.
+        """Return the intensity at `t` [s], 0..1.
 
-        It steps or grows in a straight line; what passes rises and falls as (1 - cos) / 2.
+        A step or a linear ramp; a transient rises and falls as (1 - cos) / 2.
         """
         if not self.t0 <= t < self.t1:
             return 0.0

@@ -1,4 +1,4 @@
-"""THE TABLE of faults: parts, parameters and their ranges; and how one is written on a command line."""
+"""Table of faults: parts, parameters and ranges; and the syntax of a fault on the command line."""
 
 from collections.abc import Mapping
 from math import inf, isfinite
@@ -9,7 +9,7 @@ from fleet.simulator.faults.servos import SURFACES
 
 
 class Range(NamedTuple):
-    """What a parameter may be."""
+    """Range of a parameter."""
 
     low: float
     high: float
@@ -20,8 +20,8 @@ class Kind(NamedTuple):
     """One kind of fault."""
 
     values: Mapping[str, Range]
-    of: tuple[str, ...] = ()  # parts; one must be named
-    passes: bool = False  # it comes and goes
+    of: tuple[str, ...] = ()  # surfaces or axes; one is required
+    passes: bool = False  # has an end
     aircraft: tuple[str, ...] = ("small", "c172p")
 
 
@@ -66,10 +66,10 @@ _TIMES = {"at": Range(0.0, 1e6), "ramp": Range(0.0, 1e4), "for": Range(0.5, 1e4)
 
 
 def read(text: str, aircraft: str) -> Fault:
-    """Read NAME[:of],key=value,… with at=, ramp= and, for what passes, for= in seconds.
+    """Parse NAME[:part],key=value,… with at=, ramp= and, for transients, for= in seconds.
 
     Raises:
-        ValueError: when it is no fault such an aircraft can carry; the sentence says why.
+        ValueError: when the text is no fault of this aircraft.
     """
     head, *pairs = text.split(",")
     name, _, of = head.partition(":")
@@ -77,7 +77,7 @@ def read(text: str, aircraft: str) -> Fault:
     if kind is None:
         raise ValueError(f"fault: found {name!r}, expected one of {', '.join(KINDS)}; choose one")
     if aircraft not in kind.aircraft:
-        raise ValueError(f"fault {name}: found aircraft {aircraft!r}, expected {' or '.join(kind.aircraft)}; fly that")
+        raise ValueError(f"fault {name}: found aircraft {aircraft!r}, expected {' or '.join(kind.aircraft)}; use it")
     if of not in (kind.of or ("",)):
         wanted = f"one of {', '.join(kind.of)} after a colon" if kind.of else "nothing after its name"
         raise ValueError(f"fault {name}: found {of or 'no part'!r}, expected {wanted}; correct it")

@@ -1,6 +1,6 @@
-"""Faults that no catalogue lists: what a finder must call unknown.
+"""Uncatalogued faults, which a diagnosis must report as unknown.
 
-They cannot be asked for on a command line; an examination hides them.
+They are not available on the command line; only a blind test uses them.
 """
 
 from collections.abc import Mapping
@@ -13,31 +13,31 @@ from fleet.simulator.vehicle.jsbsim import DT, Aircraft
 from fleet.simulator.vehicle.sensors import Estimate
 from fleet.simulator.vehicle.weather import FT
 
-_SENSE_S = 2 * DT  # between two calls of `sense` [s]
+_SENSE_S = 2 * DT  # between two calls of `apply_to_estimate` [s]
 _INCH = 0.0254  # [m]
 
 
 class Oddity:
-    """One of them; this one does nothing."""
+    """Base class without effect."""
 
     def __init__(self, values: Mapping[str, float], aircraft: Aircraft):
-        """Take its numbers; the aircraft has been started."""
+        """Store the values; the aircraft is started already."""
         self._values, self._aircraft = values, aircraft
 
     def press(self, t: float, share: float) -> None:
         """Change the physics at `t` [s]."""
 
     def sense(self, e: Estimate, share: float) -> Estimate:
-        """Return what the autopilot believes."""
+        """Return the estimate with this fault."""
         return e
 
     def move(self, t: float, share: float, commands: Commands) -> Commands:
-        """Return where surfaces and motor go."""
+        """Return surface and motor positions with this fault."""
         return commands
 
 
 class _CrossedLinkage(Oddity):
-    """The aileron's rod drags the rudder along."""
+    """Couple the rudder to the aileron."""
 
     def move(self, t: float, share: float, commands: Commands) -> Commands:
         a, e, r, thrust = commands
@@ -45,7 +45,7 @@ class _CrossedLinkage(Oddity):
 
 
 class _LooseHinge(Oddity):
-    """The elevator flutters about its hinge, whatever it is told."""
+    """Add an elevator oscillation independent of the command."""
 
     def move(self, t: float, share: float, commands: Commands) -> Commands:
         a, e, r, thrust = commands
@@ -53,7 +53,7 @@ class _LooseHinge(Oddity):
 
 
 class _SurgingEngine(Oddity):
-    """Thrust swells and ebbs."""
+    """Modulate the thrust with a sine."""
 
     def __init__(self, values: Mapping[str, float], aircraft: Aircraft):
         super().__init__(values, aircraft)
@@ -65,7 +65,7 @@ class _SurgingEngine(Oddity):
 
 
 class _Factors(Oddity):
-    """Derivatives of the airframe are not what they were."""
+    """Scale derivatives of the airframe."""
 
     def __init__(self, values: Mapping[str, float], aircraft: Aircraft):
         super().__init__(values, aircraft)
@@ -78,12 +78,12 @@ class _Factors(Oddity):
 
 
 class _SloshingTank(Oddity):
-    """Load that is not tied: it runs aft when the aircraft pitches up or speeds up, and comes back late."""
+    """Loose payload: it moves aft when the aircraft pitches up or accelerates, with a first-order lag."""
 
     def __init__(self, values: Mapping[str, float], aircraft: Aircraft):
         super().__init__(values, aircraft)
         self._place = f"inertia/pointmass-location-X-inches{aircraft.kind.load}"
-        self._x = 0.0  # aft of where it was stowed [m]
+        self._x = 0.0  # displacement aft [m]
         self._stowed = aircraft[self._place]
 
     def press(self, t: float, share: float) -> None:
@@ -95,14 +95,14 @@ class _SloshingTank(Oddity):
 
 
 class _GyroScale(Oddity):
-    """Gyros that read a share too much of every rate."""
+    """Apply a scale error to all gyros."""
 
     def sense(self, e: Estimate, share: float) -> Estimate:
         return e._replace(rates=e.rates * (1 + share * self._values["scale"]))
 
 
 class _PitotLag(Oddity):
-    """Water in the hose: the airspeed comes late and smooth."""
+    """Apply a first-order lag to the airspeed, as from water in the pitot line."""
 
     def __init__(self, values: Mapping[str, float], aircraft: Aircraft):
         super().__init__(values, aircraft)

@@ -1,6 +1,6 @@
-"""What goes wrong outside the electronics: increments of JSBSim's own properties, and of the wind.
+"""Faults of the physics: increments of JSBSim properties and of the wind.
 
-Knobs named conceal/* are those of `altered`.
+`vehicle.altered` defines the properties conceal/*.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,11 +18,11 @@ _FLAP_DEG = 30.0  # full
 
 Increments = dict[str, float]
 Change = Callable[[Aircraft, Mapping[str, float]], Increments]
-"""What a whole fault adds to JSBSim's properties."""
+"""Increments of JSBSim properties at full intensity."""
 
 
 def _air_density(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
-    """Change density one third by pressure, two thirds by warmth, as weather does."""
+    """Change density one third by pressure and two thirds by temperature."""
     third = cbrt(values["density_ratio"])
     return {
         "atmosphere/P-sl-psf": aircraft["atmosphere/P-sl-psf"] * (third - 1),
@@ -35,7 +35,7 @@ def _turbulence(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
 
 
 def _thrust_loss(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
-    """Take a share of what the small one's propeller pulls, or of what the Cessna's cylinders draw in."""
+    """Reduce propeller thrust (small) or volumetric efficiency (Cessna) by a fraction."""
     name = aircraft.kind.strength
     return {name: -values["fraction"] * aircraft[name]}
 
@@ -49,7 +49,7 @@ def _mass_change(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
 
 
 def _cg_shift(aircraft: Aircraft, values: Mapping[str, float]) -> Increments:
-    """Let the load slide; JSBSim's x points aft."""
+    """Shift the payload; x points aft in JSBSim."""
     load = aircraft.kind.load
     share = aircraft[f"inertia/pointmass-weight-lbs{load}"] / aircraft["inertia/weight-lbs"]
     return {f"inertia/pointmass-location-X-inches{load}": -values["dx_m"] / share / _INCH}
@@ -89,10 +89,10 @@ WINDS: dict[str, Callable[[Mapping[str, float], float], np.ndarray]] = {
 
 
 class World:
-    """The faulty physics round one aircraft."""
+    """Physics faults of one aircraft."""
 
     def __init__(self, faults: list[Fault], aircraft: Aircraft):
-        """Note how everything is as long as nothing is wrong; the aircraft has been started."""
+        """Store the nominal properties; the aircraft is started already."""
         self._aircraft = aircraft
         self._winds = [fault for fault in faults if fault.name in WINDS]
         others = [fault for fault in faults if fault.name in CHANGES]
@@ -100,7 +100,7 @@ class World:
         self._usual = {name: aircraft[name] for _, change in self._changes for name in change}
 
     def press(self, t: float, without: Fault | None = None) -> None:
-        """Set JSBSim's properties as they are at `t` [s], or as they were if one fault were not."""
+        """Set the JSBSim properties for `t` [s], optionally excluding one fault."""
         now = dict(self._usual)
         for fault, change in self._changes:
             share = 0.0 if fault is without else fault.share(t)

@@ -1,4 +1,4 @@
-"""What a faulty sensor makes of a good estimate: the autopilot flies on it and reports it."""
+"""Sensor faults: errors of the estimate that the autopilot uses and reports."""
 
 from collections import deque
 from collections.abc import Callable
@@ -9,10 +9,10 @@ import numpy as np
 from fleet.simulator.faults.fault import Fault
 from fleet.simulator.vehicle.sensors import Estimate, pressure_at, pressure_height
 
-_OLDEST_S = 3.0  # fixes that are remembered
+_OLDEST_S = 3.0  # length of the buffer of fixes
 
 Spoil = Callable[[Estimate, float], Estimate]
-"""(estimate, share of the fault) to estimate; may remember."""
+"""(estimate, intensity of the fault) to estimate; may have state."""
 
 
 def _airspeed_scale(fault: Fault, dt: float) -> Spoil:
@@ -35,7 +35,7 @@ def _gps_latency(fault: Fault, dt: float) -> Spoil:
 
 
 def _imu_misalignment(fault: Fault, dt: float) -> Spoil:
-    """Return rates and forces in the axes of a unit turned against the body by a rotation vector."""
+    """Return rates and forces in the axes of a unit rotated relative to the body by a rotation vector."""
     turn = np.radians([fault.values.get(name, 0.0) for name in ("roll_deg", "pitch_deg", "yaw_deg")])
 
     def spoil(e: Estimate, share: float) -> Estimate:
@@ -46,7 +46,7 @@ def _imu_misalignment(fault: Fault, dt: float) -> Spoil:
 
 
 def _rotation(turn: np.ndarray) -> np.ndarray:
-    """Return the matrix that rotates by a rotation vector [rad], (3, 3): exp of its cross product matrix."""
+    """Return the rotation matrix of a rotation vector [rad], (3, 3): exp of its cross product matrix."""
     angle = float(np.linalg.norm(turn))
     x, y, z = turn / angle if angle > 0 else turn
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -73,7 +73,7 @@ def _heading_bias(fault: Fault, dt: float) -> Spoil:
 
 
 def _baro_bias(fault: Fault, dt: float) -> Spoil:
-    """Let the static port tell another height; the estimator's height follows it."""
+    """Shift the static pressure by a height; the estimated height follows it."""
     up = fault.values["bias_m"]
 
     def spoil(e: Estimate, share: float) -> Estimate:

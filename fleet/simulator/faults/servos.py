@@ -1,6 +1,6 @@
-"""What becomes of a command between the flight controller's output and the surface.
+"""Servo faults between the output of the flight controller and the surface.
 
-Commands and surfaces are shares of full travel, -1..1, + rolls right, pitches up, yaws right.
+Commands and surfaces are fractions of full travel, -1..1, + rolls right, pitches up, yaws right.
 """
 
 from collections import deque
@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from math import exp
 
 SURFACES = ("aileron", "elevator", "rudder")
-_OLDEST_S = 2.0  # commands that are remembered
+_OLDEST_S = 2.0  # length of the buffer of commands
 
 Move = Callable[[float, float], float]
-"""(command, share of the fault) to surface; may remember."""
+"""(command, intensity of the fault) to surface; may have state."""
 
 
 def _lag(values: Mapping[str, float], dt: float) -> Move:
@@ -53,7 +53,7 @@ def _deadband(values: Mapping[str, float], dt: float) -> Move:
 
     def move(u: float, share: float) -> float:
         half, past = share * values["half_width"], at[0] if at else u
-        at[:] = [min(max(past, u - half), u + half)]  # the play's two ends drag the surface along
+        at[:] = [min(max(past, u - half), u + half)]  # backlash
         return at[0]
 
     return move

@@ -1,4 +1,4 @@
-"""Two ways to drive pretend aircraft: in real time over UDP, or as fast as possible into a recording."""
+"""Drivers of simulated aircraft: in real time over UDP, or as fast as possible into a recording."""
 
 import socket
 import struct
@@ -14,10 +14,10 @@ from fleet.simulator.flight.link import Link
 from fleet.simulator.flight.uav import PretendUav
 
 TICK_S = 0.01
-EPOCH_US = 1_700_000_000_000_000  # when recordings begin: the same bytes for the same seed [us since 1970]
-_LATE_S = 0.5  # behind real time by more, simulated time slows down [s]
-_STEP_S = 0.1  # of simulated time between two rounds at most: what is late comes evenly, not in a burst [s]
-_RATIO_S = 5.0  # real time over which the achieved speed is measured before it is told [s]
+EPOCH_US = 1_700_000_000_000_000  # fixed start of recordings, for reproducible files [us since 1970]
+_LATE_S = 0.5  # maximum lag behind real time before simulated time slows down [s]
+_STEP_S = 0.1  # maximum simulated time per round, which spreads a backlog evenly [s]
+_RATIO_S = 5.0  # real time to measure the achieved speed before logging it [s]
 
 
 def to_tlog(
@@ -30,20 +30,20 @@ def to_tlog(
     progress: Callable[[float], None] = lambda _: None,
     stop: Event | None = None,
 ) -> int:
-    """Fly as fast as possible into a .tlog: 8 bytes of microseconds since 1970, big endian, then one frame, for ever.
+    """Simulate as fast as possible into a .tlog: records of 8 bytes microseconds since 1970, big endian, and one frame.
 
-    The recording begins with every aircraft's mission and parameters, asked for without loss.
+    The recording starts with mission and parameters of every aircraft, without loss.
 
     Args:
         path: file to write
-        uavs: aircraft to fly
-        seconds: how long [s]
-        loss: share of frames lost
-        seed: draws losses and delays
-        progress: called with the flown time [s]
-        stop: ends the flight early
+        uavs: simulated aircraft
+        seconds: duration [s]
+        loss: fraction of frames lost
+        seed: seed of losses and delays
+        progress: called with the simulated time [s]
+        stop: stops the simulation early
     Returns:
-        frames written
+        number of frames written
     """
     links = [Link(np.random.default_rng((seed, 6, uav.uav_id)), loss) for uav in uavs]
     written = 0
@@ -61,7 +61,7 @@ def to_tlog(
 
 
 def _second(uav: PretendUav, link: Link, until: float) -> list[tuple[float, bytes]]:
-    """Fly to `until` [s] tick by tick and return what arrived on the ground."""
+    """Simulate to `until` [s] tick by tick and return the frames received on the ground."""
     t = uav.tick * TICK_S
     while t < until - TICK_S / 2:
         t += TICK_S
@@ -70,7 +70,7 @@ def _second(uav: PretendUav, link: Link, until: float) -> list[tuple[float, byte
 
 
 def write(file: BinaryIO, pairs: list[tuple[float, bytes]]) -> int:
-    """Append frames to a .tlog, each with its time [s]; return how many."""
+    """Append frames with their times [s] to a .tlog; return their number."""
     for t, frame in sorted(pairs, key=lambda pair: pair[0]):
         file.write(struct.pack(">Q", EPOCH_US + round(t * 1e6)) + frame)
     return len(pairs)
@@ -86,21 +86,21 @@ def to_udp(
     stop: Event,
     say: Callable[[str], None] = print,
 ) -> float:
-    """Fly in real time, one UDP socket per aircraft, and answer what comes back.
+    """Simulate in real time with one UDP socket per aircraft, and reply to requests.
 
-    Where the machine is too slow, simulated time runs slower than real time: every tick is simulated and sent, none is
-    left out, and the achieved speed is told once.
+    On a machine that is too slow, simulated time runs slower than real time; no tick is skipped. The achieved speed is
+    logged once.
 
     Args:
-        uavs: aircraft to fly
-        to: host and port of the gateway
-        seconds: how long [s]; None for ever
-        loss: share of frames lost, either way
-        seed: draws losses and delays
-        stop: ends the flight
-        say: where to say that real time is not kept, and what speed is achieved
+        uavs: simulated aircraft
+        address: host and port of the gateway
+        seconds: duration [s]; None: unlimited
+        loss: fraction of frames lost in each direction
+        seed: seed of losses and delays
+        stop: stops the simulation
+        log: receives the message about speed below real time
     Returns:
-        the largest delay of a round behind its due time [s]
+        maximum lag of a round behind real time [s]
     """
     rng = np.random.default_rng((seed, 7))
     links = [Link(np.random.default_rng((seed, 6, uav.uav_id)), loss) for uav in uavs]
@@ -123,25 +123,25 @@ def to_udp(
 
 
 class _Pace:
-    """Simulated time against real time: the same speed as long as the machine keeps up, else slower.
+    """Simulated time: equal to real time, or slower on a machine that is too slow.
 
     Args:
-        begun: real time when simulated time is 0 [s, monotonic]
-        say: where to tell the achieved speed, once
+        start: real time at simulated time 0 [s, monotonic]
+        log: receives the achieved speed once
     """
 
     def __init__(self, begun: float, say: Callable[[str], None]) -> None:
         self.t = 0.0  # simulated time [s]
         self._begun, self._say = begun, say
-        self._slow: tuple[float, float] | None = None  # simulated and real time since which it is slower [s]
+        self._slow: tuple[float, float] | None = None  # simulated and real time at the start of slow operation [s]
         self._told = False
 
     def due(self, now: float) -> float:
-        """Return the simulated time that is due at `now` [s, monotonic]."""
+        """Return the target simulated time at `now` [s, monotonic]."""
         return now - self._begun
 
     def next(self, now: float) -> float:
-        """Return the simulated time to go on to at `now` [s, monotonic]."""
+        """Advance and return the simulated time at `now` [s, monotonic]."""
         late = self.due(now) - self.t - _LATE_S
         if late > 0:
             self._begun += late
@@ -169,16 +169,16 @@ def _socket(to: tuple[str, int]) -> socket.socket:
 
 
 def _serve(uav: PretendUav, link: Link, sock: socket.socket, t: float, deaf: bool) -> None:
-    """Fly one aircraft to `t` [s], listen, talk."""
+    """Simulate one aircraft to `t` [s], receive requests, send frames."""
     link.send(t, uav.step(t))
     try:
         while data := sock.recv(65_535):
             if not deaf:
                 link.send(t, uav.hear(data))
-    except OSError:  # nothing more to hear, or nobody there yet
+    except OSError:  # no more data, or no receiver yet
         pass
     for _, frame in link.receive(t):
         try:
             sock.send(frame)
-        except OSError:  # no room, nobody there, no way: as with a radio, gone
+        except OSError:  # the frame is lost, as on a radio
             continue

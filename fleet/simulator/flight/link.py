@@ -1,33 +1,33 @@
-"""The radio of a pretend aircraft: loses frames, delays the others a little, keeps their order."""
+"""Simulated radio link: loses frames, delays the others, preserves their order."""
 
 from collections import deque
 
 import numpy as np
 
-DELAY_S = 0.015  # shortest way down [s]
-JITTER_S = 0.004  # mean of what comes on top [s]
-FADE_S = (0.2, 1.4)  # how long it falls silent, where it does [s]
+DELAY_S = 0.015  # minimum delay [s]
+JITTER_S = 0.004  # mean additional delay [s]
+FADE_S = (0.2, 1.4)  # range of the duration of a fade [s]
 
 
 class Link:
     """One direction of one radio link."""
 
     def __init__(self, rng: np.random.Generator, loss: float, fades_s: float = 0.0):
-        """Draw losses from `rng`; it falls silent every `fades_s` seconds or so, if that is above 0.
+        """Draw losses from `rng`; with `fades_s` above 0, fades occur at this mean interval [s].
 
         Raises:
-            ValueError: when `loss` is no share.
+            ValueError: when `loss` is outside 0..1.
         """
         if not 0 <= loss < 1:
-            raise ValueError(f"loss: found {loss}, expected a share from 0 to below 1; write e.g. 0.02")
+            raise ValueError(f"loss: found {loss}, expected a fraction from 0 to below 1; use e.g. 0.02")
         self._rng, self._loss = rng, loss
         self._queue: deque[tuple[float, bytes]] = deque()
         self._last = 0.0
         self._fades_s = fades_s
-        self._fade = (0.0, 0.0)  # the next one begins, ends [s]
+        self._fade = (0.0, 0.0)  # start and end of the next fade [s]
 
     def send(self, t: float, frames: list[bytes]) -> None:
-        """Hand over frames at time `t` [s]."""
+        """Send frames at time `t` [s]."""
         if self._fades_s > 0 and self._faded(t):
             return
         for frame in frames:
@@ -42,7 +42,7 @@ class Link:
         return t >= self._fade[0]
 
     def receive(self, t: float) -> list[tuple[float, bytes]]:
-        """Return what has arrived by time `t`: arrival time [s] and frame, in order."""
+        """Return the frames received until `t`: arrival time [s] and frame, in order."""
         arrived = []
         while self._queue and self._queue[0][0] <= t:
             arrived.append(self._queue.popleft())

@@ -1,6 +1,6 @@
-"""The voice of a pretend aircraft: MAVLink 2 as ArduPlane or PX4 speak it, telemetry out, questions in, answers out.
+"""MAVLink 2 interface of a simulated aircraft (ArduPlane or PX4): telemetry and replies to requests.
 
-What is told unasked is in `mavlink_said`.
+`mavlink_messages` defines the telemetry streams.
 Source: MAVLink common and ardupilotmega dialects.
 """
 
@@ -23,11 +23,11 @@ _CAPABILITIES = (
     | mav.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
 )
-_ANSWERS_PER_TICK = 2  # parameters are streamed, not thrown
+_ANSWERS_PER_TICK = 2  # rate limit of the parameter stream
 
 
 class Voice:
-    """One MAVLink system: counts its frames, knows its mission and parameters, answers."""
+    """One MAVLink system with mission and parameters, which sends telemetry and replies to requests."""
 
     def __init__(
         self,
@@ -36,13 +36,13 @@ class Voice:
         params: Mapping[str, float],
         dialect: Dialect = DIALECTS["ardupilot"],
     ):
-        """Speak as `system`.
+        """Create a MAVLink system.
 
         Args:
             system: MAVLink system id, 1..250
             items: the mission on board
-            params: parameters in the autopilot's names and units
-            dialect: how the autopilot speaks
+            params: parameters in the names and units of the autopilot
+            dialect: message set of the autopilot
         """
         self._out = mav.MAVLink(None, srcSystem=system, srcComponent=COMPONENT)
         self._in = mav.MAVLink(None)
@@ -50,7 +50,7 @@ class Voice:
         self._items = items
         self._names = sorted(params)
         self._params, self._dialect = params, dialect
-        self._waiting: deque[int] = deque()  # parameters still to be streamed
+        self._waiting: deque[int] = deque()  # indices of parameters to send
 
     def _frame(self, message: Any) -> bytes:
         packed = bytes(message.pack(self._out))
@@ -58,22 +58,22 @@ class Voice:
         return packed
 
     def telemetry(self, tick: int, flight: Callable[[], Flight]) -> list[bytes]:
-        """Return the frames due at this tick of 10 ms; `flight` is asked only when one is."""
+        """Return the frames due at this tick of 10 ms; `state` is called only if one is due."""
         due = [make for rate, phase, make in self._dialect.telemetry if (tick - phase) % round(TICK_HZ / rate) == 0]
         now = flight() if due else None
         frames = [self._frame(make(now)) for make in due if now is not None]
         return frames + self.stream(_ANSWERS_PER_TICK)
 
     def stream(self, most: int) -> list[bytes]:
-        """Give up to `most` of the parameters that were asked for."""
+        """Return up to `limit` requested parameters as frames."""
         count = min(most, len(self._waiting))
         return [self._frame(self._param(self._waiting.popleft())) for _ in range(count)]
 
     def hear(self, data: bytes, t: float) -> list[bytes]:
-        """Listen to bytes from the ground at `t` since boot [s] and return the answers; noise is passed over."""
+        """Process bytes from the ground at `t` since boot [s] and return the replies; ignore invalid data."""
         try:
             messages: Iterable[Any] = self._in.parse_buffer(data) or ()
-        except (mav.MAVError, ValueError):  # a wrong checksum, or text that is no text
+        except (mav.MAVError, ValueError):  # wrong checksum or invalid text
             return []
         answers: list[Any] = []
         for message in messages:
@@ -101,7 +101,7 @@ class Voice:
 
     def _mission_list(self, message: Any, t: float) -> list[Any]:
         del t
-        count = len(self._items) if message.mission_type == 0 else 0  # no fence, no rally points
+        count = len(self._items) if message.mission_type == 0 else 0  # neither geofence nor rally points
         return [mav.MAVLink_mission_count_message(*_sender(message), count, message.mission_type)]
 
     def _mission_item(self, message: Any, t: float) -> list[Any]:
@@ -119,9 +119,9 @@ class Voice:
         del t
         wanted = mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION
         asks_version = message.command == mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
-            message.command == mav.MAV_CMD_REQUEST_MESSAGE and message.param1 == wanted  # which may be no number
+            message.command == mav.MAV_CMD_REQUEST_MESSAGE and message.param1 == wanted  # may be nan
         )
-        fine = asks_version or message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL  # the rates are as they should be
+        fine = asks_version or message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL  # rates are fixed
         result = mav.MAV_RESULT_ACCEPTED if fine else mav.MAV_RESULT_UNSUPPORTED
         ack = mav.MAVLink_command_ack_message(message.command, result, 0, 0, *_sender(message))
         return [ack, self._version()] if asks_version else [ack]
@@ -153,15 +153,15 @@ _ANSWERS: dict[str, Callable[[Voice, Any, float], list[Any]]] = {
 
 
 class Ground:
-    """The few questions a recording begins with, so that it holds mission and parameters by itself."""
+    """Requests at the start of a recording, so that it contains mission and parameters."""
 
     def __init__(self, system: int):
-        """Speak to `system` as a ground station."""
+        """Create a ground station that addresses `system`."""
         self._mav = mav.MAVLink(None, srcSystem=255, srcComponent=mav.MAV_COMP_ID_MISSIONPLANNER)
         self._to = (system, COMPONENT)
 
     def questions(self, items: int) -> list[bytes]:
-        """Ask for the version, every mission item and the parameter list, in this order."""
+        """Return requests for the version, every mission item and the parameter list, in this order."""
         version = (mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 0, 0, 0, 0, 0, 0)
         asked = [
             mav.MAVLink_command_long_message(*self._to, *version),

@@ -1,7 +1,7 @@
-"""What a pretend aircraft tells by itself, at which rate: telemetry as ArduPlane's and as PX4's links stream it.
+"""Telemetry messages of a simulated aircraft and their rates, for ArduPlane and PX4.
 
-Degrees, centimetres and whole percent begin and end in this file and in `mavlink`.
-Source: MAVLink common and ardupilotmega dialects; PX4 src/modules/mavlink for what it streams.
+Only this file and `mavlink` use degrees, centimetres and integer percent.
+Source: MAVLink common and ardupilotmega dialects; PX4 src/modules/mavlink for its streams.
 """
 
 import struct
@@ -24,11 +24,11 @@ _ARMED = (
 
 
 class Flight(NamedTuple):
-    """What one aircraft has to tell at one instant."""
+    """Telemetry values of one aircraft at one instant."""
 
     t: float  # since boot [s]
     now: Estimate
-    place: tuple[int, int, int]  # believed position [1e-7 deg, 1e-7 deg, mm above mean sea level]
+    place: tuple[int, int, int]  # estimated position [1e-7 deg, 1e-7 deg, mm above mean sea level]
     height: float  # above home [m]
     pulses: tuple[int, int, int, int]  # servos 1..4 [us]
     delta_t: float  # [-]
@@ -38,10 +38,10 @@ class Flight(NamedTuple):
     alt_error: float  # [m]
     Va_error: float  # [m/s]
     xtrack_error: float  # [m]
-    seq: int  # mission item in force
-    total: int  # items in the mission
+    seq: int  # current mission item
+    total: int  # number of mission items
     home: tuple[int, int, int]  # [1e-7 deg, 1e-7 deg, mm above mean sea level]
-    wind: tuple[float, float]  # as the autopilot believes, NED, where it blows to [m/s]
+    wind: tuple[float, float]  # estimate of the autopilot, NED, direction it blows to [m/s]
 
 
 def _boot_ms(t: float) -> int:
@@ -81,7 +81,7 @@ def _hud(f: Flight) -> Any:
 def _nav(f: Flight) -> Any:
     bearing = round(degrees(atan2(f.target[1], f.target[0])))
     distance = min(round(hypot(*f.target)), 65_535)
-    Va_error = f.Va_error * 100  # ArduPlane sends centimetres per second here, against the dialect's text
+    Va_error = f.Va_error * 100  # ArduPlane sends centimetres per second here, unlike the dialect documentation
     return mav.MAVLink_nav_controller_output_message(
         degrees(f.phi_c), degrees(f.theta_c), bearing, bearing, distance, f.alt_error, Va_error, f.xtrack_error
     )
@@ -154,7 +154,7 @@ def _satellites(f: Flight) -> Any:
 
 
 Table = tuple[tuple[float, int, Callable[[Flight], Any]], ...]
-"""Rate [Hz], phase [ticks], maker."""
+"""Rate [Hz], phase [ticks], message function."""
 
 _COMMON: Table = (
     (25, 0, _attitude),
@@ -179,7 +179,7 @@ TELEMETRY_PX4: Table = (
     (1, 43, _wind_cov),
     (0.5, 53, _home),
 )
-_RECORDED: Table = (  # on board, where no radio is a bottleneck
+_RECORDED: Table = (  # onboard log, without the bandwidth limit of a radio
     (25, 0, _attitude),
     (25, 2, _imu),
     (25, 1, _servos),
@@ -192,15 +192,15 @@ _RECORDED: Table = (  # on board, where no radio is a bottleneck
     (1, 11, _mission_current),
     (1, 23, _heartbeat),
 )
-_WHOLE = ("PWM_MAIN_", "CA_SV_CS", "FW_ARSP_SCALE_EN", "NPFG_LB_PERIOD")  # parameters of PX4 that are integers
+_WHOLE = ("PWM_MAIN_", "CA_SV_CS", "FW_ARSP_SCALE_EN", "NPFG_LB_PERIOD")  # prefixes of integer parameters of PX4
 
 
 class Dialect(NamedTuple):
-    """How one autopilot speaks."""
+    """MAVLink behaviour of one autopilot."""
 
     telemetry: Table
-    version: int  # as AUTOPILOT_VERSION packs it
-    whole: tuple[str, ...]  # names that begin so are integers, and sent as their bytes
+    version: int  # encoded as in AUTOPILOT_VERSION
+    whole: tuple[str, ...]  # name prefixes of integers, sent as raw bytes
 
 
 DIALECTS = {
@@ -213,7 +213,7 @@ RECORDED = Dialect(_RECORDED, 0x040600FF, ())
 
 
 def value_message(name: str, value: float, counts: tuple[int, int], dialect: Dialect) -> Any:
-    """Make PARAM_VALUE; counts: how many parameters there are, and which this is."""
+    """Create PARAM_VALUE; counts: number of parameters and index of this one."""
     if dialect.whole and name.startswith(dialect.whole):
         (bits,) = struct.unpack("<f", struct.pack("<i", round(value)))
         return mav.MAVLink_param_value_message(name.encode(), bits, mav.MAV_PARAM_TYPE_INT32, *counts)

@@ -1,4 +1,4 @@
-"""Autopilot parameters of a pretend aircraft, as somebody who tuned each one by hand would have left them."""
+"""Autopilot parameters of a simulated aircraft, with variations as from manual tuning."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -11,11 +11,11 @@ from fleet.simulator.vehicle.types import CRUISE
 
 
 class Tuning(NamedTuple):
-    """What one type of aircraft needs of one autopilot."""
+    """Parameters of one autopilot for one aircraft type."""
 
     defaults: Mapping[str, float]
-    airframe: Mapping[str, float]  # what this type needs; the rest stays at the autopilot's defaults
-    choices: Mapping[str, tuple[float, ...]]  # what differs from one aircraft to the next
+    airframe: Mapping[str, float]  # values for this type; others stay at the defaults
+    choices: Mapping[str, tuple[float, ...]]  # values that vary between aircraft
 
 
 _SMALL_ARDUPLANE = Tuning(
@@ -178,10 +178,10 @@ _FUNCTIONS = {1: 4, 2: 19, 3: 70, 4: 21}  # SERVOn_FUNCTION: aileron, elevator, 
 
 
 def tuned(seed: int, autopilot: str = "ardupilot", aircraft: str = "small") -> dict[str, float]:
-    """Return the parameters of one aircraft in its autopilot's names and units.
+    """Return the parameters of one aircraft in the names and units of its autopilot.
 
     Args:
-        seed: draws what differs from one aircraft to the next
+        seed: seed of the variations between aircraft
         autopilot, aircraft: one pair of `TUNINGS`
     """
     rng = np.random.default_rng((seed, 3))

@@ -1,4 +1,4 @@
-"""One pretend aircraft: physics, sensors, autopilot and voice, stepped by whoever drives it."""
+"""One simulated aircraft: flight dynamics, sensors, autopilot and MAVLink interface."""
 
 from collections.abc import Mapping, Sequence
 from math import pi, sin
@@ -28,12 +28,12 @@ DT = 1 / TICK_HZ
 _INNER, _OUTER = 2, 10  # attitude loop at 50 Hz, guidance at 10 Hz [ticks]
 _LEGS_AHEAD = 200
 _LAWS = {"ardupilot": "arduplane", "px4": "px4"}
-JITTER_S = 0.001  # of time stamps on board [s]
-_GROUND_M = 3.0  # below this height above home the flight is over
+JITTER_S = 0.001  # jitter of onboard time stamps [s]
+_GROUND_M = 3.0  # height above home below which the flight ends
 
 
 class PretendUav:
-    """An aircraft on its own mission; `step` makes it fly and talk, `hear` makes it answer."""
+    """Simulated aircraft on a mission; `step` advances it and returns telemetry, `receive` returns replies."""
 
     def __init__(
         self,
@@ -50,22 +50,22 @@ class PretendUav:
         faults: Sequence[Fault] = (),
         situation: Situation | None = None,
     ):
-        """Put one aircraft in the air.
+        """Initialise one aircraft in flight.
 
         Args:
-            uav_id: from 0; the MAVLink system id is one more
-            seed: with `uav_id` draws everything; aircraft of one seed share the mean wind
+            uav_id: from 0; the MAVLink system id is `uav_id` + 1
+            seed: with `uav_id` the seed of all random draws; aircraft of one seed share the mean wind
             wind: mean wind at 100 m [m/s]
             turbulence: MIL-F-8785C severity, 0..7
-            origin: home, where the NED frame touches the earth
-            autopilot: whose law flies it and whose MAVLink it speaks, ardupilot or px4
+            origin: home, origin of the NED frame
+            autopilot: control law and MAVLink dialect, ardupilot or px4
             aircraft: name in `types.TYPES`
-            plan: mission to fly instead of its own, and where on it the aircraft is found
-            more: autopilot parameters beside its own
-            faults: what is wrong with it, and since when
-            situation: one flight of several of this aircraft, instead of the one the seed draws
+            plan: mission and start state; None: random
+            extra_params: autopilot parameters that override its own
+            faults: faults of the aircraft
+            setup: conditions of the flight; None: drawn from the seed
         Raises:
-            ValueError: when MAVLink has no system id for it.
+            ValueError: when `uav_id` is outside the MAVLink range.
         """
         if not 0 <= uav_id < MOST_AIRCRAFT:
             most = MOST_AIRCRAFT - 1
@@ -82,9 +82,9 @@ class PretendUav:
         self._first = legs_of.FIRST.get(autopilot, 1)
         self.items, start = situation.plan
         self.params = {**tuned(own, autopilot, aircraft), **more}
-        self.boot_s = float(rng.uniform(60, 600))  # on the ground before the world began [s]
+        self.boot_s = float(rng.uniform(60, 600))  # time since boot at simulation start [s]
         self.tick = 0
-        self.down = False  # it hit the ground
+        self.down = False  # reached the ground
         self._wind = situation.weather.wind(rng, DT * _OUTER)
         examined = situation.examined
         self._sensors = Sensors(rng, DT * _INNER, np.random.default_rng((own, 9)) if examined else None)
@@ -104,7 +104,7 @@ class PretendUav:
         self._engage(start.seq)
 
     def _engage(self, seq: int) -> None:
-        """Start the autopilot on item `seq`."""
+        """Initialise the autopilot on item `seq`."""
         par, _ = laws.parameters(self._law, self.params, self.origin.alt_mm * 1e-3 - self.now.p[2])
         self._par = laws.blown(par, *self._believed)
         self._legs, start = self._route(seq)
@@ -112,31 +112,31 @@ class PretendUav:
         self._ctl = laws.init(self._par, self._legs, 0, start, e.p, e.v, e.euler, e.Va, self._theta_c, self._delta_t)
 
     def _route(self, seq: int) -> tuple[np.ndarray, np.ndarray]:
-        """Unroll the mission from item `seq`; return its legs and where the first begins."""
+        """Convert the mission from item `seq` to legs; return them and the start of the first."""
         more = {"params": self.params, "limit": _LEGS_AHEAD, "first": self._first}
         way = legs_of.route(self.items, seq=seq, origin=self.origin, **more)  # type: ignore[arg-type]
         return way.legs, way.start
 
     def step(self, t: float) -> list[bytes]:
-        """Fly on to `t` [s] since the start and return the frames sent on the way."""
+        """Advance to `t` [s] since simulation start and return the frames sent meanwhile."""
         frames: list[bytes] = []
         while self.tick < round(t * TICK_HZ) and not self.down:
             frames += self._tick()
         return frames
 
     def hear(self, data: bytes) -> list[bytes]:
-        """Listen to bytes from the ground; return the answers."""
+        """Process bytes from the ground and return the replies."""
         return self._voice.hear(data, self.boot_s + self.tick * DT)
 
     def introduce(self) -> list[bytes]:
-        """Return every frame a recording should begin with: version, mission, parameters."""
+        """Return the frames for the start of a recording: version, mission, parameters."""
         questions = Ground(self.uav_id + 1).questions(len(self.items))
         answers = [frame for question in questions for frame in self.hear(question)]
         return answers + self._voice.stream(len(self.params))
 
     @property
     def leg(self) -> np.ndarray:
-        """The leg in force, columns as in `fleet.mission`."""
+        """Current leg, columns as in `fleet.mission`."""
         return self._legs[int(self._ctl[memory.LEG])]
 
     def _tick(self) -> list[bytes]:
@@ -153,7 +153,7 @@ class PretendUav:
         return frames
 
     def _weather(self) -> None:
-        """Let the wind blow, and the autopilot estimate it."""
+        """Update the wind and its estimate."""
         height = -float(self.now.p[2])
         blowing = (*self._wind.step(height), 0.0)
         if self.carried is not None:
@@ -163,7 +163,7 @@ class PretendUav:
         self.aircraft.blow(*blowing)
 
     def _measure(self) -> Estimate:
-        """Return what the autopilot believes, faults and all."""
+        """Return the state estimate including faults."""
         truth = self.aircraft.truth()
         e = self._sensors.measure(truth)
         if self._heights is not None:
@@ -171,7 +171,7 @@ class PretendUav:
         return e if self.carried is None else self.carried.sense(self.tick * DT, e)
 
     def _control(self) -> None:
-        """Measure, let the autopilot decide, move the servos."""
+        """Measure, run the autopilot, set the servos."""
         e = self.now = self._measure()
         self.down = not -e.p[2] > _GROUND_M
         if self.tick % _OUTER == 0:
@@ -193,7 +193,7 @@ class PretendUav:
         self.aircraft.drive(*Servos.commands(self.pulses))
 
     def _renew(self) -> None:
-        """Unroll the endless mission further, without disturbing the autopilot's memory."""
+        """Extend the legs of the endless mission without changing the controller state."""
         self._legs, _ = self._route(int(self.leg[legs_of.SEQ]))
         self._ctl[memory.LEG] = 0
 
@@ -223,7 +223,7 @@ class PretendUav:
         )
 
     def _xtrack(self) -> float:
-        """Return the distance right of the leg's line, or outside the circle [m]."""
+        """Return the distance to the right of the line, or outside the circle [m]."""
         e, leg, ctl = self.now, self.leg, self._ctl
         centre = leg[legs_of.P_N : legs_of.P_D]
         if leg[legs_of.KIND] != legs_of.WAYPOINT:

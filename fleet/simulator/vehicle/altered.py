@@ -1,13 +1,13 @@
-"""Aircraft files with knobs: what may go wrong with the airframe becomes a JSBSim property.
+"""Instrumented aircraft files: airframe faults become JSBSim properties.
 
-The files are read where they are installed, and changed in memory; no copy is kept. At its default every knob does
-nothing, and the aircraft flies as before; only the Cessna's inertial unit is no longer at the pilot's eyes.
+The installed files are read and changed in memory only. At the defaults of the properties the aircraft is unchanged,
+except that the inertial unit of the Cessna moves from the eye point to the centre of gravity.
 
     conceal/C_D         drag coefficient added                      conceal/lift    factor of all lift
-    conceal/C_n_beta, C_Y_beta, C_l_p, C_m_q    factors of those derivatives (c172p; the small one has its own, vary/*)
-    conceal/slipstream  share of the propeller's wash that the tail's surfaces feel (c172p; 1 as JSBSim has it)
-    conceal/p_factor    the thrust line moves aside by so much per angle of attack (c172p) [in/rad]
-    and one more point mass at the empty centre of gravity, the last in the list
+    conceal/C_n_beta, C_Y_beta, C_l_p, C_m_q    factors of those derivatives (c172p; small: vary/*)
+    conceal/slipstream  fraction of the propeller slipstream on the tail surfaces (c172p; 1 as in JSBSim)
+    conceal/p_factor    shift of the thrust line per angle of attack (c172p) [in/rad]
+    and a further point mass at the empty centre of gravity, the last in the list
 """
 
 from functools import cache
@@ -17,7 +17,7 @@ from xml.etree.ElementTree import Element, SubElement
 from fleet.simulator.vehicle.jsbsim import model_file
 from fleet.simulator.vehicle.types import TYPES, Type
 
-_FACTORS = {  # knob: functions it multiplies
+_FACTORS = {  # property: functions it multiplies
     "conceal/C_n_beta": ("aero/coefficient/Cnb",),
     "conceal/C_Y_beta": ("aero/coefficient/CYb",),
     "conceal/C_l_p": ("aero/coefficient/Clp",),
@@ -26,17 +26,17 @@ _FACTORS = {  # knob: functions it multiplies
 _UNIT_IN = (41.9, -0.7, 37.3)
 _WASH = "aero/function/qbar-induced-psf"
 _TAIL = ("aero/coefficient/Cmde", "aero/coefficient/Cndr")
-_P_FACTOR = {"z": ("-1", "aero/alpha-rad"), "y": ("1", "aero/beta-rad")}  # thrust moves right: the nose goes left
+_P_FACTOR = {"z": ("-1", "aero/alpha-rad"), "y": ("1", "aero/beta-rad")}  # thrust line to the right: nose left
 
 
 def altered(name: str) -> Type:
-    """Return the type `name` of `types.TYPES` with knobs on it."""
+    """Return the type `name` of `types.TYPES` with its instrumented aircraft file."""
     return TYPES[name]._replace(file=_file(name))
 
 
 @cache
 def _file(name: str) -> str:
-    """Write the file of one type."""
+    """Return the instrumented aircraft file of one type."""
     kind = TYPES[name]
     root = ElementTree.parse(model_file(kind)).getroot()
     _knob_forces(root)
@@ -48,7 +48,7 @@ def _file(name: str) -> str:
 
 
 def _knob_forces(root: Element) -> None:
-    """Add knobs of drag, lift and mass."""
+    """Add properties for drag, lift and mass."""
     air = _one(root, "aerodynamics")
     for knob, value in (("conceal/C_D", "0"), ("conceal/lift", "1")):
         air.insert(0, _property(knob, value))
@@ -63,7 +63,7 @@ def _knob_forces(root: Element) -> None:
 
 
 def _measure_in_the_middle(root: Element) -> None:
-    """Put the inertial unit where the loaded Cessna's centre of gravity is; JSBSim measures at the pilot's eyes."""
+    """Move the eye point, where JSBSim computes accelerations, to the centre of gravity of the loaded Cessna."""
     eyes = _one(root, "metrics/location[@name='EYEPOINT']")
     for axis, inches in zip("xyz", _UNIT_IN, strict=True):
         _one(eyes, axis).text = str(inches)
@@ -78,7 +78,7 @@ def _knob_derivatives(root: Element) -> None:
 
 
 def _knob_propeller(root: Element) -> None:
-    """Let the wash over the tail be a matter of degree, and the thrust line move with the flow."""
+    """Add properties for the slipstream on the tail and for the shift of the thrust line."""
     air = _one(root, "aerodynamics")
     felt = Element("function", name="conceal/qbar-tail-psf")
     whole = SubElement(felt, "sum")

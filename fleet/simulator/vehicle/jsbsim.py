@@ -1,6 +1,6 @@
-"""The physics of the pretend aircraft: JSBSim, flown in SI, NED and FRD.
+"""Flight dynamics of the simulated aircraft: JSBSim in SI, NED and FRD.
 
-Nothing of the twin's own physics is used here, so that the twin is judged on physics it does not share.
+The module uses nothing from the physics of the twin, so that the twin is tested on independent physics.
 """
 
 from math import atan2, cos, degrees, hypot, sin
@@ -28,13 +28,13 @@ _READ = (
     *("atmosphere/P-psf", "atmosphere/T-R"),
 )
 _SURFACES = ("fcs/aileron-cmd-norm", "fcs/elevator-cmd-norm", "fcs/rudder-cmd-norm")
-_MIXTURE = 0.87  # of a piston engine at these heights [-]
+_MIXTURE = 0.87  # mixture of a piston engine at these heights [-]
 _HERE = Path(__file__).parent
 __all__ = ["CRUISE", "DT", "Aircraft", "Truth"]
 
 
 class Truth(NamedTuple):
-    """What the physics says, before any sensor."""
+    """True state, without sensor errors."""
 
     p: np.ndarray  # position, NED from the origin, (3,) [m]
     v: np.ndarray  # velocity over ground, NED, (3,) [m/s]
@@ -52,26 +52,26 @@ class Truth(NamedTuple):
 class Gusts(NamedTuple):
     """Turbulence of one flight."""
 
-    seed: int  # draws it
-    w20_fps: float  # wind at 20 ft, which the intensity below 1000 ft goes with
+    seed: int  # random seed
+    w20_fps: float  # wind at 20 ft, sets the intensity below 1000 ft
 
 
 class Aircraft:
-    """One JSBSim aircraft, with the small differences that every built aircraft has."""
+    """One JSBSim aircraft with random variations of its parameters."""
 
     def __init__(
         self, origin: Origin, seed: int, turbulence: int = 0, kind: Type = TYPES["small"], gusts: Gusts | None = None
     ):
-        """Load the model and draw what makes this aircraft its own.
+        """Load the model and draw its variations.
 
         Args:
-            origin: where the NED frame touches the earth
-            seed: draws mass, coefficients and turbulence
+            origin: origin of the NED frame
+            seed: seed of mass, coefficients and turbulence
             turbulence: MIL-F-8785C severity, 0..7
-            kind: what to load
-            gusts: the turbulence in detail, where the severity is not enough
+            kind: aircraft type
+            gusts: seed and intensity of turbulence, instead of those of the severity
         Raises:
-            RuntimeError: when JSBSim refuses its aircraft file; reinstall the package.
+            RuntimeError: when JSBSim cannot load its aircraft file; reinstall the package.
         """
         self._fdm, self.kind = _executive(kind), kind
         self._driven = (*_SURFACES, kind.motor)
@@ -96,13 +96,13 @@ class Aircraft:
             self._fdm[f"vary/{name}"] = spread * float(np.clip(rng.standard_normal(), -2, 2))
 
     def start(self, p: np.ndarray, psi: float, Va: float, wind: tuple[float, float]) -> tuple[float, float, float]:
-        """Put the aircraft in the air, trimmed in level flight through a moving air mass.
+        """Initialise the aircraft in trimmed level flight in wind.
 
         Args:
             p: position, NED from the origin, (3,) [m]
             psi: heading [rad]
             Va: airspeed [m/s]
-            wind: north, east, the direction it blows to [m/s]
+            wind: north, east, direction it blows to [m/s]
         Returns:
             theta [rad], delta_e, delta_t at trim
         """
@@ -131,7 +131,7 @@ class Aircraft:
         return trim
 
     def _trim_engine(self, Va: float) -> tuple[float, float, float]:
-        """Start the engine and let JSBSim trim; the pitch trim wheel is left to the elevator."""
+        """Start the engine and trim with JSBSim; transfer the pitch trim to the elevator."""
         fdm = self._fdm
         fdm["ic/vt-fps"], fdm["ic/gamma-deg"] = Va / FT, 0.0
         fdm["propulsion/magneto_cmd"], fdm["fcs/mixture-cmd-norm"] = 3, _MIXTURE
@@ -146,7 +146,7 @@ class Aircraft:
         return float(theta), float(delta_e), float(delta_t)
 
     def _trim(self, Va: float) -> tuple[float, float, float]:
-        """Solve udot = wdot = qdot = 0 for alpha, delta_e, delta_t by Newton's method; servo lags pass through."""
+        """Solve udot = wdot = qdot = 0 for alpha, delta_e, delta_t by Newton's method, without servo lags."""
         self._fdm.set_trim_status(True)
         z = np.array([0.06, 0.1, 0.4])
         for _ in range(12):
@@ -167,12 +167,12 @@ class Aircraft:
         return np.array([fdm[name] for name in names])
 
     def drive(self, delta_a: float, delta_e: float, delta_r: float, delta_t: float) -> None:
-        """Command the servos, -1..1 (+ rolls right, pitches up, yaws right), and the motor, 0..1."""
+        """Set the commands of servos, -1..1 (+ rolls right, pitches up, yaws right), and motor, 0..1."""
         for name, value in zip(self._driven, (delta_a, -delta_e, -delta_r, delta_t), strict=True):
             self._nodes[name].set_double_value(value)
 
     def blow(self, w_n: float, w_e: float, w_d: float = 0.0) -> None:
-        """Set the mean wind, NED, the direction it blows to [m/s]; turbulence comes on top."""
+        """Set the mean wind, NED, direction it blows to [m/s]; turbulence is added."""
         self._fdm["atmosphere/wind-north-fps"] = w_n / FT
         self._fdm["atmosphere/wind-east-fps"] = w_e / FT
         self._fdm["atmosphere/wind-down-fps"] = w_d / FT
@@ -182,7 +182,7 @@ class Aircraft:
         self._fdm.run()
 
     def ponder(self) -> np.ndarray:
-        """Reckon pdot qdot rdot [rad/s2] and specific force, FRD [m/s2], anew while time stands still, (6,)."""
+        """Evaluate pdot qdot rdot [rad/s2] and specific force, FRD [m/s2], without advancing time, (6,)."""
         self._fdm.suspend_integration()
         self._fdm.run()
         self._fdm.resume_integration()
@@ -191,7 +191,7 @@ class Aircraft:
         return np.array([*turning, *force])
 
     def truth(self) -> Truth:
-        """Read the state in SI, NED and FRD."""
+        """Return the state in SI, NED and FRD."""
         x = np.array([read() for read in self._read])
         origin = self._origin
         p = np.array(
@@ -212,22 +212,22 @@ class Aircraft:
         return Truth(p, x[3:6] * FT, x[6:9], x[9:12], x[12:15] * FT, *air)
 
     def __getitem__(self, name: str) -> float:
-        """Read any JSBSim property by its own name, in its own unit."""
+        """Return a JSBSim property by its name, in its unit."""
         return float(self._fdm[name])
 
     def __setitem__(self, name: str, value: float) -> None:
-        """Set any JSBSim property by its own name, in its own unit: what a fault changes."""
+        """Set a JSBSim property by its name, in its unit."""
         self._fdm[name] = value
 
 
 def model_file(kind: Type) -> Path:
-    """Find the aircraft file of a type: in the jsbsim package, or beside this file."""
+    """Return the path of the aircraft file of a type, in the jsbsim package or beside this file."""
     root = Path(jsbsim.get_default_root_dir()) if kind.shipped else _HERE
     return root / "aircraft" / kind.model / f"{kind.model}.xml"
 
 
 def _load(fdm: Any, kind: Type) -> bool:
-    """Load a model; JSBSim reads files only, so a changed one is written, read and gone."""
+    """Load a model; JSBSim reads files only, so a changed one goes through a temporary file."""
     if kind.file is None:
         return bool(fdm.load_model(kind.model))
     with TemporaryDirectory(prefix="parauav-") as folder:
@@ -239,7 +239,7 @@ def _load(fdm: Any, kind: Type) -> bool:
 
 
 def _executive(kind: Type) -> Any:
-    """Make a silent JSBSim executive with an aircraft loaded."""
+    """Create a JSBSim executive without log output and load an aircraft."""
     jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.ERROR))
     fdm = jsbsim.FGFDMExec(None if kind.shipped else str(_HERE))
     fdm.set_debug_level(0)

@@ -1,7 +1,7 @@
-"""Missions for pretend aircraft: each its own walk round a common home, with turns, climbs, loiters and speed changes.
+"""Missions for simulated aircraft: random routes around a common home, with turns, climbs, loiters and speed changes.
 
-Items are as MAVLink knows them; the last is a DO_JUMP back to the first waypoint, for ever. Item 0 is home; PX4 has no
-such item, and circles by the clock where ArduPlane counts turns.
+Items are MAVLink mission items; the last is an endless DO_JUMP to the first waypoint. Item 0 is home. PX4 has no such
+item, and loiters for a time where ArduPlane counts turns.
 """
 
 from collections.abc import Iterator
@@ -17,29 +17,29 @@ from fleet.frames import Origin, to_geodetic, wrap
 HOME = Origin(474_000_000, 85_000_000, 450_000)  # over open country [1e-7 deg, 1e-7 deg, mm]
 WAYPOINT, LOITER_TURNS, LOITER_TIME, DO_JUMP, DO_CHANGE_SPEED = 16, 18, 19, 177, 178
 ABSOLUTE, RELATIVE_ALT = 0, 3
-REACH_M = 1_300.0  # waypoints stay this near to home
+REACH_M = 1_300.0  # maximum distance of waypoints from home
 LEGS = 10
 TURNS_DEG = (25, 45, 60, 75, 90, 90, 110, 130, 150)
 LOW_M, HIGH_M = 80.0, 200.0  # above home
 
 
 class Field(NamedTuple):
-    """What the missions of a type of aircraft look like."""
+    """Geometry of the missions of an aircraft type."""
 
-    scale: float = 1.0  # of lengths over ground
-    circle: float = 1.0  # of radii
-    height: float = 1.0  # of heights above home
-    climb: float = 0.08  # steepest slopes: what the motor lifts, what an idling motor sinks [-]
-    sink: float = 0.055
+    scale: float = 1.0  # factor of horizontal lengths
+    circle: float = 1.0  # factor of radii
+    height: float = 1.0  # factor of heights above home
+    climb: float = 0.08  # maximum climb slope [-]
+    sink: float = 0.055  # maximum descent slope at idle [-]
 
 
 SMALL = Field()
 
 
 class Start(NamedTuple):
-    """Where an aircraft is found when the world begins."""
+    """State of an aircraft at simulation start."""
 
-    seq: int  # mission item it flies to
+    seq: int  # current mission item
     p: np.ndarray  # position, NED from home, (3,) [m]
     psi: float  # heading, along the leg [rad]
 
@@ -56,7 +56,7 @@ class _Walk:
         self.h = rng.uniform(100, 180) * field.height
 
     def advance(self, turn: float, length: float, climb: float) -> None:
-        """Turn by `turn` [rad], fly `length` [m], climb by `climb` [m]; turn homewards when too far out."""
+        """Turn by `turn` [rad], fly `length` [m], climb by `climb` [m]; beyond the maximum distance turn home."""
         if (
             hypot(self.n + length * cos(self.course + turn), self.e + length * sin(self.course + turn))
             > REACH_M * self._field.scale
@@ -69,7 +69,7 @@ class _Walk:
         self.h = float(np.clip(self.h + climb, LOW_M * self._field.height, HIGH_M * self._field.height))
 
     def spot(self) -> tuple[float, float, float]:
-        """Return the current spot, NED from home [m]."""
+        """Return the current position, NED from home [m]."""
         return self.n, self.e, -self.h
 
 
@@ -81,14 +81,14 @@ def _turn(rng: np.random.Generator, at_least: float = 0.0) -> float:
 def mission(
     seed: int, cruise: float, origin: Origin = HOME, field: Field = SMALL, autopilot: str = "ardupilot"
 ) -> tuple[tuple[Item, ...], Start]:
-    """Make one aircraft's endless mission and the place it is found at, in front of a turn.
+    """Draw the endless mission of one aircraft and its start state before a turn.
 
     Args:
-        seed: draws everything
-        cruise: airspeed the speed changes are about [m/s]
+        seed: seed of all random draws
+        cruise: mean of the commanded airspeeds [m/s]
         origin: home
-        field: what its type of aircraft needs
-        autopilot: ardupilot or px4, which read some items differently
+        geometry: mission geometry of the aircraft type
+        autopilot: ardupilot or px4, which interpret some items differently
     """
     rng = np.random.default_rng((seed, 2))
     walk, px4 = _Walk(rng, field), autopilot == "px4"
@@ -119,14 +119,14 @@ def mission(
 
 
 def _from_zero(items: list[Item]) -> Iterator[Item]:
-    """Number items from zero, the jump back with them."""
+    """Renumber items from zero, including the jump target."""
     for item in items:
         first = item.param1 - 1 if item.command == DO_JUMP else item.param1
         yield msgspec.structs.replace(item, seq=item.seq - 1, param1=first)
 
 
 def _before_turn(rng: np.random.Generator, leg: tuple[tuple, tuple], seq: int, scale: float) -> Start:
-    """Stand on the leg, so near to its end that the next turn begins within about ten seconds."""
+    """Return a start state on the leg, about ten seconds before the next turn."""
     p, q = np.array(leg[0]), np.array(leg[1])
     length = hypot(q[0] - p[0], q[1] - p[1])
     share = 1 - rng.uniform(120, 280) * scale / max(length, 300.0 * scale)
@@ -142,7 +142,7 @@ def item(
     params: tuple[float, ...] = (),
     frame: int = RELATIVE_ALT,
 ) -> Item:
-    """Make one item; commands without a place keep zero coordinates."""
+    """Create one item; commands without a position have zero coordinates."""
     lat, lon, alt_mm = to_geodetic(origin, np.array(ned)) if ned is not None else (0, 0, 0)
     alt = 0.0 if ned is None else alt_mm * 1e-3 - (origin.alt_mm * 1e-3 if frame == RELATIVE_ALT else 0.0)
     p = (*params, 0.0, 0.0, 0.0, 0.0)

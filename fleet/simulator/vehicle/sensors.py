@@ -1,7 +1,7 @@
-"""What the autopilot of a pretend aircraft believes: truth with the errors of a small UAV's estimator.
+"""State estimate of a simulated autopilot: true state plus the errors of the estimator of a small UAV.
 
-Position wanders by 0.5 m, velocity by 0.07 m/s, attitude by 0.25 deg; gyros and accelerometers have noise and a small
-bias; airspeed has a scale error of 2 % and 0.25 m/s of noise. The autopilot flies on these values and reports them.
+Standard deviations: position 0.5 m, velocity 0.07 m/s, attitude 0.25 deg; noise and a small bias of gyros and
+accelerometers; airspeed 2 % scale error and 0.25 m/s noise. The autopilot uses and reports these values.
 
 Source: orders of magnitude of EKF innovations in ArduPlane flight logs; Beard & McLain (2012) ch. 7 for the sensors.
 """
@@ -22,7 +22,7 @@ _ERRORS = (
     ("euler", radians(0.25), 30.0, 3),  # [rad]
     ("euler_white", radians(0.02), 0.0, 3),  # [rad]
     ("gyro", 0.003, 0.0, 3),  # [rad/s]
-    ("gyro_bias", 0.001, 300.0, 3),  # [rad/s], what the estimator has not yet learnt
+    ("gyro_bias", 0.001, 300.0, 3),  # [rad/s], residual bias of the estimator
     ("accel", 0.06, 0.0, 3),  # [m/s2]
     ("accel_bias", 0.04, 300.0, 3),  # [m/s2]
     ("airspeed", 0.25, 0.3, 1),  # [m/s]
@@ -30,7 +30,7 @@ _ERRORS = (
 AIRSPEED_SCALE = 0.02  # standard deviation of the pitot tube's scale error [-]
 SEA_LEVEL_RHO = 1.225  # [kg/m3]
 _SEA_LEVEL_PA, _LAPSE, _POWER = 101_325.0, 2.25577e-5, 5.25588  # ICAO standard atmosphere [Pa, 1/m, -]
-BOARD_K = 14.0  # warmer than the air outside [K]
+BOARD_K = 14.0  # excess of board temperature over outside air [K]
 _HEIGHTS = {  # standard deviation, correlation time [s]
     "pressure": (2.0, 0.0),  # [Pa]
     "pressure_wander": (3.0, 60.0),  # [Pa]
@@ -39,31 +39,31 @@ _HEIGHTS = {  # standard deviation, correlation time [s]
 
 
 class Estimate(NamedTuple):
-    """What the autopilot believes; frames and units as in `Truth`, except the airspeed."""
+    """State estimate of the autopilot; frames and units as in `Truth`, except the airspeed."""
 
     p: np.ndarray
     v: np.ndarray
     euler: np.ndarray
     rates: np.ndarray
     force: np.ndarray
-    Va: float  # equivalent airspeed, as a pitot tube feels it: Va_true sqrt(rho / 1.225) [m/s]
-    pressure: float = nan  # static [Pa]; this and what follows only where it is recorded
+    Va: float  # equivalent airspeed of a pitot tube: Va_true sqrt(rho / 1.225) [m/s]
+    pressure: float = nan  # static [Pa]; this and the following only for onboard recordings
     warmth: float = nan  # of the board [K]
-    satellites: float = nan  # height above home by satellites alone [m]
+    satellites: float = nan  # height above home from satellites only [m]
 
 
 class Sensors:
-    """The sensors and the estimator of one aircraft."""
+    """Sensors and estimator of one aircraft."""
 
     def __init__(self, rng: np.random.Generator, dt: float, own: np.random.Generator | None = None):
-        """Draw biases, and the airspeed scale, which may be its own; `dt`: time between two calls of `measure` [s]."""
+        """Draw biases, and the airspeed scale from `scale_rng` if given; `dt`: time between `measure` calls [s]."""
         sigma = np.concatenate([np.full(n, s) for _, s, _, n in _ERRORS])
         tau = np.concatenate([np.full(n, t) for _, _, t, n in _ERRORS])
         self._noise = GaussMarkov(rng, sigma, tau, dt)
         self.airspeed_scale = 1 + AIRSPEED_SCALE * float(np.clip((own or rng).standard_normal(), -2, 2))
 
     def measure(self, truth: Truth) -> Estimate:
-        """Add this instant's errors."""
+        """Return the true state plus errors."""
         e = self._noise.step()
         return Estimate(
             truth.p + e[0:3],
@@ -76,7 +76,7 @@ class Sensors:
 
 
 class Heights:
-    """Barometer and satellites, each by itself: two heights that err apart."""
+    """Barometer and satellite height with independent errors."""
 
     def __init__(self, rng: np.random.Generator, dt: float):
         """Draw the first errors; `dt` is the time between two calls of `measure` [s]."""
@@ -84,7 +84,7 @@ class Heights:
         self._noise = GaussMarkov(rng, np.array(sigma), np.array(tau), dt)
 
     def measure(self, e: Estimate, truth: Truth) -> Estimate:
-        """Add to an estimate what these two sensors say."""
+        """Return an estimate with the readings of both sensors."""
         white, wander, up = map(float, self._noise.step())
         return e._replace(
             pressure=truth.P + white + wander, warmth=truth.T + BOARD_K, satellites=up - float(truth.p[2])
@@ -92,30 +92,30 @@ class Heights:
 
 
 def pressure_height(pressure: float) -> float:
-    """Return the height of a pressure [Pa] in the standard atmosphere [m], as an altimeter does."""
+    """Return the height of a pressure [Pa] in the standard atmosphere [m]."""
     return float((1 - (pressure / _SEA_LEVEL_PA) ** (1 / _POWER)) / _LAPSE)
 
 
 def pressure_at(height: float) -> float:
-    """Return the standard atmosphere's pressure at a height [m], in [Pa]."""
+    """Return the pressure of the standard atmosphere at a height [m], in [Pa]."""
     return float(_SEA_LEVEL_PA * (1 - _LAPSE * height) ** _POWER)
 
 
 class WindEstimate:
-    """What the autopilot believes of the wind: the mean wind it flies in, wandering by 0.4 m/s in a minute."""
+    """Wind estimate of the autopilot: mean wind plus an error of 0.4 m/s with a correlation time of 60 s."""
 
     def __init__(self, rng: np.random.Generator, dt: float):
         """Draw the first error; `dt` is the time between two calls of `measure` [s]."""
         self._error = GaussMarkov(rng, np.full(2, 0.4), np.full(2, 60.0), dt)
 
     def measure(self, wind: tuple[float, float]) -> tuple[float, float]:
-        """Add this instant's error to the mean wind, NED [m/s]."""
+        """Return the mean wind plus the error, NED [m/s]."""
         off = self._error.step()
         return wind[0] + float(off[0]), wind[1] + float(off[1])
 
 
 class Servos:
-    """The pulse widths between autopilot and servos: what is sent is what is flown, in whole microseconds."""
+    """Pulse widths between autopilot and servos, in whole microseconds."""
 
     LOW, TRIM, HIGH = 1100, 1500, 1900  # SERVOn_MIN, _TRIM, _MAX of surfaces [us]
     IDLE = 1000  # SERVO3_MIN [us]
@@ -123,14 +123,14 @@ class Servos:
 
     @classmethod
     def pulses(cls, delta_a: float, delta_e: float, delta_r: float, delta_t: float) -> tuple[int, int, int, int]:
-        """Turn commands into pulses in output order: aileron, elevator, throttle, rudder [us]."""
+        """Convert commands to pulses in output order: aileron, elevator, throttle, rudder [us]."""
         half = cls.HIGH - cls.TRIM
         a, e, r = (cls.TRIM + round(half * min(max(x, -1.0), 1.0)) for x in (delta_a, delta_e, delta_r))
         return a, e, cls.IDLE + round((cls.FULL - cls.IDLE) * min(max(delta_t, 0.0), 1.0)), r
 
     @classmethod
     def commands(cls, pulses: tuple[int, int, int, int]) -> tuple[float, float, float, float]:
-        """Turn pulses back: delta_a, delta_e, delta_r, delta_t as the servos and the motor understand them."""
+        """Convert pulses to delta_a, delta_e, delta_r, delta_t."""
         a, e, t, r = pulses
         half = cls.HIGH - cls.TRIM
         return (

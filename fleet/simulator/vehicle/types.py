@@ -1,4 +1,4 @@
-"""The types of pretend aircraft: what JSBSim loads, how fast it flies, how large its missions are, what differs."""
+"""Types of simulated aircraft: JSBSim model, cruise speed, mission geometry and parameter variations."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -6,26 +6,26 @@ from typing import NamedTuple
 
 from fleet.simulator.vehicle.missions import SMALL, Field
 
-CRUISE = 23.0  # of the small one [m/s]
+CRUISE = 23.0  # of the small aircraft [m/s]
 
 
 class Type(NamedTuple):
     """One type of aircraft."""
 
-    model: str  # JSBSim's name
-    shipped: bool  # it comes with JSBSim, and has an engine to be started
+    model: str  # name in JSBSim
+    shipped: bool  # part of the jsbsim package, with an engine to start
     cruise: float  # [m/s]
-    motor: str  # JSBSim's property of the throttle, 0..1
-    field: Field  # what its missions look like
-    payload_kg: tuple[float, float]  # least and most
+    motor: str  # JSBSim property of the throttle, 0..1
+    field: Field  # mission geometry
+    payload_kg: tuple[float, float]  # minimum, maximum
     spread: dict[str, float]  # standard deviation of each factor vary/* between aircraft of one type [-]
-    offsets: dict[str, float]  # of each offset vary/*: what building by hand leaves askew [-]
-    strength: str  # JSBSim's property that the thrust of its engine goes with
-    varied: str  # index of the point mass that differs from one to the next
-    load: str  # index of the point mass that may slide
+    offsets: dict[str, float]  # standard deviation of each offset vary/*: manufacturing asymmetry [-]
+    strength: str  # JSBSim property proportional to thrust
+    varied: str  # index of the point mass with random payload
+    load: str  # index of the point mass that can shift
     extra: str  # index of the point mass that `altered` adds
-    file: str | None = None  # its aircraft file, where it is another one than the installed
-    settings: Mapping[str, float] = MappingProxyType({})  # JSBSim's properties, where not as in the file
+    file: str | None = None  # content of the aircraft file; None: installed file
+    settings: Mapping[str, float] = MappingProxyType({})  # JSBSim properties different from the file
 
 
 _SPREAD = {
@@ -46,12 +46,12 @@ _SPREAD = {
 _OFFSETS = {"C_l_0": 0.001, "C_m_0": 0.004, "C_n_0": 0.0004}
 
 TYPES = {
-    # 9.5 kg empty, span 2.9 m, electric; ours, after Beard & McLain's Aerosonde
+    # 9.5 kg empty, span 2.9 m, electric; after Beard & McLain's Aerosonde
     "small": Type(
         *("aerosonde", False, CRUISE, "fcs/motor-cmd-norm", SMALL, (0.5, 2.5), _SPREAD, _OFFSETS),
         *("vary/thrust", "", "", "[1]"),
     ),
-    # Cessna 172P, a ton and a piston engine, as it comes with JSBSim: only its load differs from one to the next
+    # Cessna 172P, a ton and a piston engine, part of JSBSim; only the payload varies
     "c172p": Type(
         *("c172p", True, 48.0, "fcs/throttle-cmd-norm"),
         Field(scale=5.0, circle=4.5, height=2.0, climb=0.045, sink=0.04),

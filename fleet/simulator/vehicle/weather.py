@@ -1,4 +1,4 @@
-"""Weather round a pretend aircraft: mean wind with a height profile and a slow drift, turbulence intensity."""
+"""Weather of a simulated aircraft: mean wind with height profile and slow drift, turbulence intensity."""
 
 from math import cos, pi, sin
 
@@ -6,7 +6,7 @@ import numpy as np
 
 FT = 0.3048  # [m]
 _W20_FPS = (0.0, 8.0, 16.0, 25.0, 50.0, 62.0, 75.0, 88.0)
-REFERENCE_M = 100.0  # height the mean wind is given at
+REFERENCE_M = 100.0  # reference height of the mean wind
 HELLMANN = 0.143  # exponent of the mean wind over height, over open ground
 
 
@@ -17,7 +17,7 @@ class GaussMarkov:
         """Start in the stationary distribution.
 
         Args:
-            rng: source of chance
+            rng: random generator
             sigma: standard deviation, (n,) [any]
             tau: correlation time, (n,) [s]; 0 makes white noise
             dt: step [s]
@@ -50,15 +50,15 @@ class Wind:
         exponent: float = HELLMANN,
         drift: float = 1.0,
     ):
-        """Choose a direction.
+        """Set the mean wind, and draw its direction if not given.
 
         Args:
             mean: wind speed at 100 m [m/s]
-            rng: source of chance
+            rng: random generator
             dt: step of `step` [s]
-            towards: direction it blows to, from north clockwise [rad]; None draws one
-            exponent: of the height profile; 0 for none
-            drift: share of the drift above
+            towards: direction it blows to, clockwise from north [rad]; None: random
+            exponent: of the height profile; 0: uniform
+            drift: factor of the drift above
         """
         self._mean = mean
         self._towards = rng.uniform(-pi, pi) if towards is None else towards
@@ -74,7 +74,7 @@ class Wind:
 
 
 def turbulence_level(text: str) -> int:
-    """Read `--turbulence`: 0..7, or none, light (3), moderate (4), severe (6).
+    """Parse `--turbulence`: 0..7, or none, light (3), moderate (4), severe (6).
 
     Raises:
         ValueError: when it is none of these.
@@ -89,6 +89,6 @@ def turbulence_level(text: str) -> int:
 def wind_at_20ft(level: int) -> float:
     """Return the MIL-F-8785C wind at 20 ft for a severity [ft/s]: light 15 kt, moderate 30 kt, severe 45 kt.
 
-    Below 1000 ft it alone sets the intensity, sigma_w = 0.1 w_20. Source: MIL-F-8785C sec. 3.7.3.4.
+    Below 1000 ft only this wind sets the intensity, sigma_w = 0.1 w_20. Source: MIL-F-8785C sec. 3.7.3.4.
     """
     return _W20_FPS[level]

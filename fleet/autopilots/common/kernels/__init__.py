@@ -6,13 +6,13 @@ import numba as nb
 
 # no fastmath: nan means "no airspeed sensor"; nothing raises inside
 making = nb.njit(cache=True, error_model="numpy", nogil=True)
-# these make no array: counting who holds which took half their time
+# without arrays: reference counting took half of the run time
 kernel = nb.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]
 
 
 @nb.njit(cache=True, error_model="numpy", inline="always")
 def hypot(x, y):  # type: ignore[no-untyped-def]
-    """Return the length of a horizontal vector; what `math.hypot` guards against is not met on this earth."""
+    """Return the length of a horizontal vector, without the overflow checks of `math.hypot`."""
     return sqrt(x * x + y * y)
 
 

@@ -1,4 +1,4 @@
-"""Parameters of an autopilot as a table: names, defaults, ranges, older names."""
+"""Table of autopilot parameters: names, defaults, ranges, older names."""
 
 from collections.abc import Mapping
 from math import isfinite
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Row(NamedTuple):
-    """One parameter: name, default and range as ArduPilot has them, factor to SI, older names with their factor."""
+    """One parameter: name, default and range in autopilot units, factor to SI, older names with their factor."""
 
     name: str
     default: float
@@ -17,13 +17,13 @@ class Row(NamedTuple):
 
 
 def eas2tas(altitude_m: float) -> float:
-    """Return true over equivalent airspeed at a height above sea level [m]. Source: ISA, troposphere."""
+    """Return the ratio of true to equivalent airspeed at a height above sea level [m]. Source: ISA, troposphere."""
     h = min(max(altitude_m, -500.0), 11_000.0) if isfinite(altitude_m) else 0.0
     return float((1 - 2.25577e-5 * h) ** (-4.25588 / 2))
 
 
 def find(row: Row, given: Mapping[str, float]) -> float | None:
-    """Return the value of a row under its present or an older name; None where it is missing, not finite or absurd."""
+    """Return the value by current or older name; None if it is missing, not finite or out of range."""
     for name, unit in ((row.name, 1.0), *row.older):
         value = given.get(name)
         if value is not None and isfinite(value) and row.low <= value * unit <= row.high:
