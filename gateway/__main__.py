@@ -145,7 +145,9 @@ def main(argv: list[str] | None = None) -> int:
         "--forward", action="append", default=[], metavar="LINK", help="link to another ground station; may be repeated"
     )
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
-    parser.add_argument("--most-uavs", type=int, default=MOST_UAVS, metavar="N", help=f"maximum number of aircraft ({MOST_UAVS})")
+    parser.add_argument(
+        "--most-uavs", type=int, default=MOST_UAVS, metavar="N", help=f"maximum number of aircraft ({MOST_UAVS})"
+    )
     parser.add_argument("--keys", type=Path, metavar="FILE", help="keys of signed links, readable only by the owner")
     router_arguments(parser)
     parser.add_argument("--listen-only", action="store_true", help="send nothing to the aircraft")
@@ -157,7 +159,10 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--record", type=Path, metavar="DIR", help="write a .tlog of each link into this folder")
     parser.add_argument(
-        "--record-budget", default="10G", metavar="SIZE", help="disk space for .tlog files; the oldest are deleted (10G)"
+        "--record-budget",
+        default="10G",
+        metavar="SIZE",
+        help="disk space for .tlog files; the oldest are deleted (10G)",
     )
     log_arguments(parser)
     parser.add_argument("--metrics", metavar="HOST:PORT", help="counters for Prometheus, e.g. 127.0.0.1:9100")

@@ -14,7 +14,7 @@ _log = logging.getLogger(__name__)
 
 
 class Way:
-    """Send packed messages and count their fate.
+    """Send packed messages and count those published and unsent.
 
     Args:
         bus: destination

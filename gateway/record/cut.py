@@ -69,7 +69,11 @@ def cut(heard, us, carry, held, counts, extras, table):
     longest, total = 0, 0
     for i in range(len(start)):
         longest, total = max(longest, stop[i] - start[i]), total + stop[i] - start[i] + held[slot[i]]
-    out, scratch, n = np.empty(2 * total, np.uint8), np.empty(CARRY + longest, np.uint8), 0  # no frame is shorter than 8 bytes
+    out, scratch, n = (
+        np.empty(2 * total, np.uint8),
+        np.empty(CARRY + longest, np.uint8),
+        0,
+    )  # no frame is shorter than 8 bytes
     for i in range(len(start)):
         mine, size = slot[i], stop[i] - start[i]
         before = held[mine]

@@ -31,7 +31,9 @@ def sinks(flight: Forecast, home: Origin, margin: float, until: float = np.inf) 
     p = float(ndtr(z.max()))
     if p < _SLIGHT:
         return Finding(AlertKind.GROUND, p, "", _OVER)
-    first = int(np.flatnonzero(z >= min(z.max(), 0.0))[0])  # where the mean goes below the margin, else the lowest point
+    first = int(
+        np.flatnonzero(z >= min(z.max(), 0.0))[0]
+    )  # where the mean goes below the margin, else the lowest point
     at = float(flight.t[first])
     danger = (
         f"{p:.0%} chance that it sinks below {margin:.0f} m above home (terrain unknown) in "

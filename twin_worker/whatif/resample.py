@@ -34,6 +34,8 @@ def resample(prediction: Prediction, grid: np.ndarray | None) -> Prediction:
         return prediction
     ahead = prediction.ahead.numpy().astype(float)
     grid = grid[grid <= ahead[-1] + 1e-6]
-    path = CubicSpline(ahead, prediction.path.numpy())(grid)  # linear interpolation over 4 s of a turn has errors of metres
+    path = CubicSpline(ahead, prediction.path.numpy())(
+        grid
+    )  # linear interpolation over 4 s of a turn has errors of metres
     tube = np.column_stack([np.interp(grid, ahead, column) for column in prediction.tube.numpy().T])
     return msgspec.structs.replace(prediction, ahead=Array.of(grid), path=Array.of(path), tube=Array.of(tube))

@@ -99,9 +99,7 @@ def _check(args: argparse.Namespace) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line: fit or check calibration tables."""
-    parser = parser_for(
-        "python -m twin_worker.confidence.calibration", "Fit or check calibration tables.", EXAMPLES
-    )
+    parser = parser_for("python -m twin_worker.confidence.calibration", "Fit or check calibration tables.", EXAMPLES)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="fit|check")
     for verb, what in (("fit", "fit tables"), ("check", "evaluate tables on other predictions")):
         one = verbs.add_parser(verb, help=what)
