@@ -26,7 +26,7 @@ class Routes:
         self._of: dict[tuple[int, int], tuple[Port, float]] = {}  # port, and time of its last frame [s since 1970]
 
     def learn(self, link: int, frames: Frames) -> np.ndarray:
-        """Update routes from frames of one link; return whether each frame's sender owns its component id, (n,) bool."""
+        """Update routes from frames of one link; return whether each sender owns its component id, (n,) bool."""
         key = (frames.sender << 16) + (frames.at[:, SYSTEM] << 8) + frames.at[:, COMPONENT]
         keys, last, number = np.unique(key[::-1], return_index=True, return_inverse=True)
         arrivals = frames.arrival[::-1][last].tolist()

@@ -149,7 +149,7 @@ class Bulk:
 
 @nb.njit(cache=True, nogil=True)
 def numbered(names, sizes):
-    """Number distinct addresses: number of each address, (n,), and index of the first occurrence of each number, (k,)."""
+    """Number distinct addresses: number of each address, (n,), and index of its first occurrence, (k,)."""
     number, first, k = np.empty(len(names), np.int64), np.empty(len(names), np.int64), 0
     for i in range(len(names)):
         at = 0

@@ -1,4 +1,4 @@
-"""Recording as a link: replayed in real time, faster, or as fast as possible, optionally with copies of its aircraft."""
+"""Recording as a link: replayed in real time, faster, or as fast as possible, optionally with copies of aircraft."""
 
 import contextlib
 import itertools

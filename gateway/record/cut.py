@@ -107,7 +107,7 @@ class Cutter:
         return cut(pieces, us, self._carry, self._held, self.counts, EXTRA, CRC).tobytes()
 
     def _slot(self, sender: object) -> int:
-        """Return the slot of a sender; when all are in use, the oldest sender's is freed and its bytes count as noise."""
+        """Return the slot of a sender; if all are in use, free the oldest one and count its bytes as noise."""
         if sender not in self._slots:
             free = len(self._slots)
             if free == len(self._held):

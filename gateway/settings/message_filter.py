@@ -28,7 +28,7 @@ class Sieve(NamedTuple):
 
 
 def read_sieve(settings: dict[str, str]) -> Sieve:
-    """Remove the filter rules from the settings of a link, e.g. `no-messages=STATUSTEXT,30&systems=1-50`, and parse them.
+    """Parse and remove filter rules from the settings of a link, e.g. `no-messages=STATUSTEXT,30&systems=1-50`.
 
     Raises:
         ValueError: when a name or a number is invalid.

@@ -61,7 +61,7 @@ class Scored:
         return ANY in group and len(set(self._settings().tolist())) > 1
 
     def folds(self, group: str) -> np.ndarray:
-        """Return the cross-validation fold of each prediction, (s,): its setting if the group has several, or its flight.
+        """Return the validation fold of each prediction, (s,): its setting if the group has several, else its flight.
 
         A table of several settings is used for settings without a table, so validation leaves out settings.
         """
