@@ -297,7 +297,9 @@ def test_too_little_flight_answers_nothing():
 def test_another_grid_is_refused_with_a_sentence():
     record = bare()
     made = Made(0.0, "paper", PLAIN, AHEAD + 3.0, LINE, V)
-    with pytest.raises(ValueError, match=r"^prediction: found 91 look-aheads up to 183 s, expected the first 91 of AHEAD; resample it$"):
+    with pytest.raises(
+        ValueError, match=r"^prediction: found 91 look-aheads up to 183 s, expected the first 91 of AHEAD; resample it$"
+    ):
         record.keep(made, record.trust(made))
 
 

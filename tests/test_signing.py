@@ -160,9 +160,9 @@ def test_a_file_of_a_stranger_and_what_is_no_file_are_refused(tmp_path, monkeypa
     assert read_keys(path) == {"a": KEY}
     if path.stat().st_uid != 0:
         monkeypatch.setattr(os, "geteuid", lambda: 12345)
-        with pytest.raises(ValueError, match="expected a file for its owner alone"):
+        with pytest.raises(ValueError, match="expected a file readable only by its owner"):
             read_keys(path)
-    with pytest.raises(ValueError, match="expected a file for its owner alone"):
+    with pytest.raises(ValueError, match="expected a file readable only by its owner"):
         read_keys(Path("/dev/null"))
     with pytest.raises(OSError, match="No such file"):
         read_keys(tmp_path / "none")

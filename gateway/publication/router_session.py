@@ -14,7 +14,7 @@ _log = logging.getLogger(__name__)
 
 
 class Way:
-    """Send packed messages and count those published and unsent.
+    """Send packed messages and count the published and the unsent ones.
 
     Args:
         bus: destination

@@ -52,9 +52,9 @@ def read_spec(text: str, offset: int = 0) -> Spec:
         found = found._replace(sieve=read_sieve(settings), sign=settings.pop("sign", ""), key=settings.pop("key", ""))
     if found is None or settings or found.sign not in ("", *SIGN) or (found.key and not found.sign):
         raise ValueError(
-            f"--link: found {text!r}, expected udpin:HOST:PORT, udpout, udpbcast, tcpin or tcp likewise, "
-            "serial:PATH:BAUD or replay:FILE?speed=4&copies=10&results=1, with #offset=-1 if wanted, and but for "
-            f"recordings {', '.join(SETTINGS)}, sign={'|'.join(SIGN)}, key=NAME, joined by &; write one of these"
+            f"--link: found {text!r}, expected udpin:HOST:PORT, udpout, udpbcast, tcpin or tcp with HOST:PORT, "
+            "serial:PATH:BAUD or replay:FILE?speed=4&copies=10&results=1, optionally #offset=-1 and, except for "
+            f"recordings, {', '.join(SETTINGS)}, sign={'|'.join(SIGN)}, key=NAME, joined by &; write one of these"
         )
     return found._replace(offset=offset)
 

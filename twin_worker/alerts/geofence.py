@@ -17,7 +17,7 @@ from twin_worker.alerts.gaussian_forecast import Forecast
 from twin_worker.alerts.hysteresis import Finding
 
 _CEILING, _CIRCLE, _POLYGON, _FLOOR = 1, 2, 4, 8  # FENCE_TYPE
-_OVER = "the geofence is kept"
+_OVER = "no geofence breach predicted"
 
 
 class Fence(NamedTuple):

@@ -10,7 +10,7 @@ from twin_worker.alerts.hysteresis import Finding
 
 WINGS_M, ROTORS_M = 30.0, 5.0  # minimum height above home outside landings, fixed wings and multirotors [m]
 _SLIGHT = 0.02  # below this probability no alert text is composed [-]
-_OVER = "height is kept"
+_OVER = "no descent below the minimum height predicted"
 
 
 def above(flight: Forecast, home: Origin) -> np.ndarray:

@@ -14,7 +14,7 @@ from twin_worker.alerts.traffic_picture import Board
 _EVERY_S = 1.0  # between assessments of one aircraft's pairs [s]
 _STALE_S = 10.0  # maximum age of a prediction [s]
 _SLIGHT = 0.02  # lower probabilities are ignored [-]
-_KEPT = "separation from uav-{} is kept"
+_KEPT = "no conflict with uav-{} predicted"
 
 
 @dataclass

@@ -43,7 +43,7 @@ def _complaints(asked: WhatIf) -> Iterator[str]:
         yield f"found {len(items):,} mission items, expected at most {MAX_ITEMS:,}; shorten the mission"
     seqs = {item.seq for item in items}
     if len(seqs) < len(items) or any(not 0 <= seq < MAX_ITEMS for seq in seqs):
-        yield f"items: found numbers {min(seqs)}..{max(seqs)}, expected each of 0..{MAX_ITEMS - 1} once; number anew"
+        yield f"items: found numbers {min(seqs)}..{max(seqs)}, expected each of 0..{MAX_ITEMS - 1} once; renumber them"
     if asked.seq is not None and asked.items is not None and asked.seq not in seqs:
         yield f"seq: found {asked.seq}, expected the number of one of the {len(items)} items; choose one of them"
     if asked.speed is not None and not 0 < asked.speed <= _MOST_SPEED:
