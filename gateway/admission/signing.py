@@ -47,7 +47,9 @@ def read_keys(path: Path) -> dict[str, bytes]:
         mode = stat.S_IMODE(found.st_mode)
         if not stat.S_ISREG(found.st_mode) or mode & 0o077 or found.st_uid not in (0, os.geteuid()):
             whose = f"mode {mode:04o}, owner {found.st_uid}"
-            raise ValueError(f"keys {path}: found {whose}, expected a file readable only by its owner; chmod 600 {path}")
+            raise ValueError(
+                f"keys {path}: found {whose}, expected a file readable only by its owner; chmod 600 {path}"
+            )
         lines = [line.split("#")[0].split() for line in file.read().splitlines()]
     keys: dict[str, bytes] = {}
     for number, words in enumerate(lines, start=1):
