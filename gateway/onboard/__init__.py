@@ -38,7 +38,7 @@ class Onboard:
 
         Args:
             now: fleet time [s since 1970]
-            crafts: the aircraft of the link
+            all_aircraft: the aircraft of the link
             known_peers: peers that get a heartbeat before they send
         """
         live = [craft for craft in crafts if craft.link is Link.LIVE and craft.source is not None]

@@ -22,7 +22,7 @@ class Recall:
     """Check of cached parameters against the aircraft: by the hash over all, or by all relevant ones and a sample.
 
     Args:
-        craft: the aircraft
+        aircraft: the aircraft
         cache: parameters and missions of earlier connections
     """
 

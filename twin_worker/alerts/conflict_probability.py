@@ -130,7 +130,7 @@ def chance(apart: np.ndarray, covariance: np.ndarray, draws: np.ndarray, limits:
     """Compute the probability of a loss of separation.
 
     Args:
-        apart: other minus own mean position on the common grid, NED, (n, 3) [m]
+        separation: other minus own mean position on the common grid, NED, (n, 3) [m]
         covariance: sum of both, nn, ne, ee, vertical, (n, 4) [m2]
         draws: normal errors, (k, 3) [-]
         limits: horizontal and vertical, (2,) [m]

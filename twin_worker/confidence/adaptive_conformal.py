@@ -46,7 +46,7 @@ class Levels:
         _learn_tube(self.tube, ledger.score, r, j, mine)
         held, failed = _settle_claims(ledger.claimed, ledger.followed, ledger.horizon, ledger.passed, mine)
         moved = failed * QUANTILE - held * (1.0 - QUANTILE)
-        # never below QUANTILE: easy minutes, which meet any horizon, must not offset difficult ones
+        # never below NOMINAL_COVERAGE: easy minutes, which meet any horizon, must not offset difficult ones
         self.horizon = min(max(self.horizon + _HORIZON_STEP * moved, QUANTILE), _MOST_LEVEL)
 
 
@@ -82,7 +82,7 @@ class Factors:
     Attributes:
         tube: on the table's half-axes, by knot, (13,) [-]
         horizon: on the error ratio that determines the horizon [-]
-        own: number of this aircraft's predictions behind them [-]
+        own_count: number of this aircraft's predictions behind them [-]
         bounded: a level or factor of the tube is at its upper bound, so further misses cannot widen the tube
     """
 

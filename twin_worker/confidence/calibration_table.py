@@ -1,7 +1,7 @@
 """Calibration table of one group: error standard deviation and half-axes by look-ahead, from uncertainty features.
 
 By axis sigma^2 = scale^2 s^2 + lag^2 r^2 + floor^2, with the ensemble spread s and the forecast revision r. Half-axes
-are factor sigma: all axes have the same coverage, and `QUANTILE` of the flights lie within all three at once.
+are factor sigma: all axes have the same coverage, and `NOMINAL_COVERAGE` of the flights lie within all three at once.
 """
 
 from dataclasses import dataclass, field
@@ -45,7 +45,7 @@ class Table:
         scores: largest error over its half-axis, `ATOMS` quantiles [-]
         risks: critical factors of the horizon, `ATOMS` quantiles [-]
         held_out: performance on held-out flights, by name
-        alone: coverage of each half-axis by itself, `QUANTILE` to its cube root [-]
+        alone: coverage of each half-axis by itself, `NOMINAL_COVERAGE` to its cube root [-]
     """
 
     group: str
@@ -66,7 +66,7 @@ class Table:
         return np.sqrt((scale * doubt.spread) ** 2 + (lag * doubt.revision) ** 2 + floor**2)
 
     def half_axes(self, doubt: "Doubt", ahead: np.ndarray) -> np.ndarray:
-        """Return the half-axes of coverage `QUANTILE` on the fitted flights at each look-ahead, (..., n, 3) [m]."""
+        """Return the half-axes of coverage `NOMINAL_COVERAGE` at each look-ahead, (..., n, 3) [m]."""
         return self._curves(ahead)[3] * self.sigma(doubt, ahead)
 
     def _curves(self, ahead: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Confidence horizon: the look-ahead at which the error ratio times a calibrated factor exceeds 10 % of the path.
 
-The factor is chosen so that at most 1 - `QUANTILE` of predictions exceed 10 % before their horizon. The critical
-factor of a prediction is the smallest that ends its horizon before its first passage; the calibrated factor is a
-quantile of the critical factors. Most predictions never exceed 10 %, so only an upper bound of theirs is known.
+The factor is chosen so that at most 1 - `NOMINAL_COVERAGE` of predictions exceed 10 % before their horizon. The
+critical factor of a prediction is the smallest that ends its horizon before its first passage; the calibrated factor
+is a quantile of the critical factors. Most predictions never exceed 10 %, so only an upper bound of theirs is known.
 
 Source: Angelopoulos et al. 2024, "Conformal risk control" (the loss falls as the factor grows); Candes, Lei & Ren
 2023, "Conformalized survival analysis" (censored predictions).

@@ -84,7 +84,7 @@ class Trust:
         sentence: calibration table used, and number of own predictions behind the adaptation
         factor: half-axes of the tube over those of the table, by knot, (13,) [-]
         ratio: running maximum of half-axes over predicted path length, (n,) [-]
-        alone: coverage of each half-axis by itself [-]
+        axis_quantile: coverage of each half-axis by itself [-]
     """
 
     tube: np.ndarray
@@ -179,7 +179,7 @@ class Record:
         """Censor every open prediction: an event (mode, mission, clock) has invalidated them.
 
         Args:
-            moved: the origin of the local frame has changed
+            frame_changed: the origin of the local frame has changed
         """
         self._enter(self._ledger.end())
         for book in filter(None, (self._ledger, self._renewed)):

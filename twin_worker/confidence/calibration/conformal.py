@@ -13,10 +13,10 @@ from twin_worker.numerics.prediction_errors import QUANTILE
 
 
 def factors_of(ratio: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the factors of joint coverage `QUANTILE` on new predictions, (3,), and the coverage of one axis.
+    """Return the factors of joint coverage `NOMINAL_COVERAGE` on new predictions, (3,), and the coverage of one axis.
 
-    The latter is `QUANTILE` for fully dependent axes and its cube root for independent ones. Both are nan without
-    scores.
+    The latter is `NOMINAL_COVERAGE` for fully dependent axes and its cube root for independent ones. Without scores
+    both are nan.
 
     Args:
         ratio: errors along, cross, vertical over their sigma, nan where unknown, (s, k, 3) [-]
