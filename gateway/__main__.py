@@ -1,4 +1,4 @@
-"""Links to bus: hear MAVLink, publish Samples, ask aircraft for mission and parameters."""
+"""Receive MAVLink from links, publish Samples on the bus, request mission and parameters from aircraft."""
 
 import argparse
 import contextlib
@@ -36,44 +36,44 @@ from gateway.settings.link_spec import read_forward, read_spec
 from gateway.status.metrics import counters
 from gateway.status.status_table import posted
 
-SWITCH_S = 5e-4  # how long a receiving thread waits while messages are made [s]
-COLD_S = 2.0  # compiling that takes longer is said [s]
+SWITCH_S = 5e-4  # longest wait of a receiving thread for the interpreter [s]
+COLD_S = 2.0  # compilation that takes longer is logged [s]
 COLD = "compiling the decoder for this machine, once; links open when that is done"
-GARBAGE = 50_000  # objects made before cycles are looked for; messages make thousands a tick, and no cycles
-LARGE = 1 << 20  # batches of a flood are larger; what serves every tick is smaller [bytes]
+GARBAGE = 50_000  # allocations between cycle collections; a tick allocates thousands of objects without cycles
+LARGE = 1 << 20  # larger allocations are returned to the system: batches of a flood, not those of every tick [bytes]
 DEFAULT_LINK = "udpin:127.0.0.1:14550"
 EXAMPLES = """
   gateway                                              listen on loopback, port 14550
   gateway --link udpin:0.0.0.0:14550                   listen on every network
   gateway --link "udpin:127.0.0.1:14550#offset=-1"     UAV id = system id - 1
   gateway --link serial:/dev/ttyUSB0:57600 --link tcp:192.168.1.10:5760
-  gateway --link udpbcast:192.168.1.255:14550          call a whole network, hear whoever answers
-  gateway --forward udpin:127.0.0.1:14551              a ground station may sit beside us: QGroundControl, MAVProxy
+  gateway --link udpbcast:192.168.1.255:14550          broadcast to a network, receive from all that answer
+  gateway --forward udpin:127.0.0.1:14551              serve another ground station: QGroundControl, MAVProxy
   gateway --forward "udpout:10.0.0.9:14550#no-messages=RAW_IMU&systems=1-20"
   gateway --keys keys.txt --link "udpin:0.0.0.0:14550#sign=require&key=swarm"
   gateway --link "replay:flight.tlog.xz?speed=4"       play a recording four times as fast
   gateway --link "replay:flight.tlog?speed=max&copies=50"
   gateway --listen-only                                send nothing to any aircraft
   gateway --metrics 127.0.0.1:9100                     counters for Prometheus, at http://127.0.0.1:9100/metrics
-  gateway --record flights --record-budget 20G         and keep what was heard, the router there or not
+  gateway --record flights --record-budget 20G         also record what is received, with or without a router
 
 links:
   udpin:HOST:PORT   udpout:HOST:PORT   udpbcast:HOST:PORT   tcpin:HOST:PORT   tcp:HOST:PORT   serial:PATH[:BAUD]
   replay:FILE[?speed=N&copies=N&results=1]
 settings behind a #, joined by &:
   offset=N                                UAV id = MAVLink system id + N (of aircraft only)
-  messages= systems= components=          let in only these, names or numbers: messages=ATTITUDE,30, systems=1-50
-  no-messages= no-systems= no-components= let in all but these; of --forward: what is sent there
-  sign=accept|require  key=NAME           check signatures, sign what we say; require: unsigned is refused
+  messages= systems= components=          accept only these, names or numbers: messages=ATTITUDE,30, systems=1-50
+  no-messages= no-systems= no-components= accept all but these; with --forward: filter what is sent there
+  sign=accept|require  key=NAME           check signatures, sign what we send; require: refuse unsigned frames
 
-A file of keys has lines of NAME and 64 hex digits, and only its owner may read it (chmod 600).
+A file of keys has lines of NAME and 64 hex digits; only its owner may have read permission (chmod 600).
 """
 
 _log = logging.getLogger(__name__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Open the links, join the bus, work until told to stop or the recordings end."""
+    """Open the links, connect to the bus, and run until a stop signal or the end of all recordings."""
     specs = [read_spec(text, args.offset) for text in args.link or [DEFAULT_LINK]]
     specs, files = divided(specs)
     specs += [read_forward(text) for text in args.forward]
@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def compiled() -> None:
-    """Compile the decoder, or load it, and say so where it takes long: a machine does it once."""
+    """Compile the decoder, or load it from the cache; log a warning if it takes long, once per machine."""
     slow = threading.Timer(COLD_S, _log.warning, (COLD,))
     slow.start()
     try:
@@ -139,16 +139,18 @@ def main(argv: list[str] | None = None) -> int:
     """Run the `gateway` command."""
     parser = parser_for("gateway", (__doc__ or "").strip().splitlines()[0], EXAMPLES)
     parser.add_argument(
-        "--link", action="append", metavar="LINK", help=f"where aircraft are; may be given again ({DEFAULT_LINK})"
+        "--link", action="append", metavar="LINK", help=f"link to aircraft; may be repeated ({DEFAULT_LINK})"
     )
     parser.add_argument(
-        "--forward", action="append", default=[], metavar="LINK", help="another ground station; may be given again"
+        "--forward", action="append", default=[], metavar="LINK", help="link to another ground station; may be repeated"
     )
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
-    parser.add_argument("--most-uavs", type=int, default=MOST_UAVS, metavar="N", help=f"no more aircraft ({MOST_UAVS})")
-    parser.add_argument("--keys", type=Path, metavar="FILE", help="keys of signed links, for its owner's eyes only")
+    parser.add_argument(
+        "--most-uavs", type=int, default=MOST_UAVS, metavar="N", help=f"maximum number of aircraft ({MOST_UAVS})"
+    )
+    parser.add_argument("--keys", type=Path, metavar="FILE", help="keys of signed links, readable only by the owner")
     router_arguments(parser)
-    parser.add_argument("--listen-only", action="store_true", help="send nothing at all to the aircraft")
+    parser.add_argument("--listen-only", action="store_true", help="send nothing to the aircraft")
     parser.add_argument(
         "--budget",
         default="",
@@ -157,7 +159,10 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--record", type=Path, metavar="DIR", help="write a .tlog of each link into this folder")
     parser.add_argument(
-        "--record-budget", default="10G", metavar="SIZE", help="what its .tlog may take up; the oldest go (10G)"
+        "--record-budget",
+        default="10G",
+        metavar="SIZE",
+        help="disk space for .tlog files; the oldest are deleted (10G)",
     )
     log_arguments(parser)
     parser.add_argument("--metrics", metavar="HOST:PORT", help="counters for Prometheus, e.g. 127.0.0.1:9100")

@@ -1,4 +1,4 @@
-"""The working thread: queue -> decode -> intake -> bus, and questions back to the aircraft."""
+"""Main thread of the gateway: queue -> decode -> intake -> bus, and requests to the aircraft."""
 
 import gc
 import queue
@@ -25,24 +25,24 @@ from gateway.record.recorder import Recorder, Tapped
 from gateway.status.link_statistics import Tally
 
 TICK_S = 0.1  # between two publications of a live link [s]
-NAP_S = 0.02  # at an empty queue [s]
-AT_ONCE = 1 << 20  # bytes heard between two publications; in a flood these come sooner than a tick
-ACCOUNT_S = 1.0  # between two counts [s]
+NAP_S = 0.02  # wait at an empty queue [s]
+AT_ONCE = 1 << 20  # bytes received that trigger a publication before the next tick, as in a flood
+ACCOUNT_S = 1.0  # between two publications of statistics [s]
 
 
 class Pump:
-    """Everything one gateway does between its links and the bus.
+    """Processing between the links and the bus.
 
     Args:
         links: opened links, those to aircraft first
-        bus: where messages go
-        listen_only: send nothing at all to aircraft
-        gates: what each link lets in; None: whatever its sieve does, signed or not
-        stations: how many of the last links lead to other ground stations
-        most: UAVs at a time
-        recorder: takes everything heard, and what the gateway itself says; closed by whoever made it
-        budget: what the aircraft of one link may send together, as on the command line; empty: what suits the link
-        cache: what aircraft told before; None: nothing is kept
+        bus: destination of messages
+        listen_only: send nothing to aircraft
+        admissions: admission of each link; None: message filters only, without signatures
+        stations: number of links to other ground stations, the last ones
+        max_uavs: maximum number of UAVs
+        recorder: records everything received and sent; the caller closes it
+        budget: bytes/s that the aircraft of one link may send together; empty: default of the link kind
+        cache: parameters and missions of earlier connections; None: no cache
     """
 
     def __init__(
@@ -61,8 +61,8 @@ class Pump:
         self.links = links
         self.forward = Forward(links, stations, listen_only)
         self._gates = gates_of([link.spec for link in links], stations) if gates is None else gates
-        self._heard: set[int] = set()  # links with something to forward
-        self._fresh = 0  # bytes heard since the last publication
+        self._heard: set[int] = set()  # links with frames to forward
+        self._fresh = 0  # bytes received since the last publication
         self._stations = range(len(links) - stations, len(links))
         self.tally = Tally(links, recorder)
         self.publisher = Publisher(bus, results=any(link.spec.results for link in links))
@@ -78,10 +78,10 @@ class Pump:
         to_aircraft = links[: self._stations.start]
         self._live = [number for number, link in enumerate(to_aircraft) if link.spec.kind != "replay"]
         self._recorded = float("-inf")  # newest recorded time [s since 1970]
-        self._players: set[int] = set()  # UAV ids heard of in recordings
+        self._players: set[int] = set()  # UAV ids of recordings
 
     def run(self, stop: threading.Event) -> None:
-        """Work until `stop` is set or every recording has ended; the links' threads end with it."""
+        """Run until `stop` is set or every recording has ended; then stop the threads of the links."""
         for number, link in enumerate(self.links):
             link.start(number, self._queue, stop)
         try:
@@ -91,7 +91,7 @@ class Pump:
                 mono = time.monotonic()
                 if mono >= tick or self._fresh >= AT_ONCE:
                     self._tick(mono)
-                    tick = max(tick + TICK_S, time.monotonic() + TICK_S / 2)  # the queue always gets its turn
+                    tick = max(tick + TICK_S, time.monotonic() + TICK_S / 2)  # leave time for the queue
                 if mono >= account:
                     account = mono + ACCOUNT_S
                     self._tell()
@@ -102,7 +102,7 @@ class Pump:
                 link.close()
 
     def take(self, batch: Batch) -> None:
-        """Work through one batch."""
+        """Process one batch."""
         intake = self.intakes[batch.link]
         if batch.heard is not None:
             self.tally.add(batch.link, batch.heard)
@@ -124,7 +124,7 @@ class Pump:
             self._open.discard(batch.link)
 
     def _drain(self, until: float, stop: threading.Event) -> None:
-        """Work through the queue until the next tick is due, or `AT_ONCE` is there.
+        """Process the queue until the next tick is due, or `FLUSH_BYTES` were received.
 
         Args:
             until: on the monotonic clock [s]
@@ -134,14 +134,14 @@ class Pump:
                 self.take(self._queue.get_nowait())
             except queue.Empty:
                 self._pass_on()
-                stop.wait(min(left, NAP_S))  # waking up for every datagram would cost more than decoding it
+                stop.wait(min(left, NAP_S))  # a wake-up per datagram costs more than its decoding
 
     def _pass_on(self) -> None:
-        """Forward what has been heard since the last time; without a station there is no hurry to look at it."""
+        """Forward frames received since the last call; do nothing without stations."""
         for number in self._heard if self._stations else ():
             frames = self.intakes[number].sort(keep=number not in self._stations)
             for aircraft, said in self.forward.take(number, frames) if frames is not None else ():
-                self.intakes[aircraft].overhear(said)  # it may be a new mission
+                self.intakes[aircraft].overhear(said)  # it may contain a new mission
         self._heard.clear()
 
     def _tick(self, mono: float) -> None:
@@ -164,11 +164,11 @@ class Pump:
             self._recorder.hear(number, Heard.of([(wall(), ("sent", where), data)]))
 
     def _forget(self, now: float) -> None:
-        """Forget who is silent, as far as the intakes of live links do; `now` is fleet time [s since 1970]."""
+        """Remove silent aircraft of live links; `now` is fleet time [s since 1970]."""
         gone = {uav for number in self._live for uav in self.intakes[number].forget(now)}
         if gone:
             self.publisher.forget(gone - self._claims.keys())
-            gc.collect()  # an aircraft and its parts refer to each other, and cycles are looked for rarely
+            gc.collect()  # an aircraft forms reference cycles, and automatic collection is rare
 
     def _tell(self) -> None:
         now = wall() if self._live else self._recorded

@@ -232,7 +232,7 @@ def test_the_command_scores_draws_and_writes(recorded, tmp_path, capfd):
     assert told["run"]["counted"] == told[OURS]["starts"] and told["run"]["silent"] == 0
     assert told[OURS]["p50_m"]["16"] < told["cv"]["p50_m"]["16"]
     assert set(told["compare"]) == set(METHODS)
-    for words in ("starts of 2 flights", "[s]", "[m]", "the paper's way", "apart:", "ours minus each"):
+    for words in ("starts of 2 flights", "[s]", "[m]", "method of the paper", "excluded:", "ours minus each"):
         assert words in said.out
     for name in (
         "fig9a_route",
@@ -320,20 +320,20 @@ def test_too_short_a_recording_counts_no_start_and_says_so(short, tmp_path, caps
     out = tmp_path / "out"
     assert main([str(short), "--methods", "cv", "--out", str(out)]) == 1
     said = capsys.readouterr().out
-    assert "no start counts: " in said and "are set apart, see below" in said and "apart:" in said
+    assert "no start is included: " in said and "are excluded, see below" in said and "excluded:" in said
     assert [made.name for made in out.iterdir()] == ["predictions_apart.npz"]
 
 
 @pytest.mark.parametrize(
     ("run", "words"),
     [
-        ({"counted": 0, "silent": 7}, "at 7 on a mission nothing was predicted"),
-        ({"counted": 3, "silent": 0}, "at none of 3 did every method predict"),
-        ({"counted": 0, "silent": 0}, "nothing was predicted, and no mission was followed after the first 120 s"),
+        ({"counted": 0, "silent": 7}, "7 on a mission have no prediction"),
+        ({"counted": 3, "silent": 0}, "3 lack a prediction of some method"),
+        ({"counted": 0, "silent": 0}, "no prediction, and no mission flown after the first 120 s"),
     ],
 )
 def test_the_table_says_why_it_has_no_figures_as_the_json_does(run, words):
-    assert notes({"apart": {}, "compare": {}, "run": run}, []) == [f"no start counts: {words}"]
+    assert notes({"apart": {}, "compare": {}, "run": run}, []) == [f"no start is included: {words}"]
 
 
 def test_too_few_starts_for_the_papers_experiment_are_refused(capfd):

@@ -45,7 +45,7 @@ def test_the_table_names_links_and_aircraft_and_whatever_is_wrong():
 def test_of_many_aircraft_those_in_trouble_are_shown():
     statuses = [Status(uav=k, t=T0, sentence="engine is on fire" if k == 99 else "") for k in range(100)]
     text = drawing(ACCOUNT, statuses)
-    assert "engine is on fire" in text and "60 more are well" in text
+    assert "engine is on fire" in text and "60 more without warnings" in text
 
 
 def test_plain_lines_come_at_news_and_now_and_then(monkeypatch):

@@ -195,7 +195,7 @@ def test_two_recordings_of_one_id_are_two_aircraft(tmp_path, caplog):
     counts = {uav: len(of(Sample, ear.news, uav)) for uav in (7, 8, 9, 10)}
     assert len(set(counts.values())) == 1 and counts[7] > 100
     assert {m.uav for m in of(Sample, ear.news)} == set(counts)
-    assert "two.tlog: uav-7 is taken, shown as uav-9" in caplog.text
+    assert "two.tlog: uav-7 is in use, replayed as uav-9" in caplog.text
 
 
 @pytest.mark.recordings

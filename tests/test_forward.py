@@ -126,7 +126,7 @@ def test_a_station_gets_what_it_wants_and_a_link_brings_what_it_may():
         talker = Talker(system)
         field.say(air, f"air{system}", talker.heartbeat(), talker.attitude(1.0), talker.pack(text))
     assert wants.told() == {"far": ["ATTITUDE"]}
-    assert field.pump.intakes[0].refused == {"left out, as the link says": 2}
+    assert field.pump.intakes[0].refused == {"excluded by the filter of the link": 2}
     field.say(wants, "far", STATION.pack(ASK(7, 1)))  # what the station says is not sieved
     assert air.told() == {"air7": ["PARAM_REQUEST_LIST"]}
 

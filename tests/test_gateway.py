@@ -101,7 +101,7 @@ def test_what_is_no_speed_stops_at_start(speed):
 def test_a_busy_port_is_one_sentence():
     link = Udp(read_spec(f"udpin:127.0.0.1:{unused_port()}"))
     try:
-        with pytest.raises(OSError, match=r"^link udpin:\S+:\d+: .*; stop what holds the port or name another$"):
+        with pytest.raises(OSError, match=r"^link udpin:\S+:\d+: .*; stop the process on this port or name another$"):
             Udp(read_spec(link.spec.text))
     finally:
         link.close()

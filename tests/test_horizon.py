@@ -227,7 +227,7 @@ def test_short_look_aheads_speak_for_long_ones_before_those_are_answered(tables)
     flight(record, np.full(12, 6.0), seed=11)  # a minute: nothing is known of 120 s yet
     made = kept(record, 60.0, GROUP, moved(60))
     trust = record.trust(made)
-    assert "adapted by 12 of its own" in trust.sentence and GROUP in trust.sentence
+    assert "adapted to 12 own predictions" in trust.sentence and GROUP in trust.sentence
     assert trust.tube[75, 0] > 1.3 * Record(tables).trust(made).tube[75, 0]
 
 
@@ -297,7 +297,9 @@ def test_too_little_flight_answers_nothing():
 def test_another_grid_is_refused_with_a_sentence():
     record = bare()
     made = Made(0.0, "paper", PLAIN, AHEAD + 3.0, LINE, V)
-    with pytest.raises(ValueError, match=r"^record: found 91 look-aheads up to 183 s, expected the first of AHEAD$"):
+    with pytest.raises(
+        ValueError, match=r"^prediction: found 91 look-aheads up to 183 s, expected the first 91 of AHEAD; resample it$"
+    ):
         record.keep(made, record.trust(made))
 
 
@@ -313,7 +315,7 @@ def test_errors_that_outgrow_all_adaptation_are_held_less_often_and_the_predicti
         record.answer(at, flown)
     assert record.held[0] < 0.85
     said = record.trust(Made(400.0, "paper", PLAIN, AHEAD, moved(400.0), V)).sentence
-    assert "at the bound of adaptation: the tube may hold fewer" in said
+    assert "adaptation is at its bound: coverage may be below the target" in said
     assert "whatever the flight does" not in (adaptive_conformal.__doc__ or "") and "No coverage is guaranteed" in (
         adaptive_conformal.__doc__ or ""
     )

@@ -105,7 +105,7 @@ def test_a_damaged_card_is_none(tmp_path, damage):
 def test_a_folder_that_cannot_be_written_keeps_nothing_and_costs_nothing(tmp_path, caplog):
     (tmp_path / "file").write_bytes(b"")
     params, mission, _ = fly(ardupilot(), Cache(tmp_path / "file" / "folder"), 65.0)
-    assert params.complete and mission.complete and "cannot be kept" in caplog.text
+    assert params.complete and mission.complete and "cannot be cached" in caplog.text
 
 
 def test_without_a_board_s_number_nothing_is_kept_and_a_lossy_radio_is_no_obstacle(tmp_path):
@@ -173,7 +173,7 @@ def test_what_does_not_fit_is_asked_for_in_proportion_and_that_is_said():
         30: [pytest.approx(25 * share.now, abs=0.01)],
         42: [pytest.approx(share.now, abs=0.01)],
     }
-    assert share.sentence.startswith("4 aircraft would send ") and share.sentence.endswith("link carries more")
+    assert share.sentence.startswith("4 aircraft would send ") and share.sentence.endswith("link has more capacity")
     assert rates_asked(4, 10.0)[1].now == LEAST
 
 

@@ -108,9 +108,9 @@ def test_a_gateway_that_records_begins_without_a_router_and_joins_it_later(tmp_p
             _, errors = child.communicate(timeout=PATIENCE_S)
     assert child.returncode == 0
     assert (
-        beside_compiling(errors).startswith("gateway: no router is there yet")
-        and "the router is there" in errors
-        and "the router is away" in errors
+        beside_compiling(errors).startswith("gateway: no router is connected yet")
+        and "the router is connected" in errors
+        and "the router is disconnected" in errors
     )
     (path,) = tmp_path.glob("*.tlog")
     stream = mavutil.mavlink_connection(str(path), dialect="ardupilotmega", robust_parsing=False)

@@ -131,7 +131,7 @@ def test_a_disk_that_takes_no_more_is_said_and_counted_and_later_tried_again(tmp
         with files_no_longer_than(10_500):
             fates = [tape.write(records, 0.0) for _ in range(20)]
         assert fates == [0] * 10 + [1000] * 10 and (tape.written, tape.lost) == (10_000, 10_000)
-        assert "File too large" in tape.trouble and "make room" in tape.trouble
+        assert "File too large" in tape.trouble and "free space" in tape.trouble
         (path,) = tmp_path.glob("*.tlog")
         assert path.stat().st_size == 10_000  # no half of a record stays
         assert tape.write(records, AGAIN_S / 2) == 1000
@@ -144,7 +144,7 @@ def test_a_disk_that_takes_nothing_is_left_without_empty_files(tmp_path):
         with files_no_longer_than(500):
             for k in range(10):
                 assert tape.write(records, k * (AGAIN_S + 0.1)) == 1000
-                assert "make room" in tape.trouble and not list(tmp_path.iterdir())
+                assert "free space" in tape.trouble and not list(tmp_path.iterdir())
         assert tape.write(records, 10 * (AGAIN_S + 0.1)) == 0  # there is room again
     (path,) = tmp_path.iterdir()
     assert path.stat().st_size == 1000

@@ -48,7 +48,7 @@ def apart(one: Prediction, other: Prediction) -> np.ndarray:
 def test_nothing_otherwise_is_the_prediction_itself(winged):
     made, plain = asked(winged), usual(winged)
     assert apart(made, plain).max() == 0.0 and made.method == plain.method
-    assert made.sentence.startswith("what if nothing were otherwise")
+    assert made.sentence.startswith("what if nothing were changed")
     assert made.controller is not None and made.controller.received["NAVL1_PERIOD"] > 0
 
 

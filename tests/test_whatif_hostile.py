@@ -18,7 +18,7 @@ MANY = [{"seq": k, "command": 16} for k in range(MAX_ITEMS + 1)]
 REFUSED = {
     "not msgpack": (b"\xc1", "no msgpack map"),
     "no map": (b"\x93\x01\x02\x03", "Expected `object`"),
-    "too deep": (b"\x91" * 5000 + b"\xc0", "does not fit"),
+    "too deep": (b"\x91" * 5000 + b"\xc0", "invalid payload"),
     "too long": (bytes(MOST_BYTES + 1), "bytes, expected at most"),
     "a slip of the pen": ({"sped": 18}, "unknown field `sped`"),
     "text for a number": ({"speed": "fast"}, r"Expected `float \| null`"),
@@ -63,11 +63,11 @@ def test_a_question_for_everybody_is_refused(holder):
 
 
 def test_a_twin_that_has_heard_nothing_says_so():
-    with pytest.raises(ValueError, match="uav-4 has told no position yet"):
+    with pytest.raises(ValueError, match="uav-4 has sent no position yet"):
         answer(Twin(4), WhatIf(speed=10.0))
     early = Twin(4)
     f.drive(early, f.messages(f.turn(0.5), uav=4))
-    with pytest.raises(ValueError, match="too few positions"):
+    with pytest.raises(ValueError, match="too few recent positions"):
         answer(early, WhatIf(speed=10.0))
 
 

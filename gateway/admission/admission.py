@@ -1,4 +1,4 @@
-"""What one link lets in: only frames its sieve wants, and none whose signature speaks against it."""
+"""Admission of frames of one link: message filter and signature check."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,22 +9,22 @@ from gateway.admission.signing import Signing, pick, read_keys
 from gateway.settings.link_spec import Spec
 from gateway.settings.message_filter import Sieve
 
-SIEVED = "left out, as the link says"
+SIEVED = "excluded by the filter of the link"
 
 
 class Gate:
-    """The gate of one link.
+    """Admission of frames of one link.
 
     Args:
-        sieve: which frames it wants
-        signing: its signatures; None: they are not looked at
+        message_filter: filter of frames
+        signing: signature check; None: signatures are not checked
     """
 
     def __init__(self, sieve: Sieve, signing: Signing | None = None) -> None:
         self._sieve, self._signing = sieve, signing
 
     def admit(self, frames: Frames, refused: Counter[str]) -> Frames:
-        """Return the frames that may come in, and count the others by reason."""
+        """Return the accepted frames, and count the refused ones by reason."""
         if self._signing is not None and len(frames.at):
             frames = frames.only(self._signing.passes(frames, refused))
         if self._sieve.rules and len(frames.at):
@@ -34,19 +34,19 @@ class Gate:
         return frames
 
     def sign(self, message: bytes) -> bytes:
-        """Return a message of ours as it goes out."""
+        """Return an outgoing message, signed if the link requires it."""
         return message if self._signing is None else self._signing.sign(message)
 
 
 def gates_of(specs: Sequence[Spec], stations: int = 0, keys: Path | None = None) -> list[Gate]:
-    """Make the gates of all links; the sieve of a station's link is for what is sent there, not for what it says.
+    """Create the admission of each link; the filter of a station's link applies to frames sent there, not received.
 
     Args:
         specs: the links
-        stations: how many of the last ones lead to ground stations
+        stations: number of links to ground stations, the last ones
         keys: file of keys
     Raises:
-        ValueError: when the file of keys is not safe, or lacks the key of a link.
+        ValueError: when the file of keys is readable by others, or lacks the key of a link.
         OSError: when it cannot be read.
     """
     known = read_keys(keys) if keys is not None else {}

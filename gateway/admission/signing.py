@@ -1,8 +1,8 @@
-"""MAVLink 2 signatures: keys from a file, what is heard verified, what we say signed.
+"""MAVLink 2 signatures: read keys, verify received frames, sign sent frames.
 
 Source: MAVLink "Message Signing": the first 48 bits of SHA-256 over key, frame, link id and time; time counts 10 us
-since 2015. Other than in pymavlink, a time is remembered only once its signature was found right: a forged one from the
-far future would else lock the real aircraft out.
+since 2015. Unlike pymavlink, this module stores a time only after its signature was verified: otherwise a forged frame
+with a future time would block the real aircraft.
 """
 
 import hashlib
@@ -30,16 +30,16 @@ FORGED, REPLAYED, STALE, UNSIGNED = (
 )
 _EPOCH_S = 1_420_070_400  # 2015-01-01 [s since 1970]
 _UNITS = 100_000  # of a time stamp [1/s]
-_WINDOW = 60 * _UNITS  # a sender not heard before may lie back so far
+_WINDOW = 60 * _UNITS  # oldest time accepted from a new sender
 _TAIL, _STAMP, _SIGNATURE = 13, 6, 6  # link id, time, signature [bytes]
-MOST_SENDERS = 4096  # whose times are remembered
+MOST_SENDERS = 4096  # senders whose times are stored
 
 
 def read_keys(path: Path) -> dict[str, bytes]:
     """Read keys by name: lines of `NAME KEY`, KEY being 64 hex digits; # begins a comment.
 
     Raises:
-        ValueError: when others may read the file, or a line is none.
+        ValueError: when others may read the file, or a line is invalid.
         OSError: when it cannot be read.
     """
     with path.open() as file:
@@ -47,13 +47,15 @@ def read_keys(path: Path) -> dict[str, bytes]:
         mode = stat.S_IMODE(found.st_mode)
         if not stat.S_ISREG(found.st_mode) or mode & 0o077 or found.st_uid not in (0, os.geteuid()):
             whose = f"mode {mode:04o}, owner {found.st_uid}"
-            raise ValueError(f"keys {path}: found {whose}, expected a file for its owner alone; chmod 600 {path}")
+            raise ValueError(
+                f"keys {path}: found {whose}, expected a file readable only by its owner; chmod 600 {path}"
+            )
         lines = [line.split("#")[0].split() for line in file.read().splitlines()]
     keys: dict[str, bytes] = {}
     for number, words in enumerate(lines, start=1):
         if words and (len(words) != 2 or not re.fullmatch(r"[0-9a-fA-F]{64}", words[1]) or words[0] in keys):
             raise ValueError(
-                f"keys {path}: found line {number} unlike the others, expected a new name and 64 hex digits; correct it"
+                f"keys {path}: found invalid line {number}, expected a new name and 64 hex digits; correct it"
             )
         if words:
             keys[words[0]] = bytes.fromhex(words[1])
@@ -61,7 +63,7 @@ def read_keys(path: Path) -> dict[str, bytes]:
 
 
 def pick(keys: dict[str, bytes], name: str, link: str) -> bytes:
-    """Return the key of a link: the one it names, or the only one.
+    """Return the key of a link: the named one, or the only one.
 
     Raises:
         ValueError: when there is no such key.
@@ -73,27 +75,27 @@ def pick(keys: dict[str, bytes], name: str, link: str) -> bytes:
 
 
 def stamp_now() -> int:
-    """Return the time as signatures have it [10 us since 2015]."""
+    """Return the present time in units of signatures [10 us since 2015]."""
     return round((time.time() - _EPOCH_S) * _UNITS)
 
 
 class Signing:
-    """The signatures of one link.
+    """Signature check and signing of one link.
 
     Args:
-        key: 32 bytes both ends know
-        require: refuse what is not signed
-        link: number of ours, 0..255
-        clock: gives the time as signatures have it
+        key: shared key, 32 bytes
+        require: refuse unsigned frames
+        link: our link id, 0..255
+        clock: returns the time in units of signatures
     """
 
     def __init__(self, key: bytes, require: bool, link: int = 0, clock: Callable[[], int] = stamp_now) -> None:
         self._key, self._require, self._link, self._clock = key, require, link & 0xFF, clock
-        self._last: dict[tuple[int, int, int], int] = {}  # newest verified time, by system, component, their link id
-        self._said = 0  # newest time of ours
+        self._last: dict[tuple[int, int, int], int] = {}  # newest verified time, by system, component, sender's link id
+        self._said = 0  # newest time sent
 
     def passes(self, frames: Frames, refused: Counter[str]) -> np.ndarray:
-        """Tell of every frame whether it may pass, (n,) bool; those that may not are counted by reason."""
+        """Return whether each frame is accepted, (n,) bool; refused frames are counted by reason."""
         passed = np.ones(len(frames.at), bool)
         for i in range(len(frames.at)):
             at = frames.at[i]
@@ -104,7 +106,7 @@ class Signing:
         return passed
 
     def _objection(self, frame: bytes, system: int, component: int) -> str:
-        """Say what speaks against a frame; nothing: an empty string."""
+        """Return the reason to refuse a frame; empty: it is accepted."""
         if frame[0] != V2 or not frame[2] & FLAG:
             return UNSIGNED if self._require else ""
         if not hmac.compare_digest(self._signature(frame[:-_SIGNATURE]), frame[-_SIGNATURE:]):
@@ -119,11 +121,11 @@ class Signing:
         if last is None and len(self._last) >= MOST_SENDERS:
             self._last.pop(next(iter(self._last)))
         self._last[sender] = stamp
-        self._said = max(self._said, stamp)  # whose clock is ahead would take ours for a replay
+        self._said = max(self._said, stamp)  # a peer whose clock is ahead would refuse ours as replayed
         return ""
 
     def sign(self, frame: bytes) -> bytes:
-        """Sign one frame of MAVLink 2."""
+        """Return a MAVLink 2 frame with its signature."""
         body = bytearray(frame[:-2])
         body[2] |= FLAG
         extra = int(EXTRA[int.from_bytes(body[7:10], "little")])

@@ -1,8 +1,8 @@
-"""Raw MAVLink between aircraft and other ground stations, so that one of those can sit beside us.
+"""Forwarding of raw MAVLink between aircraft and other ground stations.
 
-What an aircraft says to all goes to every station; what it says to one station, to that one. What a station says to one
-aircraft goes to where that one was last heard, and nowhere else; what it says to all, to all of them. Aircraft do not
-hear each other through us, nor do stations, and nobody hears itself.
+Broadcasts of an aircraft go to every station; its messages to one station go to that station. Messages of a station to
+one aircraft go only to the link on which that aircraft was last received; its broadcasts go to all aircraft. Messages
+are not forwarded between aircraft, between stations, or back to the sender.
 Source: MAVLink routing guide.
 """
 
@@ -17,18 +17,18 @@ from gateway.forwarding.routes import Port, Routes
 from gateway.forwarding.targets import targets
 from gateway.links.link import Link
 
-DATAGRAM = 1_400  # bytes of messages sent as one: fits every network
-ASTRAY = "not forwarded: nobody here is who it is for"
-DOUBLE = "not forwarded: another sender speaks for this component"
+DATAGRAM = 1_400  # size limit of combined messages: below the MTU of common networks [bytes]
+ASTRAY = "not forwarded: target unknown"
+DOUBLE = "not forwarded: another sender uses this component id"
 
 
 class Forward:
     """Forwarding between the links of aircraft and the links of stations.
 
     Args:
-        links: all of them, those of aircraft first
-        stations: how many of the last ones lead to stations
-        listen_only: let nothing through to aircraft
+        links: all links, those of aircraft first
+        stations: number of links to stations, the last ones
+        listen_only: send nothing to aircraft
     """
 
     def __init__(self, links: Sequence[Link], stations: int, listen_only: bool = False) -> None:
@@ -39,7 +39,7 @@ class Forward:
         self.refused: Counter[str] = Counter()  # by reason
 
     def take(self, link: int, frames: Frames) -> list[tuple[int, Frames]]:
-        """Forward what one link heard; gives what stations said to aircraft: (link of the aircraft, frames)."""
+        """Forward the frames of one link; return those sent to aircraft by stations: (link of the aircraft, frames)."""
         if link in self._ground:
             return self._up(link, frames)
         if self._ground:
@@ -47,16 +47,16 @@ class Forward:
         return []
 
     def part(self, link: int, where: Hashable) -> None:
-        """Forget a far end that took its leave."""
+        """Remove a peer that has disconnected."""
         (self._stations if link in self._ground else self._aircraft).part(link, where)
 
     def tidy(self, now: float) -> None:
-        """Forget far ends that have been silent for long; `now` is fleet time [s since 1970]."""
+        """Remove peers after `ROUTE_TIMEOUT_S` of silence; `now` is fleet time [s since 1970]."""
         self._aircraft.forget(now)
         self._stations.forget(now)
 
     def _down(self, link: int, frames: Frames) -> None:
-        """Bring what aircraft said to the stations."""
+        """Forward frames of aircraft to the stations."""
         owned = self._aircraft.learn(link, frames)
         if not owned.all():
             self.refused[DOUBLE] += int((~owned).sum())
@@ -75,7 +75,7 @@ class Forward:
                 self._send(Port(number, where), frames, np.flatnonzero(mine))
 
     def _up(self, link: int, frames: Frames) -> list[tuple[int, Frames]]:
-        """Bring what stations said to the aircraft."""
+        """Forward frames of stations to the aircraft."""
         self._stations.learn(link, frames)
         if self._listen_only:
             return []
@@ -98,11 +98,11 @@ class Forward:
     def _ends(self, number: int, routes: Routes) -> Iterable[Hashable]:
         spoke = routes.ports(number)
         if self._links[number].spec.kind == "udpbcast" and spoke:
-            return spoke  # whoever answered need not be called any more
+            return spoke  # peers that answered replace the broadcast address
         return dict.fromkeys([*self._links[number].greets, *spoke])
 
     def _send(self, port: Port, frames: Frames, which: Sequence[int] | np.ndarray) -> None:
-        """Send raw frames, several to a datagram."""
+        """Send raw frames, several per datagram."""
         waiting, count = bytearray(), 0
         for start, stop in frames.at[np.asarray(which, int)][:, (START, STOP)].tolist():
             if count and len(waiting) + stop - start > DATAGRAM:

@@ -1,4 +1,4 @@
-"""Who is where: which far end of which link speaks for a MAVLink system and component."""
+"""Routing table: the peer and link of each MAVLink system and component."""
 
 from collections.abc import Hashable
 from typing import NamedTuple
@@ -9,24 +9,24 @@ from fleet.telemetry.mavlink.aircraft_link import LOST_S
 from fleet.telemetry.mavlink.parsing.decode import Frames
 from fleet.telemetry.mavlink.parsing.scan import COMPONENT, SYSTEM
 
-FORGET_S = 60.0  # silence after which a component is forgotten [s]
+FORGET_S = 60.0  # silence after which a route is removed [s]
 
 
 class Port(NamedTuple):
-    """One far end of one link."""
+    """One peer of one link."""
 
     link: int
     where: Hashable
 
 
 class Routes:
-    """Routes learned from what is heard; the first to speak for a component keeps it until it is silent."""
+    """Routes from received frames; the first sender of a component id owns it until it is silent."""
 
     def __init__(self) -> None:
-        self._of: dict[tuple[int, int], tuple[Port, float]] = {}  # and when it spoke last, fleet time [s since 1970]
+        self._of: dict[tuple[int, int], tuple[Port, float]] = {}  # port, and time of its last frame [s since 1970]
 
     def learn(self, link: int, frames: Frames) -> np.ndarray:
-        """Learn from frames of one link; tells of each whether its sender speaks for its component, (n,) bool."""
+        """Update routes from frames of one link; return whether each sender owns its component id, (n,) bool."""
         key = (frames.sender << 16) + (frames.at[:, SYSTEM] << 8) + frames.at[:, COMPONENT]
         keys, last, number = np.unique(key[::-1], return_index=True, return_inverse=True)
         arrivals = frames.arrival[::-1][last].tolist()
@@ -44,19 +44,19 @@ class Routes:
         return True
 
     def to(self, system: int, component: int) -> list[Port]:
-        """Return where a component is, all of a system's for component 0."""
+        """Return the ports of a component; component 0: of all components of the system."""
         if component:
             return [self._of[system, component][0]] if (system, component) in self._of else []
         return list(dict.fromkeys(port for (one, _), (port, _) in self._of.items() if one == system))
 
     def ports(self, link: int) -> list[Hashable]:
-        """Return the far ends of one link that speak."""
+        """Return the peers of one link that have sent frames."""
         return list(dict.fromkeys(port.where for port, _ in self._of.values() if port.link == link))
 
     def part(self, link: int, where: Hashable) -> None:
-        """Forget a far end that took its leave."""
+        """Remove the routes of a peer that has disconnected."""
         self._of = {who: held for who, held in self._of.items() if held[0] != Port(link, where)}
 
     def forget(self, now: float) -> None:
-        """Forget who has been silent for long; `now` is fleet time [s since 1970]."""
+        """Remove routes after `ROUTE_TIMEOUT_S` of silence; `now` is fleet time [s since 1970]."""
         self._of = {who: held for who, held in self._of.items() if now - held[1] <= FORGET_S}

@@ -1,1 +1,1 @@
-"""Endpoints: every kind of link to aircraft and ground stations, one a file."""
+"""Endpoints: every kind of link to aircraft and ground stations, one per file."""

@@ -1,4 +1,4 @@
-"""Recordings beside live links, played by a gateway of their own: whatever is in a file, no live link waits for it."""
+"""Replay of recordings in a separate gateway process, so that a file cannot delay live links."""
 
 import argparse
 import os
@@ -15,11 +15,11 @@ from gateway.settings.link_spec import Spec
 Say = Callable[[str], None]
 Process = subprocess.Popen[bytes]
 
-_PATIENCE_S = 8.0  # between the request to end and the end of patience [s]
+_PATIENCE_S = 8.0  # between the request to terminate and the kill [s]
 
 
 def divided(specs: Sequence[Spec]) -> tuple[list[Spec], list[Spec]]:
-    """Return the links to open here, and the recordings to be played apart: all of them where there is a live link."""
+    """Return the links to open here, and the recordings to replay separately: all, if there is a live link."""
     files = [spec for spec in specs if spec.kind == "replay"]
     live = [spec for spec in specs if spec.kind != "replay"]
     return (live, files) if live else (files, [])
@@ -27,12 +27,12 @@ def divided(specs: Sequence[Spec]) -> tuple[list[Spec], list[Spec]]:
 
 @contextmanager
 def played_apart(files: Sequence[Spec], args: argparse.Namespace, say: Say) -> Iterator[Process | None]:
-    """Play recordings in a process of its own until they end or the block does.
+    """Replay recordings in a separate process until they or the block end.
 
     Args:
         files: the recordings; none: no process
-        args: of this gateway, the router's and the limits passed on
-        say: is told how the process ended, where it did not end well
+        args: arguments of this gateway; those of the router and the limits are passed on
+        report: called with a message if the process fails
     """
     if not files:
         yield None
@@ -62,4 +62,4 @@ def played_apart(files: Sequence[Spec], args: argparse.Namespace, say: Say) -> I
 def _watched(child: Process, ended: threading.Event, say: Say) -> None:
     code = child.wait()
     if code and not ended.is_set():
-        say(f"the recordings ended with exit code {code}; the live links go on")
+        say(f"the replay of recordings ended with exit code {code}; the live links continue")

@@ -1,4 +1,4 @@
-"""A link as it was asked for -> the link."""
+"""Open a link from its specification."""
 
 from fleet.telemetry.recording.ids import Ids
 from gateway.links.link import Link
@@ -10,10 +10,10 @@ from gateway.settings.link_spec import Spec
 
 
 def open_link(spec: Spec, ids: Ids) -> Link:
-    """Open a link; what listens holds its port from now on, what calls begins with `start`.
+    """Open a link; a listening link binds its port now, an outgoing one connects in `start`.
 
     Raises:
-        ValueError, OSError: when there is no such recording, or a port is not free.
+        ValueError, OSError: when the recording does not exist, or the port is in use.
     """
     if spec.kind == "replay":
         return Replay(spec, ids)

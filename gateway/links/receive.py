@@ -1,4 +1,4 @@
-"""Datagrams off a socket, as many at once as there are: `recvmmsg` on Linux, one by one elsewhere.
+"""Receive datagrams from a socket: in batches with `recvmmsg` on Linux, one by one elsewhere.
 
 Source: recvmmsg(2), udp(7), socket(7), cmsg(3); structures as in <sys/socket.h> of 64-bit Linux.
 """
@@ -17,23 +17,23 @@ import numpy as np
 from fleet.telemetry.mavlink.parsing.received import Heard, tight
 from gateway.links.link import wall
 
-MOST = 256  # datagrams taken at once; of the longest ones they are 16 MB
-LONGEST = 65_536  # no datagram is longer [bytes]
-_PAGE = 4096  # what a datagram of a usual size touches of its slot at most [bytes]
+MOST = 256  # datagrams per batch, at most 16 MB
+LONGEST = 65_536  # maximum size of a datagram [bytes]
+_PAGE = 4096  # memory page; a larger datagram touches more than one page of its slot [bytes]
 _ADDRESS = 28  # bytes of an IPv6 socket address; IPv4 takes 16
-_STAMPS = 35  # SO_TIMESTAMPNS: the system says when a datagram came, however late it is fetched
-_STAMP = 4  # numbers of such a word: length, kind, seconds, nanoseconds
+_STAMPS = 35  # SO_TIMESTAMPNS: the system provides the arrival time of each datagram
+_STAMP = 4  # numbers of a time stamp message: length, kind, seconds, nanoseconds
 _STAMPED = socket.SOL_SOCKET | _STAMPS << 32
-_LATEST_S = 1.0  # a datagram fetched later than that counts as this late: the system's clock was set
-_MOST_KNOWN = 4096  # addresses whose reading is remembered
+_LATEST_S = 1.0  # upper bound of the delay of a datagram, for steps of the system's clock
+_MOST_KNOWN = 4096  # parsed addresses that are cached
 _DONTWAIT = getattr(socket, "MSG_DONTWAIT", 0)
 
 
 class Receiver(Protocol):
-    """Takes what waits in a socket."""
+    """Receiver of the pending datagrams of a socket."""
 
     def take(self) -> Heard | None:
-        """Return the datagrams that wait; None where there are none."""
+        """Return the pending datagrams; None without any."""
 
 
 def receiver(sock: socket.socket) -> Receiver:
@@ -45,19 +45,19 @@ def receiver(sock: socket.socket) -> Receiver:
 
 
 class OneByOne:
-    """The portable way."""
+    """Portable receiver, one datagram per call."""
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
         self._sock = sock
 
     def take(self) -> Heard | None:
-        """Return the datagrams that wait; None where there are none."""
+        """Return the pending datagrams; None without any."""
         pieces: list[tuple[float, Hashable, bytes]] = []
         while len(pieces) < MOST:
             try:
                 data, sender = self._sock.recvfrom(LONGEST)
-            except OSError:  # no more, or an earlier answer found nobody
+            except OSError:  # no more datagrams, or an earlier send failed
                 break
             pieces.append((wall(), sender, data))
         return Heard.of(pieces) if pieces else None
@@ -84,14 +84,14 @@ class _Message(ctypes.Structure):
 
 
 class Bulk:
-    """One call for up to `MOST` datagrams; memory nobody wrote to costs nothing, that of long ones is given back."""
+    """Receiver of up to `MAX_DATAGRAMS` per call; pages touched by long datagrams are returned to the system."""
 
     def __init__(self, sock: socket.socket) -> None:
         if not sys.platform.startswith("linux"):
             raise AttributeError("recvmmsg: Linux only")
         sock.setblocking(False)
         self._sock = sock
-        self._call = ctypes.CDLL(None, use_errno=True).recvmmsg  # releases the interpreter while it works
+        self._call = ctypes.CDLL(None, use_errno=True).recvmmsg  # releases the interpreter during the call
         self._call.argtypes = (ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
         self._memory = mmap.mmap(-1, MOST * LONGEST, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         self._slots = np.frombuffer(self._memory, np.uint8)
@@ -110,17 +110,17 @@ class Bulk:
         self._name_sizes = self._column(_Message.header.offset + _Header.name_size.offset)
         self._stamp_sizes = self._column(_Message.header.offset + _Header.control_size.offset)
         self._known: dict[bytes, Hashable] = {}
-        numbered(self._names[:0], self._name_sizes[:0])  # compiles before anything comes
+        numbered(self._names[:0], self._name_sizes[:0])  # compile before the first datagram
 
     def _column(self, offset: int) -> np.ndarray:
         stride = ctypes.sizeof(_Message)
         return np.ndarray((MOST,), np.uint32, memoryview(self._messages).cast("B"), offset, (stride,))
 
     def take(self) -> Heard | None:
-        """Return the datagrams that wait; None where there are none."""
+        """Return the pending datagrams; None without any."""
         self._name_sizes[:], self._stamp_sizes[:] = _ADDRESS, self._stamps.itemsize * _STAMP
         count = self._call(self._sock.fileno(), ctypes.addressof(self._messages), MOST, _DONTWAIT, None)
-        if count <= 0:  # nothing there, or an earlier answer found nobody
+        if count <= 0:  # no datagram, or an earlier send failed
             return None
         lengths = self._lengths[:count].astype(np.int64)
         buf, stop = tight(self._slots, self._starts[:count], lengths)
@@ -131,7 +131,7 @@ class Bulk:
         return Heard(buf, stop - lengths, stop, self._arrivals(count), sender, tuple(map(self._address, names)))
 
     def _arrivals(self, count: int) -> np.ndarray:
-        """Tell when datagrams came, never falling, (n,) [s since 1970]; where the system does not say so: now."""
+        """Return the arrival times, non-decreasing, (n,) [s since 1970]; now for datagrams without a time stamp."""
         now, told = wall(), self._stamps[:count]
         stamped = (self._stamp_sizes[:count] > 0) & (told[:, 1] == _STAMPED)
         late = np.where(stamped, time.time() - told[:, 2] - told[:, 3] * 1e-9, 0.0)
@@ -149,7 +149,7 @@ class Bulk:
 
 @nb.njit(cache=True, nogil=True)
 def numbered(names, sizes):
-    """Number addresses in the order they come: number of each one, (n,), and which was the first of each, (k,)."""
+    """Number distinct addresses: number of each address, (n,), and index of its first occurrence, (k,)."""
     number, first, k = np.empty(len(names), np.int64), np.empty(len(names), np.int64), 0
     for i in range(len(names)):
         at = 0
@@ -171,7 +171,7 @@ def _equal(a, b, size_a, size_b):
 
 
 def read_address(raw: bytes) -> Hashable:
-    """Read a socket address as Python writes it: (host, port), or (host, port, flow, scope) for IPv6."""
+    """Parse a raw socket address as in Python: (host, port), or (host, port, flow, scope) for IPv6."""
     family, port = int.from_bytes(raw[:2], sys.byteorder), int.from_bytes(raw[2:4], "big")
     if family == socket.AF_INET:
         return socket.inet_ntop(family, raw[4:8]), port

@@ -1,4 +1,4 @@
-"""A recording as a link: played in its own time, faster, or as fast as it can be read, by one cast or many."""
+"""Recording as a link: replayed in real time, faster, or as fast as possible, optionally with copies of aircraft."""
 
 import contextlib
 import itertools
@@ -18,21 +18,21 @@ from fleet.telemetry.replay.offset_copies import Copies
 from gateway.links.link import POLL_S, QUEUE, Batch
 from gateway.settings.link_spec import Spec
 
-LOOK_S = 3.0  # recorded time looked ahead to learn who is there [s]
-_MOST_LOOK = 100  # steps looked at where nobody shows
-_IN_FLIGHT = 4096  # messages between playing and publishing, about
+LOOK_S = 3.0  # recorded time read ahead to find the aircraft [s]
+_MOST_LOOK = 100  # steps read ahead before the first message
+_IN_FLIGHT = 4096  # messages between replay and publication, approximately
 
 _log = logging.getLogger(__name__)
 
 
 class Replay:
-    """A recording, played at a multiple of its own time.
+    """Recording replayed at a multiple of real time.
 
     Args:
         spec: the link
-        ids: who is who, shared by all recordings that play together
+        ids: assignment of UAV ids, shared by all recordings that are replayed together
     Raises:
-        ValueError: when it is no recording.
+        ValueError: when the file is not a recording.
         OSError: when it cannot be read.
     """
 
@@ -44,34 +44,34 @@ class Replay:
         self.pace = Pace(spec.speed)
         self._ids = Ids() if ids is None else ids
         self._copies = Copies(spec.copies)
-        self._known: dict[int, int] = {}  # UAV id by the recorded one
+        self._known: dict[int, int] = {}  # UAV id by recorded id
         self._steps: Iterator[tuple[float, list[Any]]] | None = None
         self._thread: threading.Thread | None = None
 
     @property
     def name(self) -> str:
-        """Name the file."""
+        """Return the file name."""
         return self.recording.name
 
     @property
     def damage(self) -> str:
-        """Say what could not be read of it, known once it is at its end; empty: nothing."""
+        """Return what could not be read, known at the end of the recording; empty: everything was read."""
         return "; ".join(self.recording.skipped)
 
     @property
     def share(self) -> float:
-        """Tell how far reading has come, 0..1."""
+        """Return the progress of reading, 0..1."""
         return self.recording.share
 
     def words(self) -> str:
-        """Say how far it has been played, and how fast."""
-        return self.pace.words() if self.pace.passed_s else "looking through it"
+        """Return the progress and speed of the replay."""
+        return self.pace.words() if self.pace.passed_s else "scanning"
 
     def look(self, stop: threading.Event) -> None:
-        """Read a little ahead, so that everybody gets an id before anybody speaks.
+        """Read ahead, so that all aircraft have an id before the first message is published.
 
         Raises:
-            ValueError: when there is nothing in it.
+            ValueError: when the recording is empty.
             OSError: when it cannot be read.
         """
         self.recording.source.stop = stop
@@ -91,19 +91,19 @@ class Replay:
         self._steps = itertools.chain(ahead, steps)
 
     def _meet(self, news: Sequence[Any]) -> None:
-        """Return an id to whoever is new: first to those recorded, then to their copies, copy by copy."""
+        """Assign ids to new aircraft: first to the recorded ones, then to their copies, copy by copy."""
         new = sorted({m.uav for m in news if not isinstance(m, FleetState)} - self._known.keys())
         for uav in new:
             self._known[uav] = self._ids.give((self, uav, 0), uav)
             if self._known[uav] != uav:
-                _log.warning("%s: uav-%d is taken, shown as uav-%d", self.name, uav, self._known[uav])
+                _log.warning("%s: uav-%d is in use, replayed as uav-%d", self.name, uav, self._known[uav])
         ids = [[self._ids.give((self, uav, copy), self._known[uav]) for uav in new]
                for copy in range(1, self.spec.copies)]  # fmt: skip
         for k, uav in enumerate(new):
             self._copies.name(self._known[uav], [row[k] for row in ids])
 
     def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
-        """Play in a thread."""
+        """Replay in a thread."""
         if self._steps is None:
             self.look(stop)
         self._thread = threading.Thread(target=self._play, args=(number, out, stop), name=self.spec.text)
@@ -112,7 +112,7 @@ class Replay:
     def _play(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
         try:
             self._play_steps(number, out, stop)
-        except (ValueError, OSError) as error:  # a disk that fails half-way, a file without any aircraft
+        except (ValueError, OSError) as error:  # a read error, or a file without aircraft
             if not stop.is_set():
                 _log.warning("%s", error)
         finally:
@@ -138,14 +138,14 @@ class Replay:
             _put(out, Batch(number, copies=copied), stop, most)
 
     def _named(self, news: Sequence[Any]) -> list[Any]:
-        """Return everybody the id found for them."""
+        """Return the messages with the assigned UAV ids."""
         if all(uav == known for uav, known in self._known.items()):
             return list(news)
         renamed = (renumbered(message, lambda uav: self._known.get(uav, uav)) for message in news)
         return [message for message in renamed if message is not None]
 
     def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
-        """Do nothing: a recording does not answer."""
+        """Ignore the data: a recording does not receive."""
 
     def close(self) -> None:
         """Wait for the thread."""
@@ -154,7 +154,7 @@ class Replay:
 
 
 def _put(out: "queue.Queue[Batch]", batch: Batch, stop: threading.Event, most: int) -> None:
-    """Queue a batch once fewer than `most` wait there."""
+    """Queue a batch once fewer than `max_queued` are queued."""
     while not stop.is_set():
         if out.qsize() >= most:
             stop.wait(0.005)

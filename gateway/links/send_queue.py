@@ -1,31 +1,31 @@
-"""Messages on their way into a stream that may be slow: whole ones or none, and never waiting."""
+"""Send queue of a stream: complete messages or none, without waiting."""
 
 import threading
 from collections import deque
 from collections.abc import Callable
 
-MOST = 65_536  # bytes that may wait; at 57,600 baud that is eleven seconds
+MOST = 65_536  # capacity in bytes; eleven seconds at 57,600 baud
 
 
 class Outbox:
-    """What one stream has still to be given.
+    """Send queue of one stream.
 
     Args:
-        write: takes bytes without waiting and tells how many it took
+        write: writes bytes without waiting and returns how many were written
     """
 
     def __init__(self, write: Callable[[bytes], int]) -> None:
         self._write = write
-        self._lock = threading.Lock()  # filled by the working thread, emptied by the link's as well
+        self._lock = threading.Lock()  # written to by the main thread and the link's thread
         self._waiting: deque[tuple[bytes, int]] = deque()
         self._size = 0
         self._closed = False
 
     def put(self, data: bytes, messages: int) -> bool:
-        """Queue whole messages and write what is taken; False where they found no room.
+        """Queue complete messages and write as much as possible; return False if they do not fit.
 
         Raises:
-            OSError: when the far end is gone.
+            OSError: when the peer is disconnected.
         """
         with self._lock:
             if self._closed or self._size + len(data) > MOST:
@@ -36,10 +36,10 @@ class Outbox:
             return True
 
     def flush(self) -> None:
-        """Write as much as is taken.
+        """Write as much as possible.
 
         Raises:
-            OSError: when the far end is gone.
+            OSError: when the peer is disconnected.
         """
         with self._lock:
             self._flush()
@@ -55,11 +55,11 @@ class Outbox:
             self._waiting.popleft()
 
     def waits(self) -> bool:
-        """Return whether something waits."""
+        """Return whether the queue has data."""
         return bool(self._waiting)
 
     def close(self) -> int:
-        """Take no more; count the messages that still wait, the one half written included, and forget them."""
+        """Close and clear the queue; return the number of messages lost, a partly written one included."""
         with self._lock:
             self._closed = True
             count = sum(messages for _, messages in self._waiting)

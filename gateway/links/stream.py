@@ -1,4 +1,4 @@
-"""One open stream of bytes, over TCP or a serial line, in the same few words."""
+"""Open byte stream over TCP or a serial line, with a common interface."""
 
 import os
 import socket
@@ -10,7 +10,7 @@ import serial
 from gateway.links.send_queue import Outbox
 
 CHUNK = 65_536  # bytes read at once
-CONNECT_S = 3.0  # patience of one try [s]
+CONNECT_S = 3.0  # timeout of one attempt [s]
 
 
 class Tcp:
@@ -18,26 +18,26 @@ class Tcp:
 
     def __init__(self, connected: socket.socket) -> None:
         connected.setblocking(False)
-        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # commands are short and should go now
+        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # commands are short and must not be delayed
         self._socket = connected
         self.outbox = Outbox(self._write)
 
     def fileno(self) -> int:
-        """Return the number to wait at."""
+        """Return the file descriptor."""
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """Return what came; it is nothing where waiting was for nothing.
+        """Return the pending bytes; empty without any.
 
         Raises:
-            OSError: when the far end has closed or is gone.
+            OSError: when the peer has closed the connection or is unreachable.
         """
         try:
             data = self._socket.recv(CHUNK)
         except BlockingIOError:
             return b""
         if not data:
-            raise ConnectionResetError("the far end closed")
+            raise ConnectionResetError("the peer closed the connection")
         return data
 
     def _write(self, data: bytes) -> int:
@@ -57,25 +57,25 @@ class Serial:
     def __init__(self, path: str, baud: int) -> None:
         try:
             self._line = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
-        except (ValueError, termios.error) as error:  # a rate this device does not know
+        except (ValueError, termios.error) as error:  # a baud rate that the device does not support
             raise OSError(str(error)) from None
         self.outbox = Outbox(self._write)
 
     def fileno(self) -> int:
-        """Return the number to wait at."""
+        """Return the file descriptor."""
         return int(self._line.fileno())
 
     def read(self) -> bytes:
-        """Return what came.
+        """Return the pending bytes.
 
         Raises:
-            OSError: when the device is gone.
+            OSError: when the device is disconnected.
         """
         return bytes(self._line.read(CHUNK))
 
     def _write(self, data: bytes) -> int:
         try:
-            return os.write(self._line.fileno(), data)  # pyserial's own write spins where nothing is taken
+            return os.write(self._line.fileno(), data)  # pyserial's write busy-waits while the device is blocked
         except BlockingIOError:
             return 0
 
@@ -88,19 +88,19 @@ Stream = Tcp | Serial
 
 
 def offer(stream: Stream | None, data: bytes, messages: int) -> int:
-    """Offer whole messages to a stream, if it is there and has room; gives how many are not on their way."""
+    """Queue complete messages on a stream, if it is open and has space; return the number not queued."""
     try:
         taken = stream is not None and stream.outbox.put(data, messages)
-    except OSError:  # gone just now: its thread sees it too, and counts what waited
+    except OSError:  # just closed: the thread of the stream counts the queued messages
         return 0
     return 0 if taken else messages
 
 
 def open_stream(kind: str, where: str, port: Any) -> Stream:
-    """Call a TCP server, or open a serial line at `port` baud.
+    """Connect to a TCP server, or open a serial line at `port` baud.
 
     Raises:
-        OSError: when nobody is there.
+        OSError: when the connection fails.
     """
     if kind == "serial":
         return Serial(where, port)

@@ -1,4 +1,4 @@
-"""A link to one far end over a stream, opened again whenever it fails: `tcp` and `serial`."""
+"""Link to one peer over a stream, reopened after every failure: `tcp` and `serial`."""
 
 import logging
 import queue
@@ -15,17 +15,17 @@ _log = logging.getLogger(__name__)
 
 
 class Dialled:
-    """A TCP client or a serial line; what is sent while it is down is counted, not kept."""
+    """TCP client or serial line; messages sent while it is down are counted, not stored."""
 
     def __init__(self, spec: Spec) -> None:
         self.spec = spec
         self.dropped = self.unsent = 0
-        self.greets: Sequence[Hashable] = (spec.text,)  # the one far end; the same after every reconnection
+        self.greets: Sequence[Hashable] = (spec.text,)  # the peer; the same after every reconnection
         self._stream: Stream | None = None
         self._thread: threading.Thread | None = None
 
     def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
-        """Call and receive in a thread."""
+        """Connect and receive in a thread."""
         outlet = Outlet(number, out, self)
         self._thread = threading.Thread(target=self._run, args=(outlet, stop), name=self.spec.text)
         self._thread.start()
@@ -51,7 +51,7 @@ class Dialled:
                 back_off.wait(stop)
 
     def _receive(self, stream: Stream, outlet: Outlet, back_off: BackOff, stop: threading.Event) -> None:
-        """Receive until the far end is gone, which is an OSError."""
+        """Receive until `stop` is set or the peer disconnects, which raises an OSError."""
         read, both = selectors.EVENT_READ, selectors.EVENT_READ | selectors.EVENT_WRITE
         with selectors.DefaultSelector() as ready:
             ready.register(stream, read)
@@ -65,10 +65,10 @@ class Dialled:
                         outlet.piece(self.spec.text, data)
 
     def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
-        """Send to the far end, if it is there and has room."""
+        """Send to the peer, if it is connected and the send queue has space."""
         self.unsent += offer(self._stream, data, messages)
 
     def close(self) -> None:
-        """Wait for the thread; it closes what is open."""
+        """Wait for the thread, which closes the stream."""
         if self._thread is not None:
             self._thread.join()

@@ -1,4 +1,4 @@
-"""A TCP port that aircraft or ground stations call: `tcpin`."""
+"""TCP server for aircraft or ground stations: `tcpin`."""
 
 import logging
 import queue
@@ -12,29 +12,29 @@ from gateway.links.link import POLL_S, Batch, Outlet
 from gateway.links.stream import Tcp, offer
 from gateway.settings.link_spec import Spec
 
-MOST = 64  # callers at a time
-SPEAKING_S = 3.0  # a caller that sent something so lately keeps its place [s]
-SAID_S = 10.0  # between two log lines on callers that had to leave or were refused [s]
+MOST = 64  # clients at a time
+SPEAKING_S = 3.0  # a client that sent data within this time is not disconnected [s]
+SAID_S = 10.0  # between two log lines on clients that were disconnected or refused [s]
 
 _log = logging.getLogger(__name__)
 
 
 class TcpListener:
-    """A port and those who called it.
+    """Listening port and its clients.
 
-    Silence is no fault: a station may only listen. But where all places are taken, the caller silent for longest gives
-    its place to the next one; only if all have sent something within `SPEAKING_S` is the next one refused.
+    Silent clients are allowed: a station may only listen. When all places are taken, a new client replaces the client
+    silent for longest; if all have sent data within `SPEAKING_S`, the new client is refused.
 
     Raises:
-        OSError: when the port is not free.
+        OSError: when the port is in use.
     """
 
     def __init__(self, spec: Spec) -> None:
         self.spec = spec
         self.dropped = self.unsent = 0
         self._callers: dict[Hashable, Tcp] = {}
-        self._spoke: dict[Hashable, float] = {}  # when each sent something last, or called [s, monotonic]
-        self._silent: set[Hashable] = set()  # callers that have sent nothing yet
+        self._spoke: dict[Hashable, float] = {}  # time of the last data or of the connection [s, monotonic]
+        self._silent: set[Hashable] = set()  # clients that have sent nothing yet
         self._said, self._unsaid = float("-inf"), 0
         self._thread: threading.Thread | None = None
         family = socket.AF_INET6 if ":" in spec.where else socket.AF_INET
@@ -42,17 +42,17 @@ class TcpListener:
             self._socket = socket.create_server((spec.where, spec.port), family=family)
         except OSError as error:
             reason = error.strerror or str(error)
-            raise OSError(f"link {spec.text}: {reason}; stop what holds the port or name another") from None
+            raise OSError(f"link {spec.text}: {reason}; stop the process on this port or name another") from None
         self._socket.setblocking(False)
 
     @property
     def greets(self) -> Sequence[Hashable]:
-        """Return those who are there, whether they have spoken or not."""
+        """Return all connected clients, silent ones included."""
         return tuple(self._callers)
 
     @property
     def port(self) -> int:
-        """Return the port listened at."""
+        """Return the listening port."""
         return int(self._socket.getsockname()[1])
 
     def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
@@ -78,15 +78,15 @@ class TcpListener:
                 self._part(caller)
 
     def _accept(self, ready: selectors.BaseSelector) -> Hashable:
-        """Let the next caller in; gives the caller that has to leave for it, None where there is room or no caller."""
+        """Accept the next client; return the client to disconnect for it, None if there is space or no client."""
         try:
             connected, caller = self._socket.accept()
-        except OSError:  # gone before it was let in
+        except OSError:  # disconnected before it was accepted
             return None
         now, oldest = time.monotonic(), None
         if len(self._callers) >= MOST:
             oldest = self._longest_silent(now)
-            self._warn(now, "one more was refused" if oldest is None else "the one silent for longest had to leave")
+            self._warn(now, "refused another" if oldest is None else "disconnected the one silent for longest")
             if oldest is None:
                 connected.close()
                 return None
@@ -97,16 +97,16 @@ class TcpListener:
         return oldest
 
     def _longest_silent(self, now: float) -> Hashable:
-        """Return the caller silent for longest; None where all have sent something lately."""
+        """Return the client silent for longest; None if all have sent data recently."""
         silent = [one for one, t in self._spoke.items() if one in self._silent or now - t > SPEAKING_S]
         return min(silent, key=self._spoke.__getitem__, default=None)
 
     def _warn(self, now: float, what: str) -> None:
-        """Log that there is no room, at most every `SAID_S`."""
+        """Log that all places are taken, at most every `LOG_EVERY_S`."""
         self._unsaid += 1
         if now - self._said >= SAID_S:
             more = f" ({self._unsaid} since the last such line)" if self._unsaid > 1 else ""
-            _log.warning("link %s: found %d callers, expected fewer; %s%s", self.spec.text, MOST, what, more)
+            _log.warning("link %s: found %d clients, expected fewer; %s%s", self.spec.text, MOST, what, more)
             self._said, self._unsaid = now, 0
 
     def _leave(self, caller: Hashable, ready: selectors.BaseSelector, outlet: Outlet, stop: threading.Event) -> None:
@@ -115,7 +115,7 @@ class TcpListener:
         outlet.gone(caller, stop)
 
     def _serve(self, caller: Hashable, events: int, outlet: Outlet) -> bool:
-        """Read from and write to one caller; False where it is gone."""
+        """Read from and write to one client; return False if it has disconnected."""
         tcp = self._callers[caller]
         try:
             if events & selectors.EVENT_WRITE:
@@ -136,7 +136,7 @@ class TcpListener:
         self.unsent += tcp.outbox.close()
 
     def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
-        """Send to one of the callers, if it is there and has room."""
+        """Send to one client, if it is connected and its send queue has space."""
         self.unsent += offer(self._callers.get(where), data, messages)
 
     def close(self) -> None:

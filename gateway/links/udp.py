@@ -1,4 +1,4 @@
-"""Links over UDP: `udpin` listens and learns who speaks, `udpout` calls one far end, `udpbcast` a whole network."""
+"""Links over UDP: `udpin` listens, `udpout` sends to one peer, `udpbcast` broadcasts to a network."""
 
 import logging
 import queue
@@ -13,19 +13,19 @@ from gateway.links.link import POLL_S, Batch, Outlet
 from gateway.links.receive import MOST, receiver
 from gateway.settings.link_spec import Spec
 
-BUFFER = 1 << 26  # asked of the system: two seconds of 250 aircraft; taken only while it is full [bytes]
-_FORCE = 33  # SO_RCVBUFFORCE: beyond the system's limit, where that is allowed
+BUFFER = 1 << 26  # requested receive buffer: two seconds of 250 aircraft; memory is used only when filled [bytes]
+_FORCE = 33  # SO_RCVBUFFORCE: exceeds the system's limit, if permitted
 _LONGEST_NAP_S = 0.02
-_FILL = 4e8  # bytes of buffer a flood of 300,000 datagrams a second takes [bytes/s]
+_FILL = 4e8  # buffer use of a flood of 300,000 datagrams a second [bytes/s]
 
 _log = logging.getLogger(__name__)
 
 
 class Udp:
-    """A UDP socket and its thread.
+    """UDP socket and its thread.
 
     Raises:
-        OSError: when a port to listen at is not free.
+        OSError: when the listening port is in use.
     """
 
     def __init__(self, spec: Spec) -> None:
@@ -37,11 +37,11 @@ class Udp:
 
     @property
     def port(self) -> int:
-        """Return the port listened at; 0 as long as there is none."""
+        """Return the local port; 0 before the socket is open."""
         return int(self._socket.getsockname()[1]) if self._socket is not None else 0
 
     def start(self, number: int, out: "queue.Queue[Batch]", stop: threading.Event) -> None:
-        """Receive in a thread: stamp, queue, nothing else."""
+        """Receive in a thread, which only time-stamps and queues datagrams."""
         outlet = Outlet(number, out, self)
         self._thread = threading.Thread(target=self._run, args=(outlet, stop), name=self.spec.text)
         self._thread.start()
@@ -52,7 +52,7 @@ class Udp:
             try:
                 self._socket, where = _calling(self.spec)
                 self.greets = (where,)
-            except OSError as error:  # no network yet, or a name nobody knows yet
+            except OSError as error:  # no network yet, or an unresolved host name
                 _log.warning("link %s: %s; trying again", self.spec.text, error.strerror or error)
                 back_off.wait(stop)
         if self._socket is not None:
@@ -61,7 +61,7 @@ class Udp:
     def _receive(self, sock: socket.socket, outlet: Outlet, stop: threading.Event) -> None:
         source = receiver(sock)
         size = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-        nap = min(_LONGEST_NAP_S, size / _FILL)  # many datagrams at once cost little more than one
+        nap = min(_LONGEST_NAP_S, size / _FILL)  # a batch of datagrams costs little more than one
         with selectors.DefaultSelector() as ready:
             ready.register(sock, selectors.EVENT_READ)
             while not stop.is_set():
@@ -73,7 +73,7 @@ class Udp:
                         stop.wait(nap)
 
     def send(self, where: Hashable, data: bytes, messages: int = 1) -> None:
-        """Send one datagram; a full buffer or a far end that is not there loses it, and that is counted."""
+        """Send one datagram; count its messages as unsent if the buffer is full or the peer unreachable."""
         try:
             if self._socket is None:
                 raise OSError("not open yet")
@@ -98,12 +98,12 @@ def _listening(spec: Spec) -> socket.socket:
     except OSError as error:
         found.close()
         reason = error.strerror or str(error)
-        raise OSError(f"link {spec.text}: {reason}; stop what holds the port or name another") from None
+        raise OSError(f"link {spec.text}: {reason}; stop the process on this port or name another") from None
     return found
 
 
 def _calling(spec: Spec) -> tuple[socket.socket, Hashable]:
-    """Open a socket that speaks first: to one far end and hears only that; or to a network and hears all."""
+    """Open a socket that sends first: connected to one peer, or unconnected for broadcasts."""
     family, _, _, _, where = socket.getaddrinfo(spec.where, spec.port, type=socket.SOCK_DGRAM)[0]
     found = socket.socket(family, socket.SOCK_DGRAM)
     try:
@@ -122,5 +122,5 @@ def _calling(spec: Spec) -> tuple[socket.socket, Hashable]:
 def _widen(sock: socket.socket) -> None:
     try:
         sock.setsockopt(socket.SOL_SOCKET, _FORCE, BUFFER)
-    except OSError:  # allowed to few
+    except OSError:  # not permitted
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)

@@ -1,4 +1,4 @@
-"""What the gateway asks of the aircraft on one link: never in a rush, and no more than the link carries."""
+"""Requests to the aircraft of one link, limited to the capacity of the link."""
 
 from collections.abc import Hashable, Iterable, Sequence
 from typing import Any
@@ -11,17 +11,17 @@ from gateway.onboard.cache import Cache
 from gateway.onboard.questions import Questions
 from gateway.onboard.rates import Share
 
-# Other ground stations are 255: answers to us are not for them, and an aircraft that has lost them must notice.
+# Other ground stations use 255: they must not receive our answers, and an aircraft must detect the loss of theirs.
 SYSTEM, COMPONENT = 254, dialect.MAV_COMP_ID_MISSIONPLANNER
 HEARTBEAT_S = 1.0
 
 
 class Onboard:
-    """The talking half of one link.
+    """Sender of heartbeats and requests on one link.
 
     Args:
-        budget: what its aircraft may send together [bytes/s]
-        cache: what aircraft told before; None: nothing is kept
+        budget: rate at which its aircraft may send together [bytes/s]
+        cache: parameters and missions of earlier connections; None: no cache
     """
 
     def __init__(self, budget: float = float("inf"), cache: Cache | None = None) -> None:
@@ -34,12 +34,12 @@ class Onboard:
     def tick(
         self, now: float, crafts: Iterable[Craft], greets: Sequence[Hashable] = ()
     ) -> list[tuple[Hashable, bytes]]:
-        """Return (where to, bytes) of what is to be sent now.
+        """Return the messages to send now: (peer, bytes).
 
         Args:
             now: fleet time [s since 1970]
-            crafts: the aircraft of the link
-            greets: far ends to greet even before they speak
+            all_aircraft: the aircraft of the link
+            known_peers: peers that get a heartbeat before they send
         """
         live = [craft for craft in crafts if craft.link is Link.LIVE and craft.source is not None]
         out: list[tuple[Hashable, bytes]] = []

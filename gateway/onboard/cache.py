@@ -1,4 +1,4 @@
-"""What aircraft told before, kept in the user's cache folder: a proposal to be checked, never the truth."""
+"""Cache of parameters and missions of aircraft in the user's cache folder; entries are verified before use."""
 
 import logging
 from pathlib import Path
@@ -9,27 +9,27 @@ from fleet.contract import Item
 from fleet.process import private_files
 
 _log = logging.getLogger(__name__)
-_MOST = 1 << 24  # bytes read of one card; 5,000 parameters and 1,000 items have 0.5 MB
+_MOST = 1 << 24  # bytes read of one entry; 5,000 parameters and 1,000 items have 0.5 MB
 
 
 class Card(msgspec.Struct, frozen=True):
-    """What one aircraft told."""
+    """Cache entry of one aircraft."""
 
     values: dict[str, float] = {}
     count: int = 0  # of its parameters
-    hash: float | None = None  # over all of them, as the autopilot tells it
+    hash: float | None = None  # over all parameters, from the autopilot
     items: tuple[Item, ...] = ()
 
 
 class Cache:
-    """Cards by aircraft.
+    """Cache entries by aircraft.
 
     Args:
-        where: their folder, made when the first one is kept; one that others could have changed is left alone
+        folder: created with the first entry; a folder that other users can change is refused
     """
 
     def __init__(self, where: Path | None = None) -> None:
-        self._refused = ""  # why nothing is read or kept
+        self._refused = ""  # why nothing is read or stored
         self._said = False
         try:
             self._where = private_files.onboard_folder() if where is None else where
@@ -39,7 +39,7 @@ class Cache:
             self._check()
 
     def read(self, key: str) -> Card | None:
-        """Return what an aircraft told before; None where nothing is known or the file is damaged."""
+        """Return the entry of an aircraft; None without one or if the file is damaged."""
         try:
             if self._refused:
                 return None
@@ -49,23 +49,23 @@ class Cache:
             return None
 
     def keep(self, key: str, card: Card) -> None:
-        """Keep what an aircraft tells now; without a disk nothing is kept."""
+        """Store the entry of an aircraft; log a warning if that fails."""
         if card == self.read(key):
             return
         if self._where != Path():
             self._check()
         if self._refused:
             if not self._said:
-                _log.warning("what aircraft told cannot be kept: %s", self._refused)
+                _log.warning("parameters and missions cannot be cached: %s", self._refused)
             self._said = True
             return
         try:
             private_files.write(self._where / f"{key}.json", msgspec.json.encode(card))
         except OSError as error:
-            _log.warning("what aircraft told cannot be kept in %s (%s)", self._where, error.strerror)
+            _log.warning("parameters and missions cannot be cached in %s (%s)", self._where, error.strerror)
 
     def _check(self) -> None:
-        """Make the folder, or see that nobody else can have written there."""
+        """Create the folder, or check that no other user can write there."""
         try:
             private_files.folder(self._where, "PARAUAV_ONBOARD")
             self._refused = ""

@@ -1,4 +1,4 @@
-"""THE TABLE of how autopilots like to be asked: one row per autopilot, as `Status.autopilot` names it.
+"""Request protocol of each autopilot, by `Status.autopilot`.
 
 Source: ArduPilot GCS_Param.cpp, GCS_Common.cpp and MissionItemProtocol.cpp; PX4 mavlink_parameters.cpp and
 mavlink_mission.cpp; MAVLink services "Parameter Protocol" (hash check) and "Message interval".
@@ -12,13 +12,13 @@ from fleet.telemetry.mavlink.microservices.params import HASH
 
 
 class Dialect(NamedTuple):
-    """How one autopilot likes to be asked."""
+    """Request protocol of one autopilot."""
 
-    items_at_once: int = 1  # mission items asked for in one go
-    probe: bool = False  # any item may be asked for at any time, not only in order after the count
-    hash: str = ""  # name under which it tells the hash over all of its parameters
-    fickle: tuple[str, ...] = ()  # parameters that change by themselves begin so
-    streams: bool = False  # old versions know groups of messages only: REQUEST_DATA_STREAM
+    items_at_once: int = 1  # mission items requested at once
+    probe: bool = False  # any item may be requested at any time, not only in order after the count
+    hash: str = ""  # name of the parameter with the hash over all parameters
+    fickle: tuple[str, ...] = ()  # prefixes of parameters that the autopilot changes itself
+    streams: bool = False  # old versions support only groups of messages: REQUEST_DATA_STREAM
 
 
 DIALECTS = {
@@ -37,4 +37,4 @@ STREAMS = {
     "NAV_CONTROLLER_OUTPUT": dialect.MAV_DATA_STREAM_EXTENDED_STATUS,
     "MISSION_CURRENT": dialect.MAV_DATA_STREAM_EXTENDED_STATUS,
 }
-"""The group a message belongs to."""
+"""Stream group of each message."""

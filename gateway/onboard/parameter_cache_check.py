@@ -1,4 +1,4 @@
-"""Parameters an aircraft told before: found again by its board, believed only once they are checked."""
+"""Verification of cached parameters, identified by the board number of the aircraft, before they are used."""
 
 import random
 from typing import Any
@@ -11,23 +11,23 @@ from fleet.telemetry.mavlink.microservices.params import HASH
 from gateway.onboard.cache import Cache, Card
 from gateway.onboard.dialects import ANY, DIALECTS
 
-ASK_S = 1.0  # between two questions of the same [s]
-TRIES = 4  # in vain, then everything is asked for anew
-AT_ONCE = 10  # parameters
-OTHERS = 20  # looked at, of those no twin reads
+ASK_S = 1.0  # between two equal requests [s]
+TRIES = 4  # unsuccessful attempts after which everything is requested again
+AT_ONCE = 10  # parameters per request
+OTHERS = 20  # parameters checked among those that no twin reads
 FENCES = ("FENCE_", "GF_")
 
 
 class Recall:
-    """The way from a board's number to parameters in force: the hash over all, or every one that matters and some more.
+    """Check of cached parameters against the aircraft: by the hash over all, or by all relevant ones and a sample.
 
     Args:
-        craft: the aircraft
-        cache: what aircraft told before
+        aircraft: the aircraft
+        cache: parameters and missions of earlier connections
     """
 
     def __init__(self, craft: Craft, cache: Cache) -> None:
-        self.over = False  # adopted, or to be asked for as if nothing were known
+        self.over = False  # adopted, or rejected so that all parameters must be requested
         self._craft, self._cache = craft, cache
         self._to = (craft.system, craft.component)
         self._card: Card | None = None
@@ -36,7 +36,7 @@ class Recall:
 
     @property
     def key(self) -> str:
-        """Name the aircraft's file; empty where its board has no number."""
+        """Return the cache key of the aircraft; empty if its board has no number."""
         craft = self._craft
         return f"{craft.autopilot}-{craft.board}-{craft.system}" if craft.board else ""
 
@@ -61,7 +61,7 @@ class Recall:
         return [dialect.MAVLink_param_request_read_message(*self._to, name.encode(), -1) for name in names]
 
     def keep(self) -> None:
-        """Keep what is known whole by now."""
+        """Store parameters and mission in the cache, if complete."""
         book, route = self._craft.params, self._craft.route
         if self.key and book.complete:
             items = route.items if route.complete else ()
@@ -78,14 +78,14 @@ class Recall:
         self._names = [row.hash] if row.hash else self._sample(card, row.fickle, now)
 
     def _sample(self, card: Card, fickle: tuple[str, ...], now: float) -> list[str]:
-        """Name every parameter a twin reads and some of the others, every time other ones."""
+        """Return every parameter that a twin reads, and a random sample of the others."""
         steady = [name for name in sorted(card.values) if not name.startswith(fickle or "\0")]
         vital = [name for name in steady if name in NAMES or name.startswith(FENCES)]
         others = sorted(set(steady).difference(vital))
         return vital + random.Random(now).sample(others, min(OTHERS, len(others)))
 
     def _open(self) -> list[str]:
-        """List what has to be heard before anything can be believed."""
+        """Return the parameters not yet received that the check needs."""
         book = self._craft.params
         heard = {HASH} if book.hash is not None else set()
         return [name for name in self._names if name not in heard and name not in book.values]

@@ -1,4 +1,4 @@
-"""What the gateway asks of an aircraft: parameters, mission, message rates; with patience, and never in a rush.
+"""Schedule of requests to an aircraft: parameters, mission, message rates, time; with retries at limited rate.
 
 Source: MAVLink services "Parameter Protocol", "Mission Protocol", "Message interval".
 """
@@ -14,22 +14,22 @@ from gateway.onboard.parameter_cache_check import Recall
 from gateway.onboard.rates import WANTED_HZ
 from gateway.onboard.retry_timer import Patience
 
-RETRY_S = 0.5  # for one item or a handful of parameters [s]
-ITEM_TRIES = 20  # in vain, then the list is asked for again: it may have become shorter
-WATCH_S, PROOF_S = 15.0, 1.0  # between two looks at an item: known; believed since others were as before [s]
-AGAIN_S, AGAIN_ITEM_S = 60.0, 2.0  # between two downloads where single items cannot be looked at, and for each item [s]
-KEEP_S, SOON_S = 60.0, 15.0  # between two looks at whether there is something new to keep, and before the first [s]
-TRIP_S = 10.0  # between two questions for the time [s]
+RETRY_S = 0.5  # for one item or a few parameters [s]
+ITEM_TRIES = 20  # unsuccessful attempts after which the list is requested again: it may have become shorter
+WATCH_S, PROOF_S = 15.0, 1.0  # between two checks of an item: verified; from the cache and not yet verified [s]
+AGAIN_S, AGAIN_ITEM_S = 60.0, 2.0  # between two downloads where single items cannot be requested, and per item [s]
+KEEP_S, SOON_S = 60.0, 15.0  # between two updates of the cache, and before the first [s]
+TRIP_S = 10.0  # between two time requests [s]
 PARAMS_AT_ONCE = 10
-LIST_AGAIN = 200  # so many parameters missing are asked for as a list
-RATES_AFTER_S = 5.0  # the first judgement of rates [s]
+LIST_AGAIN = 200  # if more parameters are missing, the list is requested
+RATES_AFTER_S = 5.0  # before the first check of rates [s]
 RATE_TRIES = 3
-TOO_LOW, TOO_HIGH = 0.4, 1.6  # times the rate that fits: beyond, it is asked for; too high only where the link is full
+TOO_LOW, TOO_HIGH = 0.4, 1.6  # bounds of received over fitting rate; the upper one applies only on a full link [-]
 _IDS = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
 
 
 class Questions:
-    """What is still to be asked of one aircraft."""
+    """Pending requests to one aircraft."""
 
     def __init__(self, craft: Craft, now: float, cache: Cache | None = None) -> None:
         self.craft = craft
@@ -44,10 +44,10 @@ class Questions:
         self._rate_wait, self._rate_tries = Patience(10.0), 0
         self._params_at = self._items_at = float("-inf")
         self._items_left: int | None = None
-        self._item_tries = 0  # since the last item that came
+        self._item_tries = 0  # since the last item received
 
     def ask(self, now: float, share: float = 1.0) -> list[Any]:
-        """Return the messages to send now; `share` of the rates wanted fits the link."""
+        """Return the messages to send now; `share` of the wanted rates fits the link."""
         if self._recall is not None and now - self._keep_at >= KEEP_S:
             self._keep_at = now
             self._recall.keep()
@@ -81,7 +81,7 @@ class Questions:
         return self._watch(now) if route.complete and not route.stale else []
 
     def _watch(self, now: float) -> list[Any]:
-        """Look now and then whether the mission known is still the one on board."""
+        """Return requests that check periodically whether the stored mission is still the one on board."""
         route, count = self.craft.route, len(self.craft.route.items)
         if not self._dialect.probe:
             if now - self._watch_at > max(AGAIN_S, AGAIN_ITEM_S * count):
@@ -131,7 +131,7 @@ class Questions:
         return dialect.MAVLink_command_long_message(*self._to, command, 0, _IDS[name], 1e6 / hz, 0, 0, 0, 0, 0)
 
     def _time(self, now: float) -> list[Any]:
-        """Ask for the time, to learn how long question and answer take."""
+        """Return a time request when due, to measure the round-trip time."""
         if now - self._trip_at < TRIP_S:
             return []
         self._trip_at = now

@@ -1,4 +1,4 @@
-"""How often each message is wanted, and what a link can carry of it."""
+"""Wanted message rates, and the share of them that fits a link."""
 
 from collections.abc import Collection
 
@@ -17,38 +17,38 @@ WANTED_HZ: dict[str, float] = {  # [Hz]
     "NAV_CONTROLLER_OUTPUT": 5,
     "MISSION_CURRENT": 1,
 }
-LEAST = 0.1  # share of the rates wanted that is asked for in any case: less is of no use
-BUDGET = "1M"  # what the aircraft of one link may send [bytes/s]
-_FRAME = 12  # bytes round a payload
+LEAST = 0.1  # minimum share of the wanted rates: lower rates are not useful
+BUDGET = "1M"  # default rate that the aircraft of one link may send together [bytes/s]
+_FRAME = 12  # bytes of a frame without payload
 _RADIO = 0.7  # share of a serial line that telemetry may fill
-_STEADY = 0.15  # a share that would change by less stays
+_STEADY = 0.15  # smaller relative changes of the share are ignored
 
 
 def budget_of(spec: Spec, text: str = "") -> float:
-    """Return what aircraft may send on a link [bytes/s]: as asked for, or what suits its kind.
+    """Return the rate that aircraft may send on a link [bytes/s]: as specified, or the default of its kind.
 
     Raises:
-        ValueError: when `text` is no size.
+        ValueError: when `text` is not a size.
     """
     if text or spec.kind != "serial":
         return float(read_size(text or BUDGET, "--budget"))
-    return _RADIO * spec.port / 10  # ten bits a byte
+    return _RADIO * spec.port / 10  # ten bits per byte
 
 
 def size_of(name: str) -> int:
-    """Return the length of a message on the wire, nothing cut off [bytes]."""
+    """Return the length of a message on the wire without truncation [bytes]."""
     return _FRAME + layout(name).itemsize
 
 
 WANTED_BYTES_S = sum(hz * size_of(name) for name, hz in WANTED_HZ.items())
-"""What one aircraft would send of the messages wanted [bytes/s]."""
+"""Data rate of the wanted messages of one aircraft [bytes/s]."""
 
 
 class Share:
-    """The share of the rates wanted that fits a link: the same for all of its aircraft.
+    """Share of the wanted rates that fits a link, the same for all of its aircraft.
 
     Args:
-        budget: what they may send together [bytes/s]
+        budget: rate that they may send together [bytes/s]
     """
 
     def __init__(self, budget: float) -> None:
@@ -57,7 +57,7 @@ class Share:
         self._budget = budget
 
     def weigh(self, crafts: Collection[Craft]) -> float:
-        """Return the share for these aircraft; what they send unasked counts too, where it is known."""
+        """Return the share for these aircraft; messages that were not requested use part of the budget."""
         unasked = sum(
             hz * size_of(name) for craft in crafts for name, hz in craft.rates.items() if name not in WANTED_HZ
         )
@@ -70,6 +70,6 @@ class Share:
             need = in_words(wanted + unasked)
             self.sentence = (
                 f"{len(crafts)} aircraft would send {need}/s, the budget is {in_words(self._budget)}/s: "
-                f"{self.now:.0%} of the rates wanted are asked for; raise --budget where the link carries more"
+                f"{self.now:.0%} of the wanted rates are requested; raise --budget if the link has more capacity"
             )
         return self.now

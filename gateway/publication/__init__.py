@@ -1,1 +1,1 @@
-"""Publication of samples on the bus, and the history kept for late subscribers."""
+"""Publication of samples on the bus, and the history stored for late subscribers."""

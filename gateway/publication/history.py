@@ -1,4 +1,4 @@
-"""The last minutes of every aircraft, for whoever joins late: kept as it was sent, answered in one message."""
+"""History of the last minutes of every aircraft for late subscribers: packed messages, returned as one message."""
 
 import contextlib
 import threading
@@ -13,21 +13,21 @@ from fleet.bus.bus_protocol import Answers
 from fleet.bus.codec import Wire
 from fleet.contract import History, Sample, Status
 
-SECONDS = 160.0  # as long as a twin remembers
-MOST = 512 << 20  # bytes over all aircraft; beyond, everybody's past becomes shorter
+SECONDS = 160.0  # length of the history of a twin
+MOST = 512 << 20  # bytes over all aircraft; beyond, the history of every aircraft becomes shorter
 KINDS = (Sample, Status)
 
 
 class _Past:
-    """What one aircraft said: (fleet time [s since 1970], bytes), oldest first, by kind."""
+    """Packed messages of one aircraft: (fleet time [s since 1970], bytes), oldest first, by kind."""
 
     def __init__(self, since: float) -> None:
         self.said: dict[type, deque[tuple[float, bytes]]] = {kind: deque() for kind in KINDS}
         self.size = 0
-        self.since = since  # nothing after it is left out [s since 1970]
+        self.since = since  # complete from this time on [s since 1970]
 
     def trim(self, before: float, most: int) -> int:
-        """Forget what is older than `before` [s since 1970] or beyond `most` bytes; gives how much shorter it is."""
+        """Delete messages older than `before` [s since 1970] or beyond `max_bytes`; return the bytes deleted."""
         size = self.size
         for said in self.said.values():
             while said and said[0][0] < before:
@@ -43,22 +43,22 @@ class _Past:
 
 
 class Keeper:
-    """Remember what was said, answer for one aircraft at a time.
+    """Store packed messages and answer history queries, one aircraft at a time.
 
     Args:
-        seconds: how far back, on the fleet clock
-        most: bytes over all aircraft, shared equally
+        seconds: length of the history, on the fleet clock
+        max_bytes: over all aircraft, shared equally
     """
 
     def __init__(self, seconds: float = SECONDS, most: int = MOST) -> None:
-        self.size = 0  # bytes kept
+        self.size = 0  # bytes stored
         self._share = most  # of one aircraft [bytes]
         self._seconds, self._most = seconds, most
         self._pasts: dict[int, _Past] = {}
-        self._lock = threading.Lock()  # questions come on a thread of the bus
+        self._lock = threading.Lock()  # queries arrive on a thread of the bus
 
     def keep(self, wires: Iterable[Wire]) -> None:
-        """Remember packed messages; those that do not say when they are of are left out."""
+        """Store packed messages; those without a time are skipped."""
         with self._lock:
             for wire in wires:
                 if wire.kind in KINDS and isfinite(wire.t):
@@ -76,7 +76,7 @@ class Keeper:
         self.size += size - past.trim(wire.t - self._seconds, self._share)
 
     def forget(self, uavs: Iterable[int]) -> None:
-        """Forget aircraft; the others may then keep more."""
+        """Remove aircraft; the others get their share of memory."""
         with self._lock:
             for uav in uavs:
                 if (past := self._pasts.pop(uav, None)) is not None:
@@ -84,15 +84,15 @@ class Keeper:
             self._share = self._most // max(len(self._pasts), 1)
 
     def answer(self, uav: int | None, settings: dict[str, str], payload: bytes) -> Answers:
-        """Answer a question on the bus.
+        """Answer a query on the bus.
 
         Raises:
-            ValueError: when it is not about one aircraft: everybody's past at once is more than one message.
+            ValueError: when it is not about one aircraft: all histories do not fit one message.
         """
         del payload
         if uav is None:
             raise ValueError(
-                "history: found a question about every aircraft, expected one id in the key; ask one by one"
+                "history: found a query for every aircraft, expected one id in the key; query one at a time"
             )
         seconds = self._seconds
         with contextlib.suppress(ValueError):

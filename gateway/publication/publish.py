@@ -1,4 +1,4 @@
-"""Contract messages to the bus; the latest of each aircraft answers whoever asks."""
+"""Publish contract messages on the bus, and answer queries with the latest of each aircraft."""
 
 import threading
 import time
@@ -17,28 +17,28 @@ from gateway.publication.router_session import Way
 
 KEPT = (Status, Mission, Params, Alert)
 AGAIN = (Mission, Params)
-REPEAT_S = 10.0  # mission and parameters are said again, for those who missed them [s]
+REPEAT_S = 10.0  # between repetitions of mission and parameters, for late subscribers [s]
 
 
 Told = tuple[Account | None, list[Status]]
 
 
 class Publisher:
-    """Publish, remember the latest, answer queries.
+    """Publish messages, store the latest of each kind, answer queries.
 
     Args:
-        bus: where messages go
-        results: answer also for recorded results, as a worker would
+        bus: destination of messages
+        results: also answer queries for recorded results, as a worker does
     """
 
     def __init__(self, bus: Bus, results: bool = False) -> None:
         self.way, self.history = Way(bus), Keeper()
         self._bus = bus
-        self._lock = threading.Lock()  # answers come from a thread of the bus
+        self._lock = threading.Lock()  # queries arrive on a thread of the bus
         kept = tuple(dict.fromkeys(KEPT + RESULTS)) if results else KEPT
         self._latest: dict[type, dict[Hashable, tuple[Any, Stamp | None]]] = {kind: {} for kind in kept}
-        self.told: Account | None = None  # the newest counters
-        self._again: dict[tuple[type, int], Wire] = {}  # the latest, packed
+        self.told: Account | None = None  # the newest statistics
+        self._again: dict[tuple[type, int], Wire] = {}  # the latest mission and parameters, packed
         self._repeated = 0.0
         for kind in kept:
             bus.answer(kind, partial(self._answers, kind))
@@ -58,23 +58,23 @@ class Publisher:
             self._send([wire], stamp)
 
     def put(self, wires: Sequence[Wire]) -> None:
-        """Put messages on the bus that are packed already; results of workers are never among them."""
+        """Put packed messages on the bus; they never contain results of workers."""
         for wire in wires:
             if wire.kind in self._latest:
                 self._keep(wire.kind, (wire.uav, ""), wire, None)
         self._send(wires)
 
     def account(self, account: Account) -> None:
-        """Put the counters on the bus."""
+        """Put the statistics on the bus."""
         self.told = account
         self.way.send([Wire(Account, -1, encode(account))])
 
     def newest(self) -> Told:
-        """Return the newest counters, and the newest status of every aircraft by id."""
+        """Return the newest statistics, and the newest status of every aircraft by id."""
         return self.told, [s for s, _ in sorted(self._answers(Status, None, {}, b""), key=lambda pair: pair[0].uav)]
 
     def repeat(self, mono: float) -> None:
-        """Say missions and parameters again when it is time; `mono` is any clock that only goes forward [s]."""
+        """Repeat missions and parameters when due; `now` is any monotonic clock [s]."""
         came = self.way.look()
         if mono - self._repeated < REPEAT_S and not came:
             return
@@ -82,7 +82,7 @@ class Publisher:
         self._send(list(self._again.values()))
 
     def forget(self, uavs: Collection[int]) -> None:
-        """Forget aircraft: nobody is answered about them any more."""
+        """Remove aircraft; queries no longer return them."""
         with self._lock:
             for kind, latest in self._latest.items():
                 self._latest[kind] = {who: one for who, one in latest.items() if getattr(one[0], "uav", -1) not in uavs}
@@ -99,7 +99,7 @@ class Publisher:
             self._latest[kind][who] = message, stamp
 
     def _claimed(self, message: Any) -> tuple[Any, Stamp]:
-        """Claim the aircraft anew with every recorded result, so that no worker that computes its own is believed."""
+        """Stamp a recorded result with a new epoch, which supersedes results of workers for the same aircraft."""
         epoch = time.time_ns() // 1_000_000
         if isinstance(message, FleetState):
             rows = tuple(msgspec.structs.replace(row, epoch=epoch) for row in message.rows)

@@ -1,1 +1,1 @@
-"""What the links heard, on disk: a `.tlog` per link, within a budget, whatever becomes of decoding and of the bus."""
+"""Recording of received bytes: a `.tlog` per link within a disk budget, independent of decoding and of the bus."""

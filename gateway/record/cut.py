@@ -1,4 +1,4 @@
-"""Bytes of many senders cut into `.tlog` records: 8 bytes of big-endian us since 1970, one frame. Compiled."""
+"""Compiled split of the bytes of many senders into `.tlog` records: 8 bytes of big-endian us since 1970, one frame."""
 
 import numba as nb
 import numpy as np
@@ -7,12 +7,12 @@ from fleet.telemetry.mavlink.parsing.received import Heard
 from fleet.telemetry.mavlink.parsing.scan import CRC, EXTRA, STAMP, V1, V2, frame_length, message_id, sound
 
 CARRY = 300  # the longest frame is 293 [bytes]
-FRAMES, NOISE = range(2)  # what `cut` counts: frames found, bytes that belong to none
+FRAMES, NOISE = range(2)  # counters of `cut`: frames, bytes outside frames
 
 
 @nb.njit(cache=True, nogil=True)
 def _judge(data, at, end, extras, table):
-    """Tell how long the frame at `at` is [bytes]; 0: none, -1: it goes on beyond `end`."""
+    """Return the length of the frame at `at` [bytes]; 0: no frame, -1: it extends beyond `end`."""
     length = frame_length(data, at, end)
     if length == 0 or (length < 0 and data[at] != V1 and data[at] != V2):
         return 0
@@ -21,7 +21,7 @@ def _judge(data, at, end, extras, table):
     number = message_id(data, at)
     if number < len(extras) and extras[number] >= 0:
         return length if sound(data, at, end, extras, table) else 0
-    after = at + length  # a message unknown here has no checksum to test: what follows must look like the next frame
+    after = at + length  # the checksum of an unknown message cannot be tested: the next byte must begin a frame
     return length if after == end or data[after] == V1 or data[after] == V2 else 0
 
 
@@ -33,7 +33,7 @@ def _copy(source, start, length, target, at):
 
 @nb.njit(cache=True, nogil=True)
 def _search(data, end, us, work, counts, extras, table):
-    """Copy every frame of `data[:end]`, stamped; gives where `work` ends now and where the search must go on."""
+    """Copy every frame of `data[:end]` with a time stamp; return the new end of the output and of the consumed data."""
     out, n = work
     at = 0
     while at < end:
@@ -54,13 +54,13 @@ def _search(data, end, us, work, counts, extras, table):
 
 @nb.njit(cache=True, nogil=True)
 def cut(heard, us, carry, held, counts, extras, table):
-    """Cut pieces into records.
+    """Split pieces into records.
 
     Args:
-        heard: buf (b,) uint8; start, stop, slot of each piece, (n,): where it lies, whose it is
+        pieces: buf (b,) uint8; start, stop and sender slot of each piece, (n,)
         us: arrival of each piece, (n,) int64 [us since 1970]
-        carry, held: by slot what was cut off before, (m * CARRY,) uint8, and how much of it there is, (m,)
-        counts: raised: frames, bytes of no frame, (2,) int64
+        carry, carried: by slot the incomplete frame of earlier pieces, (m * CARRY_BYTES,) uint8, and its size, (m,)
+        counts: increased by frames and bytes outside frames, (2,) int64
         extras, table: `EXTRA`, `CRC`
     Returns:
         the records, (k,) uint8
@@ -69,7 +69,11 @@ def cut(heard, us, carry, held, counts, extras, table):
     longest, total = 0, 0
     for i in range(len(start)):
         longest, total = max(longest, stop[i] - start[i]), total + stop[i] - start[i] + held[slot[i]]
-    out, scratch, n = np.empty(2 * total, np.uint8), np.empty(CARRY + longest, np.uint8), 0  # no frame is below 8 bytes
+    out, scratch, n = (
+        np.empty(2 * total, np.uint8),
+        np.empty(CARRY + longest, np.uint8),
+        0,
+    )  # no frame is shorter than 8 bytes
     for i in range(len(start)):
         mine, size = slot[i], stop[i] - start[i]
         before = held[mine]
@@ -83,7 +87,7 @@ def cut(heard, us, carry, held, counts, extras, table):
 
 
 class Cutter:
-    """The cutting of one link: remembers of every sender what a piece cut off."""
+    """Split of the bytes of one link; stores the incomplete frame of every sender."""
 
     def __init__(self, most: int = 4096) -> None:
         self.counts = np.zeros(2, np.int64)
@@ -92,7 +96,7 @@ class Cutter:
 
     @property
     def held(self) -> int:
-        """Tell how many bytes wait for the rest of their frame."""
+        """Return the number of bytes of incomplete frames."""
         return int(self._held.sum())
 
     def feed(self, heard: Heard) -> bytes:
@@ -103,7 +107,7 @@ class Cutter:
         return cut(pieces, us, self._carry, self._held, self.counts, EXTRA, CRC).tobytes()
 
     def _slot(self, sender: object) -> int:
-        """Return the place of a sender's rest; who was met first makes room, the rest counts as noise then."""
+        """Return the slot of a sender; if all are in use, free the oldest one and count its bytes as noise."""
         if sender not in self._slots:
             free = len(self._slots)
             if free == len(self._held):

@@ -1,4 +1,4 @@
-"""The thread that records: takes what links heard off their hands at once, writes it when the disk can."""
+"""Recording thread: queues received bytes without blocking and writes them to disk."""
 
 import logging
 import queue
@@ -16,26 +16,26 @@ from gateway.record.cut import FRAMES, Cutter
 from gateway.record.tape import Budget, Tape
 
 MOST = 64 << 20  # bytes waiting for the disk; beyond, they are dropped and counted
-WRITE_S = 0.25  # between two writes: what a crash may cost [s]
+WRITE_S = 0.25  # between two writes: the longest loss at a crash [s]
 
 _log = logging.getLogger(__name__)
 
 
 class Taped(NamedTuple):
-    """What became of the bytes of one link: `heard` is the sum of the five after it, stamps of the file left out."""
+    """Byte counters of one link: `received` is the sum of the five after it, without the time stamps of the file."""
 
     heard: int = 0  # bytes
     recorded: int = 0  # in frames, on disk
-    noise: int = 0  # part of no frame, so not recorded
-    lost: int = 0  # the disk did not take them
-    dropped: int = 0  # the disk was too slow, and the queue full
-    waiting: int = 0  # for the disk, or for the rest of their frame
+    noise: int = 0  # outside frames, not recorded
+    lost: int = 0  # write errors
+    dropped: int = 0  # queue overflow
+    waiting: int = 0  # in the queue, or in incomplete frames
     frames: int = 0  # recorded or lost
     trouble: str = ""
 
 
 class _Reel:
-    """One link: its tape and its counters [bytes]."""
+    """Recording of one link: writer and counters [bytes]."""
 
     def __init__(self, tape: Tape) -> None:
         self.tape, self.cutter = tape, Cutter()
@@ -76,7 +76,7 @@ class Recorder(AbstractContextManager):
         self._thread.start()
 
     def hear(self, link: int, heard: Heard) -> None:
-        """Take pieces of one link, on any thread; never waits for the disk."""
+        """Queue pieces of one link; thread-safe, never waits for the disk."""
         size = int((heard.stop - heard.start).sum())
         with self._lock:
             self._reels[link].heard += size
@@ -87,12 +87,12 @@ class Recorder(AbstractContextManager):
                 self._size += size
 
     def account(self) -> list[Taped]:
-        """Tell what became of the bytes of each link."""
+        """Return the byte counters of each link."""
         with self._lock:
             return [reel.account() for reel in self._reels]
 
     def close(self) -> None:
-        """Write what waits and close the files."""
+        """Write the queue and close the files."""
         self._over.set()
         self._thread.join()
         for reel in self._reels:
@@ -108,7 +108,7 @@ class Recorder(AbstractContextManager):
             self.write()
 
     def write(self) -> None:
-        """Write what waits."""
+        """Write the queue."""
         with self._lock:
             waiting, self._waiting, self._size = self._waiting, [], 0
         for number, reel in enumerate(self._reels):
@@ -120,28 +120,28 @@ class Recorder(AbstractContextManager):
 
 
 class Tapped(queue.Queue[Batch]):
-    """The queue between receiving and decoding, recorded on its way in, what does not fit included.
+    """Queue between receiving and decoding; it records every batch, also those that do not fit.
 
     Args:
-        most: batches
-        most_bytes: heard, in those of one link
+        max_batches: capacity
+        max_bytes: received bytes of one link in the queue
     """
 
     def __init__(self, most: int, recorder: Recorder | None, most_bytes: int = QUEUE_BYTES) -> None:
         super().__init__(most)
         self._recorder, self._most_bytes = recorder, most_bytes
-        self._sizes: Counter[int] = Counter()  # bytes that wait, by link
+        self._sizes: Counter[int] = Counter()  # queued bytes, by link
 
     def put(self, item: Batch, block: bool = True, timeout: float | None = None) -> None:
-        """Record what was heard, then queue it.
+        """Record a batch, then queue it.
 
         Raises:
-            queue.Full: when it finds no room.
+            queue.Full: when there is no space.
         """
         if self._recorder is not None and item.heard is not None:
             self._recorder.hear(item.link, item.heard)
         waiting = self._sizes[item.link]
-        if item.size and waiting and waiting + item.size > self._most_bytes:  # one batch alone always has room
+        if item.size and waiting and waiting + item.size > self._most_bytes:  # a single batch always fits
             raise queue.Full
         super().put(item, block, timeout)
 

@@ -1,4 +1,4 @@
-"""Sizes as people write them: 500M, 10G."""
+"""Sizes with unit prefixes: 500M, 10G."""
 
 import re
 
@@ -6,10 +6,10 @@ _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
 
 def read_size(text: str, option: str) -> int:
-    """Read `500M` or `10G` [bytes], the value of a command line's `option`.
+    """Parse a size such as `500M` or `10G` [bytes], the value of a command line `option`.
 
     Raises:
-        ValueError: when it is neither.
+        ValueError: when it is not a size.
     """
     found = re.fullmatch(r"(\d+(?:\.\d+)?)([kMGT]?)B?", text.strip())
     if found is None or float(found[1]) <= 0:
@@ -18,7 +18,7 @@ def read_size(text: str, option: str) -> int:
 
 
 def in_words(size: float) -> str:
-    """Say `size` [bytes] in at most four figures."""
+    """Format a size [bytes] with at most four digits."""
     for unit in ("", "k", "M", "G"):
         if size < 1000:
             return f"{size:.0f} {unit}B" if size >= 100 or not unit else f"{size:.1f} {unit}B"

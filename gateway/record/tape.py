@@ -1,4 +1,4 @@
-"""One link's recording on disk: files that follow each other, and a budget that all recordings share."""
+"""Recording of one link on disk: rotated files, and a disk budget shared by all recordings."""
 
 import contextlib
 import os
@@ -10,20 +10,20 @@ from typing import IO
 from gateway.record.size import in_words
 
 OURS = re.compile(r".+_\d{8}T\d{6}Z(-\d+)?\.tlog$")
-LONGEST_S = 3600.0  # of one file
-LARGEST, SMALLEST = 256 << 20, 64 << 10  # of one file [bytes]
-PIECES = 4  # a link's newest file is at most one of so many equal parts of its share of the budget
+LONGEST_S = 3600.0  # longest duration of one file
+LARGEST, SMALLEST = 256 << 20, 64 << 10  # size limit of one file [bytes]
+PIECES = 4  # the size limit is at most this fraction of a link's share of the budget
 AGAIN_S = 2.0  # after a failure [s]
 
 
 class Budget:
-    """What recordings may take up in a folder; the oldest of our own make room.
+    """Disk budget of the recordings in a folder; the oldest recordings are deleted.
 
     Args:
-        folder: theirs alone, made here if need be
-        most: bytes, earlier runs' recordings included; other files are not counted and never touched
+        folder: folder of the recordings, created if it does not exist
+        max_bytes: recordings of earlier runs included; other files are neither counted nor deleted
     Raises:
-        OSError: when the folder cannot be made or written to.
+        OSError: when the folder cannot be created or written to.
     """
 
     def __init__(self, folder: Path, most: int) -> None:
@@ -33,20 +33,22 @@ class Budget:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OSError(f"--record: {str(folder)!r} cannot be made ({error.strerror}); name another folder") from None
+            raise OSError(
+                f"--record: {str(folder)!r} cannot be created ({error.strerror}); name another folder"
+            ) from None
         if not os.access(folder, os.W_OK | os.X_OK):
-            raise OSError(f"--record: {str(folder)!r} may not be written to; name another folder")
+            raise OSError(f"--record: {str(folder)!r} is not writable; name another folder")
         self._sizes = {
             path: path.stat().st_size for path in sorted(folder.iterdir(), key=_age) if OURS.match(path.name)
         }
 
     @property
     def used(self) -> int:
-        """Tell how many bytes our recordings take up."""
+        """Return the size of the recordings [bytes]."""
         return sum(self._sizes.values())
 
     def grow(self, path: Path, size: int) -> None:
-        """Note that a file being written has reached `size` bytes; the oldest that are not being written make room."""
+        """Update the size of an open file [bytes]; delete the oldest closed files beyond the budget."""
         self._sizes[path] = size
         self._open.add(path)
         for oldest in [path for path in self._sizes if path not in self._open]:
@@ -54,27 +56,27 @@ class Budget:
                 return
             del self._sizes[oldest]
             self.removed += 1
-            with contextlib.suppress(OSError):  # somebody else was tidier
+            with contextlib.suppress(OSError):  # deleted by another process
                 oldest.unlink()
 
     def shut(self, path: Path) -> None:
-        """Note that a file is not written to any more."""
+        """Mark a file as closed."""
         self._open.discard(path)
 
 
 class Tape(contextlib.AbstractContextManager):
-    """The recording of one link; what cannot be written is counted, and later the next file is tried.
+    """Writer of the recording of one link; after a write error it counts lost bytes and later tries a new file.
 
     Args:
-        name: of the link, as it is told
-        budget: of all of them
-        links: how many share it
+        name: name of the link
+        budget: disk budget of all recordings
+        links: number of links that share it
     """
 
     def __init__(self, name: str, budget: Budget, links: int = 1) -> None:
         self.written = 0  # bytes
-        self.lost = 0  # bytes the disk did not take
-        self.trouble = ""  # a sentence while the disk does not take any
+        self.lost = 0  # bytes not written
+        self.trouble = ""  # error message while writing fails
         self._slug = re.sub(r"[^\w.-]+", "-", name).strip("-")
         self._budget = budget
         self._largest = max(SMALLEST, min(LARGEST, budget.most // (PIECES * links)))
@@ -83,7 +85,7 @@ class Tape(contextlib.AbstractContextManager):
         self._size, self._begun, self._again = 0, 0.0, float("-inf")
 
     def write(self, records: bytes, now: float) -> int:
-        """Write whole records; `now` is any clock that only goes forward [s]. Gives the bytes lost."""
+        """Write complete records and return the bytes lost; `now` is any monotonic clock [s]."""
         if not records:
             return 0
         if self._file is None and now < self._again:
@@ -129,10 +131,10 @@ class Tape(contextlib.AbstractContextManager):
         self._budget.grow(self._path, self._size)
 
     def _fail(self, error: OSError, now: float) -> None:
-        """Leave the file as it was before this write, none where that is empty, and let it be for a while."""
+        """Truncate the file to its size before this write, delete it if empty, and pause writing."""
         self.trouble = (
-            f"recording of {self._slug} stopped ({error.strerror or error}), the gateway goes on; "
-            f"make room in {self._budget.folder} (ours take {in_words(self._budget.used)})"
+            f"recording of {self._slug} stopped ({error.strerror or error}), the gateway continues; "
+            f"free space in {self._budget.folder} (recordings take {in_words(self._budget.used)})"
         )
         if self._file is not None:
             with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""What passes a link and what does not: by message, by system, by component."""
+"""Message filter of a link: by message, system and component."""
 
 from typing import NamedTuple
 
@@ -8,19 +8,19 @@ from fleet.telemetry.mavlink.parsing.decode import IDS
 from fleet.telemetry.mavlink.parsing.scan import COMPONENT, ID, SYSTEM
 
 COLUMNS = {"messages": ID, "systems": SYSTEM, "components": COMPONENT}
-"""Setting of a link -> column of a frame it looks at; `no-` before it turns it round."""
+"""Setting of a link -> column of a frame that it tests; the prefix `no-` inverts it."""
 NO = "no-"
 SETTINGS = (*COLUMNS, *(NO + name for name in COLUMNS))
 _HIGHEST = {"messages": 0xFF_FFFF, "systems": 255, "components": 255}
 
 
 class Sieve(NamedTuple):
-    """Which frames pass: every rule must hold."""
+    """Filter of frames: a frame must satisfy every rule."""
 
-    rules: tuple[tuple[int, bool, tuple[int, ...]], ...] = ()  # column, whether these pass or all others, numbers
+    rules: tuple[tuple[int, bool, tuple[int, ...]], ...] = ()  # column, include (True) or exclude, numbers
 
     def keep(self, at: np.ndarray) -> np.ndarray:
-        """Tell of every frame whether it passes, (n,) bool; `at` as in `Frames`, (n, 8)."""
+        """Return whether each frame passes, (n,) bool; `frames` is `Frames.at`, (n, 8)."""
         kept = np.ones(len(at), bool)
         for column, these, numbers in self.rules:
             kept &= np.isin(at[:, column], numbers) == these
@@ -28,10 +28,10 @@ class Sieve(NamedTuple):
 
 
 def read_sieve(settings: dict[str, str]) -> Sieve:
-    """Take what belongs to a sieve out of the settings of a link, e.g. `no-messages=STATUSTEXT,30&systems=1-50`.
+    """Parse and remove filter rules from the settings of a link, e.g. `no-messages=STATUSTEXT,30&systems=1-50`.
 
     Raises:
-        ValueError: when a name or a number is none.
+        ValueError: when a name or a number is invalid.
     """
     rules = []
     for name in SETTINGS:

@@ -1,4 +1,4 @@
-"""The counters of one gateway, gathered from its links once a second."""
+"""Statistics of one gateway, collected from its links once a second."""
 
 import platform
 import time
@@ -20,7 +20,7 @@ _SYSTEM_S_COUNT = (Path("/proc/net/udp"), Path("/proc/net/udp6"))
 
 
 class _Flow:
-    """What has passed over one link."""
+    """Traffic counters and rates of one link."""
 
     def __init__(self) -> None:
         self.datagrams = self.bytes_in = self.sent = self.bytes_out = 0
@@ -28,7 +28,7 @@ class _Flow:
         self._then = (float("-inf"), 0, 0)
 
     def measure(self, t: float, messages: int) -> None:
-        """Measure rates up to `t` [s since 1970]."""
+        """Update the rates at `t` [s since 1970]."""
         before, bytes_in, heard = self._then
         passed = t - before
         self._then = (t, self.bytes_in, messages)
@@ -38,7 +38,7 @@ class _Flow:
 
 
 class Tally:
-    """Count what arrives, before anything is decoded, and what the gateway sends."""
+    """Counters of bytes received, before decoding, and of bytes sent."""
 
     def __init__(self, links: Sequence[Link], recorder: Recorder | None = None) -> None:
         self._links, self._recorder = links, recorder
@@ -46,13 +46,13 @@ class Tally:
         self._overruns: dict[int, int] = {}
 
     def add(self, link: int, heard: Heard) -> None:
-        """Count what came on a link."""
+        """Count received bytes of a link."""
         flow = self._flows[link]
         flow.datagrams += len(heard.start)
         flow.bytes_in += int((heard.stop - heard.start).sum())
 
     def sent(self, link: int, size: int) -> None:
-        """Count one piece of bytes sent."""
+        """Count one datagram sent."""
         flow = self._flows[link]
         flow.sent += 1
         flow.bytes_out += size
@@ -60,7 +60,7 @@ class Tally:
     def account(
         self, t: float, intakes: Sequence[Intake], players: set[int], way: Way, shares: Sequence[Share]
     ) -> Account:
-        """Make the message; `t` is fleet time [s since 1970], `players` the UAV ids of recordings."""
+        """Return the statistics message; `t` is fleet time [s since 1970], `replayed` the UAV ids of recordings."""
         taped = self._recorder.account() if self._recorder is not None else [Taped() for _ in self._links]
         self._overruns = overruns()
         told = tuple(self._link(t, k, intakes[k], taped[k], share) for k, share in enumerate(shares))
@@ -72,7 +72,7 @@ class Tally:
         if dropped := sum(link.dropped for link in told):
             refused["dropped: decoding fell behind"] += dropped
         if unsent := sum(link.unsent for link in told):
-            refused["not sent: nobody at the far end, or no room"] += unsent
+            refused["not sent: no peer, or send queue full"] += unsent
         return Account(
             t=t,
             links=tuple(link.link for link in told),
@@ -83,7 +83,7 @@ class Tally:
             bad_bytes=sum(link.bad_bytes for link in told),
             bad_frames=sum(link.bad_frames for link in told),
             refused=dict(refused),
-            sentence="" if uavs else "no aircraft heard yet; point its telemetry at one of the links",
+            sentence="" if uavs else "no aircraft received yet; send its telemetry to one of the links",
             per_link=told,
             published=way.published,
             unsent=way.unsent,
@@ -122,7 +122,7 @@ class Tally:
 
 
 def overruns(counts: Sequence[Path] = _SYSTEM_S_COUNT) -> Counter[int]:
-    """Return the datagrams the system dropped at each UDP port as its buffer was full; none where it does not tell."""
+    """Return the datagrams dropped by the system at each UDP port because of a full buffer; empty if unknown."""
     found: Counter[int] = Counter()
     for path in counts:
         try:

@@ -1,4 +1,4 @@
-"""The counters for people: a live table on a terminal, elsewhere a line now and then and whenever there is news."""
+"""Status display: a live table on a terminal; otherwise a line periodically and at every change of warnings."""
 
 import threading
 import time
@@ -19,19 +19,19 @@ from gateway.publication.publish import Told
 from gateway.record.size import in_words
 
 REFRESH_S = 1.0
-PLAIN_S = 30.0  # between lines where the output is no terminal [s]
-MOST_UAVS = 40  # shown, those in trouble first
+PLAIN_S = 30.0  # between lines where the output is not a terminal [s]
+MOST_UAVS = 40  # UAVs shown, those with warnings first
 
 
 def posted(
     told: Callable[[], Told], say: Callable[[str], None], console: Console | None = None
 ) -> AbstractContextManager[None]:
-    """Show the counters for as long as the block lasts.
+    """Show the status until the block ends.
 
     Args:
-        told: gives the newest; called on a thread of this block
-        say: takes a line where there is no terminal
-        console: the terminal; None where there is none
+        snapshot: returns the newest statistics; called on a separate thread
+        report: prints a line where there is no terminal
+        console: the terminal; None without one
     """
     return alongside(partial(_lines, say, told) if console is None else partial(_table, console, told))
 
@@ -55,22 +55,22 @@ def _lines(say: Callable[[str], None], told: Callable[[], Told], done: threading
         news = "; ".join(link.sentence for link in account.per_link if link.sentence)
         if news != said:
             said = news
-            say(news or "all links are well again")
+            say(news or "all links are normal again")
         if time.monotonic() >= due:
             due = time.monotonic() + PLAIN_S
             say(in_line(account, statuses))
 
 
 def in_line(account: Account, statuses: list[Status]) -> str:
-    """Say the counters in one line."""
+    """Format the statistics in one line."""
     lost = sum(status.link is Link.LOST for status in statuses)
     rate = sum(link.messages_hz for link in account.per_link)
     said = f"{len(account.uavs)} aircraft{f', {lost} of them lost' if lost else ''}, {rate:.0f} messages/s"
     found = {
         "bad frames": account.bad_frames,
         "refused": sum(account.refused.values()),
-        "missed by the aircraft's own count": sum(status.missed for status in statuses),
-        "lost in the system's buffer": sum(link.overrun or 0 for link in account.per_link),
+        "missing by sequence number": sum(status.missed for status in statuses),
+        "lost in the socket buffer": sum(link.overrun or 0 for link in account.per_link),
         "unsent without a router": account.unsent,
     }
     said += "".join(f", {count:,} {what}" for what, count in found.items() if count)
@@ -82,7 +82,7 @@ def in_line(account: Account, statuses: list[Status]) -> str:
 
 
 def drawn(account: Account, statuses: list[Status]) -> Group:
-    """Draw the counters."""
+    """Render the statistics as tables."""
     said = [link.sentence for link in account.per_link if link.sentence]
     said += [] if account.uavs or not account.sentence else [account.sentence]
     parts: list[Text | Table] = [
@@ -114,7 +114,7 @@ def _links(account: Account) -> Table:
 
 def _uavs(statuses: list[Status]) -> Table:
     table = _columns(
-        "UAV", "link", "mode", "messages/s", "received", "missed", "rejected", "later by ms", "round trip ms"
+        "UAV", "link", "mode", "messages/s", "received", "missed", "rejected", "latency ms", "round trip ms"
     )
     table.add_column("", overflow="fold")
     shown = sorted(statuses, key=lambda s: (s.link is Link.LIVE and not s.sentence, s.uav))[:MOST_UAVS]
@@ -124,7 +124,7 @@ def _uavs(statuses: list[Status]) -> Table:
         counts = (f"{sum(s.rates_hz.values()):.0f}", str(s.received), str(s.missed), str(s.rejected))
         table.add_row(str(s.uav), s.link.value, escape(plain(s.mode)), *counts, later, trip, escape(plain(s.sentence)))
     if len(statuses) > len(shown):
-        table.caption = f"{len(statuses) - len(shown)} more are well"
+        table.caption = f"{len(statuses) - len(shown)} more without warnings"
     return table
 
 

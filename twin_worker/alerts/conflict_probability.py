@@ -1,11 +1,11 @@
-"""How probable it is that two aircraft come too close, at any time of their predictions.
+"""Probability that two aircraft lose separation at any time of their predictions.
 
-The errors of two aircraft are taken as independent, so the covariance of their distance is the sum of both. (Wind that
-both meet makes errors alike and the distance surer than this says.) With S(t) that sum, 2 x 2 horizontally:
+The errors of two aircraft are assumed independent, so the covariance of their relative position is the sum of both.
+(Common wind correlates the errors and makes the true covariance smaller.) With S(t) that sum, 2 x 2 horizontally:
 
     distance(t) = d(t) + S(t)^(1/2) z,      z ~ N(0, I) drawn once for the whole encounter, vertical alike
 
-and the probability is the share of 128 evenly spread draws that come within the limits at one instant; between two
+and the probability is the share of 128 quasi-random draws that come within both limits at the same instant; between two
 instants of the grid the motion is a straight line. For a straight encounter this is the closed form of
 Source: Paielli & Erzberger 1997, "Conflict probability estimation for free flight", J. Guidance 20(3).
 """
@@ -17,12 +17,12 @@ import numpy as np
 
 from fleet.physics.kernel import kernel
 
-_BOUND = 2.0  # pairs whose limits lie more standard deviations off are no candidates: below 0.023 [-]
-_ENOUGH = 32  # draws after which a pair without one hit is given up [-]
+_BOUND = 2.0  # standard deviations beyond which a pair is rejected: probability below 0.023 [-]
+_ENOUGH = 32  # draws without a hit after which the probability is taken as 0 [-]
 
 
 class Separation(NamedTuple):
-    """The least distance two aircraft must keep: both less than these is a loss of separation."""
+    """Separation minima: separation is lost when both distances are below them."""
 
     horizontal: float = 50.0  # [m]
     vertical: float = 20.0  # [m]
@@ -30,7 +30,7 @@ class Separation(NamedTuple):
 
 @kernel
 def _minimum(d0: float, d1: float, e0: float, e1: float) -> tuple[float, float]:
-    """Return the least length of the vector (d, e) on its straight way from 0 to 1, and where on it."""
+    """Return the minimum length of the vector (d, e) on the line from 0 to 1, and the position of the minimum."""
     x, y = d1 - d0, e1 - e0
     square = x * x + y * y
     s = 0.0 if square <= 0.0 else min(max(-(d0 * x + e0 * y) / square, 0.0), 1.0)
@@ -39,7 +39,7 @@ def _minimum(d0: float, d1: float, e0: float, e1: float) -> tuple[float, float]:
 
 @kernel
 def _meets(r0: np.ndarray, r1: np.ndarray, wide: float, high: float) -> bool:
-    """Tell whether a relative position on its straight way from r0 to r1, NED (3,) [m], is ever inside both limits."""
+    """Return whether a relative position is inside both limits anywhere on the line from r0 to r1, NED (3,) [m]."""
     low, top = 0.0, 1.0
     fall = r1[2] - r0[2]
     if abs(fall) < 1e-9:
@@ -77,13 +77,13 @@ def screen(
     limits: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Find which others one aircraft may meet, when, and how near the mean paths come.
+    """Find possible conflicts of one aircraft: the others, the time, and the closest approach of the mean paths.
 
     Args:
         own: slot of the aircraft
         others: slots of the others, (m,)
         first, rows: first instant and number of rows of every slot [steps since 1970, -]
-        path: mean paths, NED from each one's own origin, (slots, n, 3) [m]
+        path: mean paths, NED from the origin of each prediction, (slots, n, 3) [m]
         covariance: nn, ne, ee, vertical, (slots, n, 4) [m2]
         scale, shift: other's NED to own NED, one row each of `others`, (m, 3) [-, m]
         limits: horizontal and vertical, (2,) [m]
@@ -127,10 +127,10 @@ def screen(
 
 @kernel
 def chance(apart: np.ndarray, covariance: np.ndarray, draws: np.ndarray, limits: np.ndarray) -> float:
-    """Return the probability of a loss of separation.
+    """Compute the probability of a loss of separation.
 
     Args:
-        apart: other minus own mean position on the common grid, NED, (n, 3) [m]
+        separation: other minus own mean position on the common grid, NED, (n, 3) [m]
         covariance: sum of both, nn, ne, ee, vertical, (n, 4) [m2]
         draws: normal errors, (k, 3) [-]
         limits: horizontal and vertical, (2,) [m]

@@ -1,10 +1,11 @@
-"""Whether the aircraft can fly the legs ahead: against this wind, this steep, this tight.
+"""Feasibility of the mission legs ahead: headwind, climb and descent rate, circle radius.
 
-    over ground    sqrt(Va^2 - w_cross^2) + w_along, and never more than Va - |w_cross|
-    steepness      rise / length x speed over ground, against the autopilot's climb and sink limits
+    ground speed   sqrt(Va^2 - w_cross^2) + w_along, at most Va - |w_cross|
+    slope          rise / length x ground speed, against the autopilot's climb and sink limits
     circle         tan(phi) = Va^2 / (g R) in still air, against the bank limit
 
-Limits that were not received are not judged. Probability: the wind's own sigma and how far it changes, 5 % for a limit.
+Limits that were not received are not checked. The probability includes the sigma and drift of the wind, and 5 % of each
+limit.
 """
 
 from collections.abc import Mapping
@@ -22,34 +23,34 @@ from fleet.contract import AlertKind
 from fleet.frames import G, Origin, to_geodetic
 from twin_worker.alerts.hysteresis import Finding
 
-_LEGS = 12  # legs ahead that are judged
-_SLOWEST = 1.0  # speed over ground that is no headway [m/s]
-_CHANGES = 0.55  # how far the wind itself changes within minutes [m/s]
-_SHARE = 0.05  # how well a limit is known [-]
-_FLAT = 15.0  # smaller differences in height are no slope: they are flown at once [m]
+_LEGS = 12  # legs ahead that are checked
+_SLOWEST = 1.0  # minimum ground speed that counts as headway [m/s]
+_CHANGES = 0.55  # standard deviation of the change of wind within minutes [m/s]
+_SHARE = 0.05  # relative standard deviation of a limit [-]
+_FLAT = 15.0  # smaller height differences are not checked: they take little time [m]
 _OVER = "the mission is achievable"
 _CIRCLES = (m.LOITER_TURNS, m.LOITER_UNLIMITED, m.LOITER_TIME, m.LOITER_TO_ALT)
 
 
 class Ability(NamedTuple):
-    """What a fixed wing may do by its autopilot's parameters; nan where they were not received."""
+    """Limits of a fixed wing from autopilot parameters; nan where they were not received."""
 
     Va: float  # cruise airspeed, true [m/s]
     climb: float  # [m/s]
     sink: float  # [m/s]
     bank: float  # [rad]
-    radius: float  # of circles that name none [m]
+    radius: float  # of circles without a radius of their own [m]
 
 
 class Now(NamedTuple):
-    """Where an aircraft is on its mission.
+    """State of an aircraft on its mission.
 
     Attributes:
         t: data time [s since 1970]
-        p: position, NED from `origin`, (3,) [m]
+        position: NED from `origin`, (3,) [m]
         origin: origin of the route's frame
-        wind: north, east, the direction it blows to, and its sigma, (3,) [m/s]
-        way: route from the item in force on
+        wind: north and east component of the wind velocity, and its sigma, (3,) [m/s]
+        route: route from the active item on
     """
 
     t: float
@@ -60,7 +61,7 @@ class Now(NamedTuple):
 
 
 def ability(params: Mapping[str, float], altitude_m: float) -> Ability:
-    """Read what ArduPlane's or PX4's parameters allow, at a height above sea level [m]."""
+    """Read limits from ArduPlane or PX4 parameters, at a height above sea level [m]."""
     if "FW_AIRSPD_TRIM" in params:
         names = ("FW_AIRSPD_TRIM", "FW_T_CLMB_MAX", "FW_T_SINK_MAX", "FW_R_LIM", "NAV_LOITER_RAD")
         Va, climb, sink, bank, radius = (params.get(name, np.nan) for name in names)
@@ -72,9 +73,9 @@ def ability(params: Mapping[str, float], altitude_m: float) -> Ability:
 
 
 def achievable(now: Now, able: Ability) -> Finding:
-    """Judge the legs ahead; return the one that is least achievable. A leg of unknown airspeed ends the judgement.
+    """Check the legs ahead and return the least feasible one; the check ends at a leg of unknown airspeed.
 
-    Without an estimate of the wind nothing is judged.
+    Without a wind estimate no leg is checked.
     """
     if not np.isfinite(now.wind).all():
         return Finding(AlertKind.NOT_ACHIEVABLE, 0.0, "", _OVER)
@@ -101,7 +102,7 @@ def achievable(now: Now, able: Ability) -> Finding:
 def _worst(
     leg: np.ndarray, from_p: np.ndarray, Va: float, able: Ability, wind: np.ndarray
 ) -> tuple[float, tuple[float, str]]:
-    """Return the speed over ground on a leg [m/s], and the greatest probability that it cannot be flown, with why."""
+    """Return the ground speed on a leg [m/s], and the greatest probability of infeasibility with its reason."""
     way, length = leg[m.P_N : m.P_D + 1] - from_p, hypot(*(leg[m.P_N : m.P_D] - from_p[:2]))
     unit = way[:2] / length if length > 1.0 else np.array([1.0, 0.0])
     along, cross = float(wind[:2] @ unit), float(wind[1] * unit[0] - wind[0] * unit[1])
@@ -118,17 +119,17 @@ def _worst(
     if int(leg[m.KIND]) in _CIRCLES and isfinite(able.bank + radius) and radius > 0 and able.bank > 0:
         needed, most = Va * Va / (G * radius), tan(min(able.bank, 1.5))
         why = f"a circle of {radius:.0f} m at {Va:.0f} m/s needs {np.degrees(np.arctan(needed)):.0f} deg of bank, "
-        checks.append((_p(needed / most - 1, _SHARE), why + f"{np.degrees(able.bank):.0f} are allowed; widen it"))
+        checks.append((_p(needed / most - 1, _SHARE), why + f"the limit is {np.degrees(able.bank):.0f}; widen it"))
     return speed, max(checks, default=(0.0, ""))
 
 
 def _steep(leg: np.ndarray, rate: float, able: Ability, share: float) -> list[tuple[float, str]]:
-    """Judge the climb [m/s] that a leg asks for; on the way to a landing descents are the landing's own matter."""
+    """Check the climb rate [m/s] that a leg requires; legs to a landing are not checked."""
     kind, most = int(leg[m.KIND]), able.climb if rate > 0 else able.sink
     if kind not in (m.WAYPOINT, m.LOITER_TURNS, m.LOITER_TIME) or not (isfinite(most) and most > 0):
         return []
     word = "climb" if rate > 0 else "descent"
-    why = f"it asks for a {word} of {abs(rate):.1f} m/s, {most:.1f} are allowed; make the leg longer"
+    why = f"it requires a {word} of {abs(rate):.1f} m/s, the limit is {most:.1f}; make the leg longer"
     return [(_p(abs(rate) / most - 1, hypot(_SHARE, share)), why)]
 
 

@@ -1,18 +1,18 @@
-"""One prediction as what alerts are judged on: Gaussian positions on a grid of times that all aircraft share.
+"""Prediction as Gaussian positions on a time grid common to all aircraft, the input of all alerts.
 
-The tube holds `quantile` q of flights within all three half-axes (along, cross, vertical) at once; it is a box, not an
-ellipsoid. How much each axis alone holds, L, depends on how errors of the axes go together and is measured where the
-tube is calibrated (`axis_quantile`). A half-axis is then z standard deviations of a normal error:
+The tube contains `quantile` q of flights within all three half-axes (along, cross, vertical) at once; it is a box, not
+an ellipsoid. The coverage L of each axis by itself depends on the correlation of the axes and is measured in the
+calibration of the tube (`axis_quantile`). A half-axis is then z standard deviations of a normal error:
 
-    z = Phi^-1((1 + L) / 2),    q <= L <= q^(1/3):  1.64 where all axes err at once, 2.11 where they are independent
+    z = Phi^-1((1 + L) / 2),    q <= L <= q^(1/3):  1.64 for fully dependent axes, 2.11 for independent ones
 
-for q = 0.9. Without a measurement they count as independent, the upper bound: for normal errors of whatever correlation
-a box holds no less than the product of what its axes hold.
+for q = 0.9. Without a measurement the axes count as independent, which is the upper bound: the coverage of a box of
+normal errors is at least the product of the coverages of its axes, for any correlation.
 Source: Sidak 1967, "Rectangular confidence regions for the means of multivariate normal distributions".
 
-Errors of one prediction are taken as one draw for its whole length (an aircraft that is late stays late), along and
-cross turned to NED by the direction of the path at each time. The covariance grows with the look-ahead, so what is far
-ahead weighs little by itself and no horizon cuts it off.
+The error of one prediction is one draw for its whole length (an aircraft that is late stays late), rotated from along
+and cross to NED by the path direction at each time. The covariance grows with the look-ahead, so distant positions
+contribute little and need no cut-off horizon.
 """
 
 from functools import lru_cache
@@ -29,14 +29,14 @@ from twin_worker.confidence.tube_and_horizon import track_frame
 from twin_worker.numerics.interpolation import straight
 
 STEP = 2.0  # grid in fleet time, the same for all: instants k STEP [s since 1970]
-LONGEST_S = 180.0  # of a prediction that is judged [s]
-DRAWS = norm.ppf(qmc.Sobol(3, scramble=True, seed=5).random(128))  # evenly spread normal errors, (128, 3) [-]
-_MOST = 1e6  # places farther from their own origin are noise [m]
-_LEAST = 0.1  # standard deviations are never smaller [m]
+LONGEST_S = 180.0  # longest look-ahead used [s]
+DRAWS = norm.ppf(qmc.Sobol(3, scramble=True, seed=5).random(128))  # quasi-random normal errors, (128, 3) [-]
+_MOST = 1e6  # positions farther from their origin are invalid [m]
+_LEAST = 0.1  # minimum standard deviation [m]
 
 
 class Forecast(NamedTuple):
-    """A prediction, checked, on the common grid."""
+    """A validated prediction on the common grid."""
 
     made: Prediction
     first: int  # instant of the first row, in steps since 1970
@@ -56,7 +56,7 @@ class Forecast(NamedTuple):
         return out
 
     def draws(self, until: float = np.inf) -> np.ndarray:
-        """Return 128 equally probable flights up to an instant [s since 1970], NED, (128, k, 3) [m]."""
+        """Return 128 equally probable paths up to an instant [s since 1970], NED, (128, k, 3) [m]."""
         k = max(int(np.searchsorted(self.t, until, side="right")), 1)
         e = DRAWS[:, None, :] * self.sigma[:k]
         c, s = self.along[:k].T
@@ -70,18 +70,18 @@ class Forecast(NamedTuple):
 
 @lru_cache(maxsize=64)
 def axis_z(quantile: float, alone: float = 0.0) -> float:
-    """Return the half-axis of a tube that holds `quantile`, in standard deviations of one axis.
+    """Return the half-axis of a tube of coverage `quantile`, in standard deviations of one axis.
 
     Args:
-        quantile: share that all three half-axes hold at once
-        alone: share that each of them alone holds; beyond what is possible, as 0, the axes count as independent
+        quantile: joint coverage of all three half-axes
+        axis_quantile: coverage of each half-axis; a value out of range, such as 0, means independent axes
     """
     independent = quantile ** (1 / 3)
     return float(norm.ppf((1 + (alone if quantile <= alone < independent else independent)) / 2))
 
 
 def forecast(made: Prediction) -> Forecast | None:
-    """Check a prediction and lay it on the common grid; None where it cannot be judged."""
+    """Validate a prediction and interpolate it on the common grid; None if it is invalid or too short."""
     try:
         ahead, path, tube = (array.numpy().astype(float) for array in (made.ahead, made.path, made.tube))
     except ValueError:
@@ -101,7 +101,7 @@ def forecast(made: Prediction) -> Forecast | None:
 
 @nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
 def _turned(along: np.ndarray, sigma: np.ndarray, out: np.ndarray) -> None:
-    """Fill in the covariance of every row, (n, 4)."""
+    """Compute the NED covariance of every row into `out`, (n, 4)."""
     for k in range(len(out)):
         c, s = along[k, 0], along[k, 1]
         a, b = sigma[k, 0] ** 2, sigma[k, 1] ** 2
@@ -110,7 +110,7 @@ def _turned(along: np.ndarray, sigma: np.ndarray, out: np.ndarray) -> None:
 
 
 def _sound(made: Prediction, ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
-    """Return whether times rise, shapes agree, numbers are finite and the origin is on this earth."""
+    """Return whether times rise, shapes agree, numbers are finite and the origin is a valid position."""
     n = len(ahead) if ahead.ndim == 1 else 0
     if n < 1 or path.shape != (n, 3) or tube.shape != (n, 3):
         return False
@@ -128,7 +128,7 @@ def _sound(made: Prediction, ahead: np.ndarray, path: np.ndarray, tube: np.ndarr
 
 @nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]
 def _credible(ahead: np.ndarray, path: np.ndarray, tube: np.ndarray) -> bool:
-    """Return whether times are finite and rise, and places and half-axes are near; false for nan."""
+    """Return whether times are finite and rise, and positions and half-axes are within bounds; false for nan."""
     for k in range(len(ahead)):
         if not np.isfinite(ahead[k]) or (k and not ahead[k] > ahead[k - 1]):
             return False

@@ -1,7 +1,7 @@
-"""Whether a predicted flight leaves the geofence that the autopilot's parameters describe.
+"""Probability that a predicted flight breaches the geofence in the autopilot parameters.
 
-A circle round home and heights above home. Fences of points (ArduPilot's polygons, PX4's fence items) are not among
-the parameters and are not received: what is not judged is said.
+Supported are a circle around home and height limits above home. Polygon fences (ArduPilot polygons, PX4 fence items)
+are not parameters and are not received; the alert text names them as not monitored.
 Source: ArduPilot "Geofencing" (FENCE_*), PX4 "Geofence" (GF_*).
 """
 
@@ -17,24 +17,24 @@ from twin_worker.alerts.gaussian_forecast import Forecast
 from twin_worker.alerts.hysteresis import Finding
 
 _CEILING, _CIRCLE, _POLYGON, _FLOOR = 1, 2, 4, 8  # FENCE_TYPE
-_OVER = "the geofence is kept"
+_OVER = "no geofence breach predicted"
 
 
 class Fence(NamedTuple):
-    """Limits about home; infinite where there is none."""
+    """Geofence limits around home; infinite where there is none."""
 
     radius: float = np.inf  # horizontal [m]
     ceiling: float = np.inf  # height above home [m]
     floor: float = -np.inf  # height above home [m]
-    unseen: str = ""  # what of the fence is not judged
+    unseen: str = ""  # part of the fence that is not monitored
 
     def limits(self) -> bool:
-        """Return whether anything can be judged."""
+        """Return whether there is any limit."""
         return bool(np.isfinite(self[:3]).any())
 
 
 def fence(params: Mapping[str, float]) -> Fence:
-    """Read the fence in force from autopilot parameters; without one nothing is limited."""
+    """Read the active geofence from autopilot parameters; without one all limits are infinite."""
     if "GF_MAX_HOR_DIST" in params or "GF_MAX_VER_DIST" in params:
         wide, high = (_positive(params.get(name)) for name in ("GF_MAX_HOR_DIST", "GF_MAX_VER_DIST"))
         return Fence(wide, high)
@@ -53,12 +53,12 @@ def fence(params: Mapping[str, float]) -> Fence:
 
 
 def _positive(value: float | None) -> float:
-    """Read a distance; absent, zero or absurd is no limit."""
+    """Return a distance limit; infinite if it is absent, not positive or not finite."""
     return value if value is not None and isfinite(value) and value > 0 else np.inf
 
 
 def leaves(flight: Forecast, limit: Fence, home: Origin, until: float = np.inf) -> Finding:
-    """Judge a predicted flight against the fence round `home`, up to an instant [s since 1970]."""
+    """Compute the probability of a geofence breach around `home`, up to an instant [s since 1970]."""
     centre = to_ned(flight.made.ned_origin(), *(np.array([x]) for x in home))[0]
     place = flight.draws(until) - centre
     away, height = np.hypot(place[..., 0], place[..., 1]), -place[..., 2]

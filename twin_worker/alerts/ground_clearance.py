@@ -1,4 +1,4 @@
-"""Whether a predicted flight comes too near to the ground. Terrain is unknown: height is above home, and said so."""
+"""Probability that a predicted flight descends below a minimum height above home; terrain is unknown."""
 
 import numpy as np
 from scipy.special import ndtr
@@ -8,9 +8,9 @@ from fleet.frames import Origin
 from twin_worker.alerts.gaussian_forecast import Forecast
 from twin_worker.alerts.hysteresis import Finding
 
-WINGS_M, ROTORS_M = 30.0, 5.0  # least height above home where it does not land, on wings and on rotors [m]
-_SLIGHT = 0.02  # what is less probable is warned of by nobody, and not described [-]
-_OVER = "height is kept"
+WINGS_M, ROTORS_M = 30.0, 5.0  # minimum height above home outside landings, fixed wings and multirotors [m]
+_SLIGHT = 0.02  # below this probability no alert text is composed [-]
+_OVER = "no descent below the minimum height predicted"
 
 
 def above(flight: Forecast, home: Origin) -> np.ndarray:
@@ -19,9 +19,9 @@ def above(flight: Forecast, home: Origin) -> np.ndarray:
 
 
 def sinks(flight: Forecast, home: Origin, margin: float, until: float = np.inf) -> Finding:
-    """Judge a predicted flight against a least height above home [m], up to an instant [s since 1970].
+    """Compute the probability of descending below a height above home [m], up to an instant [s since 1970].
 
-    The vertical error is one draw for the whole flight, so the worst instant alone decides:
+    The vertical error is one draw for the whole flight, so the worst instant determines the probability:
 
         p = max over t of Phi((margin - height(t)) / sigma(t))
     """
@@ -31,7 +31,9 @@ def sinks(flight: Forecast, home: Origin, margin: float, until: float = np.inf) 
     p = float(ndtr(z.max()))
     if p < _SLIGHT:
         return Finding(AlertKind.GROUND, p, "", _OVER)
-    first = int(np.flatnonzero(z >= min(z.max(), 0.0))[0])  # where the mean goes below, else where it comes nearest
+    first = int(
+        np.flatnonzero(z >= min(z.max(), 0.0))[0]
+    )  # where the mean goes below the margin, else the lowest point
     at = float(flight.t[first])
     danger = (
         f"{p:.0%} chance that it sinks below {margin:.0f} m above home (terrain unknown) in "

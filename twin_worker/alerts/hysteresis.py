@@ -1,4 +1,4 @@
-"""Raise an alert once and withdraw it once: what is found is probable for a while, then improbable for a while."""
+"""Alarm hysteresis: raise an alert after a hazard stays probable, and clear it after it stays improbable."""
 
 from dataclasses import dataclass, field
 from math import isfinite
@@ -9,16 +9,16 @@ from fleet.frames import Origin
 
 
 class Rule(NamedTuple):
-    """When an alert of one kind begins and ends; between the two probabilities nothing changes."""
+    """Thresholds and delays of one kind of alert; between the two probabilities the state does not change."""
 
-    raise_at: float  # probability from which it is raised
-    clear_below: float  # probability below which it is withdrawn
-    after_s: float  # how long it must be probable without a break [s]
-    ease_s: float  # how long it must be improbable without a break [s]
-    per_s: float = 0.0  # how much longer it must be probable for each second that it lies more than 30 s ahead [-]
+    raise_at: float  # probability at and above which it is raised
+    clear_below: float  # probability below which it is cleared
+    after_s: float  # uninterrupted time above `raise_at` before it is raised [s]
+    ease_s: float  # uninterrupted time below `clear_below` before it is cleared [s]
+    per_s: float = 0.0  # additional delay for each second that it lies more than 30 s ahead [-]
 
 
-_NEAR_S = 30.0  # dangers nearer than this are told at once [s]
+_NEAR_S = 30.0  # hazards nearer than this have no additional delay [s]
 RULES = {
     AlertKind.LINK_LOST: Rule(0.5, 0.5, 0.0, 0.0),
     AlertKind.SHORT_HORIZON: Rule(0.9, 0.1, 15.0, 5.0),
@@ -31,16 +31,16 @@ RULES = {
 
 @dataclass(frozen=True)
 class Finding:
-    """What one judgement found of one danger.
+    """Probability and description of one hazard.
 
     Attributes:
-        kind: what is in danger
-        probability: that it comes to pass, 0..1
-        danger: what to say when it is raised, without the aircraft's name
-        over: what to say when it is withdrawn
+        kind: kind of alert
+        probability: that the hazard occurs, 0..1
+        message: text when the alert is raised, without the aircraft's name
+        clear_message: text when the alert is cleared
         other: the other UAV of a conflict, -1 none
-        at: when it is predicted for [s since 1970]; None now
-        place: where it is predicted for; None at no one place
+        predicted_t: predicted time [s since 1970]; None: now
+        position: predicted position; None: unknown
     """
 
     kind: AlertKind
@@ -54,20 +54,20 @@ class Finding:
 
 @dataclass
 class Open:
-    """One danger under watch."""
+    """Hysteresis state of one hazard."""
 
-    alert: Alert | None = None  # in force
-    since: float | None = None  # since when the contrary of what is in force was found [s since 1970]
+    alert: Alert | None = None  # active alert
+    since: float | None = None  # when the condition for the opposite state began to be met [s since 1970]
 
 
 @dataclass
 class Ledger:
-    """The alerts of one UAV: in force, or about to be."""
+    """Alerts of one UAV, active or pending."""
 
     _open: dict[About, Open] = field(default_factory=dict)
 
     def judge(self, uav: int, now: float, finding: Finding) -> list[Alert]:
-        """Take a finding at data time `now` [s since 1970]; return the alert it raises or withdraws, if any."""
+        """Update with a hazard at data time `now` [s since 1970]; return the alert it raises or clears, if any."""
         about = finding.kind, finding.other
         entry, rule = self._open.setdefault(about, Open()), RULES[finding.kind]
         p = finding.probability if isfinite(finding.probability) else 0.0
@@ -88,17 +88,17 @@ class Ledger:
         return [entry.alert]
 
     def watched(self, kind: AlertKind) -> list[int]:
-        """Return the other UAVs of all dangers of one kind that are in force or about to be."""
+        """Return the other UAVs of all alerts of one kind, active or pending."""
         return [other for one, other in self._open if one is kind]
 
     @property
     def active(self) -> list[Alert]:
-        """Return the alerts in force, oldest first."""
+        """Return the active alerts, oldest first."""
         return [entry.alert for entry in tuple(self._open.values()) if entry.alert is not None]
 
 
 def _patience(rule: Rule, found: Finding, now: float) -> float:
-    """Return how long a danger must be probable before it is told [s]: what lies far ahead has time to be borne out."""
+    """Return how long a hazard must be probable before it is raised [s]; longer for hazards far ahead."""
     ahead = found.at - now if found.at is not None else 0.0
     return rule.after_s + rule.per_s * max(ahead - _NEAR_S, 0.0)
 

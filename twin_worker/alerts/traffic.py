@@ -1,4 +1,4 @@
-"""Loss of separation: each pair is judged once, by whoever holds the aircraft with the lower id."""
+"""Conflict alerts: each pair is assessed once, by the worker that owns the aircraft with the lower id."""
 
 from dataclasses import dataclass, field
 from math import inf, isfinite
@@ -11,34 +11,34 @@ from twin_worker.alerts.gaussian_forecast import DRAWS, STEP, Forecast
 from twin_worker.alerts.hysteresis import Finding, Ledger
 from twin_worker.alerts.traffic_picture import Board
 
-_EVERY_S = 1.0  # between judgements of one aircraft's pairs [s]
-_STALE_S = 10.0  # predictions older by more say nothing [s]
-_SLIGHT = 0.02  # probabilities below are not followed up [-]
-_KEPT = "separation from uav-{} is kept"
+_EVERY_S = 1.0  # between assessments of one aircraft's pairs [s]
+_STALE_S = 10.0  # maximum age of a prediction [s]
+_SLIGHT = 0.02  # lower probabilities are ignored [-]
+_KEPT = "no conflict with uav-{} predicted"
 
 
 @dataclass
 class Traffic:
-    """The predictions of all aircraft, and the conflicts of those that are held here."""
+    """Predictions of all aircraft, and conflicts of the owned aircraft."""
 
     separation: Separation = field(default_factory=Separation)
     board: Board = field(default_factory=Board)
     _ledgers: dict[int, Ledger] = field(default_factory=dict)
-    _judged: dict[int, float] = field(default_factory=dict)  # when, by UAV [s since 1970]
+    _judged: dict[int, float] = field(default_factory=dict)  # time of the last assessment, by UAV [s since 1970]
 
     def hear(self, made: Prediction) -> None:
-        """Keep the newest prediction of an aircraft, held here or not."""
+        """Store the newest prediction of any aircraft."""
         self.board.hear(made)
 
     def after(self, uav: int, now: float, results: list[Message]) -> list[Message]:
-        """Take what a held twin published up to data time `now`; return that, and what it means to its neighbours."""
+        """Process the results of an owned twin at data time `now`; return them and the conflict alerts that follow."""
         for result in results:
             if isinstance(result, Prediction):
                 self.hear(result)
         return [*results, *self.judge(uav, now)]
 
     def judge(self, uav: int, now: float) -> list[Alert]:
-        """Judge one held aircraft against all with a higher id, at most once a second of data time `now`."""
+        """Assess one owned aircraft against all with a higher id, at most once a second of data time `now`."""
         last = self._judged.get(uav, -inf)
         if last <= now < last + _EVERY_S or not isfinite(now):
             return []
@@ -50,20 +50,20 @@ class Traffic:
         return [alert for finding in found.values() for alert in ledger.judge(uav, now, finding)]
 
     def take(self, uav: int, conflicts: Ledger) -> None:
-        """Go on with what another worker found of an aircraft that is held here from now on."""
+        """Take over the alert state of a newly owned aircraft from another worker."""
         self._ledgers[uav] = conflicts
 
     def show(self, uav: int) -> Ledger:
-        """Return what was found of an aircraft."""
+        """Return the alert state of an aircraft."""
         return self._ledgers.get(uav) or Ledger()
 
     def forget(self, uav: int) -> None:
-        """Hold an aircraft no longer."""
+        """Delete the alert state of an aircraft that is no longer owned."""
         self._judged.pop(uav, None)
         self._ledgers.pop(uav, None)
 
     def active(self, uav: int) -> list[Alert]:
-        """Return the conflicts of one held aircraft that are in force."""
+        """Return the active conflict alerts of one owned aircraft."""
         return self._ledgers[uav].active if uav in self._ledgers else []
 
     def _meetings(self, uav: int, now: float) -> list[Finding]:

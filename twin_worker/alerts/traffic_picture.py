@@ -1,4 +1,4 @@
-"""The newest prediction of every aircraft, side by side, so that one judgement reads them all at once."""
+"""Newest predictions of all aircraft in common arrays, so that one call assesses all pairs."""
 
 from dataclasses import dataclass, field
 from math import inf
@@ -10,30 +10,30 @@ from fleet.frames import Origin, to_geodetic, to_ned
 from twin_worker.alerts.gaussian_forecast import LONGEST_S, STEP, Forecast, forecast
 
 _ROWS = int(LONGEST_S / STEP) + 1
-_MOST = 4_096  # aircraft on one board; more are a stranger's
-_NEWS_S = 2.0  # what follows the last that was heard sooner hardly says anything new: paths are flown minutes ahead [s]
-_FAR = np.array([1e4, 1e4, -1e4])  # corner whose image gives the scale from one NED frame to another [m]
+_MOST = 4_096  # maximum number of aircraft; a bound against hostile input
+_NEWS_S = 2.0  # minimum period between stored predictions of one aircraft; paths change little within it [s]
+_FAR = np.array([1e4, 1e4, -1e4])  # point whose image determines the scale from one NED frame to another [m]
 
 
 @dataclass
 class Board:
-    """Predictions in slots; a UAV keeps its slot, which is written anew when it is first judged after news."""
+    """Predictions in slots, one per UAV; a slot is rewritten at the first assessment after a new prediction."""
 
     _slots: dict[int, int] = field(default_factory=dict)  # slot by UAV id
-    _news: dict[int, Prediction] = field(default_factory=dict)  # heard, not yet laid
-    _heard: dict[int, float] = field(default_factory=dict)  # when the newest was made [s since 1970]
+    _news: dict[int, Prediction] = field(default_factory=dict)  # received, not yet in a slot
+    _heard: dict[int, float] = field(default_factory=dict)  # time of the newest prediction [s since 1970]
     _laid: list[Forecast | None] = field(default_factory=list)
     first: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     rows: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     path: np.ndarray = field(default_factory=lambda: np.zeros((0, _ROWS, 3)))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, _ROWS, 4)))
     uav: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    t: np.ndarray = field(default_factory=lambda: np.zeros(0))  # when it was made [s since 1970]
+    t: np.ndarray = field(default_factory=lambda: np.zeros(0))  # time of the prediction [s since 1970]
     origin: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [1e-7 deg, 1e-7 deg, mm]
-    corner: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # geodetic place of _FAR, the same units
+    corner: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # geodetic position of `_CORNER`, same units
 
     def hear(self, made: Prediction) -> None:
-        """Keep the newest prediction of each aircraft; safe to call from another thread."""
+        """Store the newest prediction of an aircraft; thread-safe."""
         last = self._heard.get(made.uav, -inf)
         if last < made.t < last + _NEWS_S:
             return
@@ -41,7 +41,7 @@ class Board:
             self._heard[made.uav], self._news[made.uav] = made.t, made
 
     def settle(self) -> None:
-        """Lay what was heard since into its slots; what cannot be judged empties its slot."""
+        """Write pending predictions to their slots; an invalid prediction empties its slot."""
         while self._news:
             uav, made = self._news.popitem()
             slot = self._slots.setdefault(uav, len(self._slots))
@@ -71,7 +71,7 @@ class Board:
             self.corner[slot] = to_geodetic(made.ned_origin(), _FAR)
 
     def of(self, uav: int) -> tuple[int, Forecast] | None:
-        """Return slot and prediction of one aircraft; None where it has none that can be judged."""
+        """Return slot and forecast of one aircraft; None without a valid prediction."""
         slot = self._slots.get(uav)
         found = None if slot is None else self._laid[slot]
         return None if slot is None or found is None else (slot, found)
@@ -83,9 +83,9 @@ class Board:
         return np.flatnonzero(near)
 
     def into(self, slot: int, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return scale and shift that take the others' NED to that of `slot`, (m, 3) each [-, m].
+        """Return scale and shift from the others' NED frames to that of `slot`, (m, 3) each [-, m].
 
-        Both are straight in latitude and longitude (`fleet.frames`), so the images of two places tell all.
+        Both frames are linear in latitude and longitude (`fleet.frames`), so two points determine the transform.
         """
         origin = Origin(*map(int, self.origin[slot]))
         shift = to_ned(origin, *self.origin[others].T)

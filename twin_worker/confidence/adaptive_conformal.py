@@ -1,12 +1,12 @@
-"""Adapt tube and horizon to one aircraft by what became of its own past predictions.
+"""Adapt tube and horizon to one aircraft by the scores of its own past predictions.
 
-The factor on a table's half-axes is a quantile of the aircraft's own scores, the table counting as a few more of
-them; its level moves up at each miss and down a little at each hit, within bounds. Short look-aheads are answered
-first: what they say in common moves the longer ones too.
+The factor on a table's half-axes is a quantile of the aircraft's own scores; the table counts as a few more scores.
+The quantile level rises at each miss and falls a little at each hit, within bounds. Short look-aheads are scored
+first; their common factor also scales the longer ones.
 
-No coverage is guaranteed. The long-run share of the source holds for levels without bounds whose region is infinite
-from level 1 on; a region that is published must be finite. So an aircraft whose errors outgrow all that was seen is
-covered less, which `Trust.sentence` says while a bound is met; `Prediction.held` publishes the measured share.
+Coverage is not guaranteed. The long-run coverage of the source requires unbounded levels and an infinite region from
+level 1 on, but a published region must be finite. An aircraft whose errors exceed all errors in the table is therefore
+covered less. `Confidence.sentence` reports a bound that is met; the measured coverage is published too.
 
 Source: Gibbs & Candes 2021, "Adaptive conformal inference under distribution shift", proposition 4.1.
 """
@@ -22,37 +22,37 @@ from twin_worker.confidence.prediction_log import EVERY_S, Ledger
 from twin_worker.confidence.weighted_quantile import censored_quantile, weighted_quantile
 from twin_worker.numerics.prediction_errors import AHEAD, QUANTILE
 
-_TABLE = 10.0  # independent predictions the table counts as [-]
-_FADES_S = 400.0  # scores fade with age [s]
-_SHARE = np.minimum(1.0, EVERY_S / (0.5 * KNOTS))  # independent predictions one counts as: overlapping ones agree [-]
-_SHARE_HORIZON = EVERY_S / 30.0  # the same for a first passage [-]
+_TABLE = 10.0  # independent predictions that the table counts as [-]
+_FADES_S = 400.0  # time constant of the weight of a score [s]
+_SHARE = np.minimum(1.0, EVERY_S / (0.5 * KNOTS))  # weight of a score; scores of overlapping predictions correlate [-]
+_SHARE_HORIZON = EVERY_S / 30.0  # weight of a first passage [-]
 _TUBE_STEP, _HORIZON_STEP = 0.05, 0.02  # of the level, per independent miss [-]
 _LEAST_LEVEL, _MOST_LEVEL = 0.5, 0.99
 _COLUMN_OF = np.full(len(AHEAD), -1)
 _COLUMN_OF[COLUMN] = np.arange(len(KNOTS))
 _LEAST_FACTOR, _MOST_FACTOR = 0.1, 20.0
-_exact = nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: as numpy does it
+_exact = nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: results equal numpy's
 
 
 @dataclass
 class Levels:
-    """Quantiles that the tube at each knot and the horizon of one group take now."""
+    """Present quantile levels of one group: of the tube at each knot, and of the horizon."""
 
     tube: np.ndarray = field(default_factory=lambda: np.full(len(KNOTS), QUANTILE))
     horizon: float = QUANTILE
 
     def learn(self, ledger: Ledger, r: np.ndarray, j: np.ndarray, mine: np.ndarray) -> None:
-        """Take new answers: rows and columns of the ledger, and which rows are of this group, bool."""
+        """Update the levels with new scores: rows and columns of the log, and which rows are of this group, bool."""
         _learn_tube(self.tube, ledger.score, r, j, mine)
         held, failed = _settle_claims(ledger.claimed, ledger.followed, ledger.horizon, ledger.passed, mine)
         moved = failed * QUANTILE - held * (1.0 - QUANTILE)
-        # never below: easy minutes, which hold whatever is claimed, must not pay for hard ones
+        # never below NOMINAL_COVERAGE: easy minutes, which meet any horizon, must not offset difficult ones
         self.horizon = min(max(self.horizon + _HORIZON_STEP * moved, QUANTILE), _MOST_LEVEL)
 
 
 @_exact
 def _learn_tube(level: np.ndarray, score: np.ndarray, r: np.ndarray, j: np.ndarray, mine: np.ndarray) -> None:
-    """Move the levels at the knots, (13,), by new answers of this group."""
+    """Update the levels at the knots, (13,), with new scores of this group."""
     for k in range(len(r)):
         knot, value = _COLUMN_OF[j[k]], score[r[k], j[k]]
         if mine[r[k]] and knot >= 0 and np.isfinite(value):
@@ -65,7 +65,7 @@ def _learn_tube(level: np.ndarray, score: np.ndarray, r: np.ndarray, j: np.ndarr
 def _settle_claims(
     claimed: np.ndarray, followed: np.ndarray, horizon: np.ndarray, passed: np.ndarray, mine: np.ndarray
 ) -> tuple[int, int]:
-    """Return how many horizons of this group have held and how many have failed since, and claim them no longer."""
+    """Count the horizons of this group that were met and missed since the last call, and close them."""
     held = failed = 0
     for r in range(len(claimed)):
         if mine[r] and claimed[r]:
@@ -77,13 +77,13 @@ def _settle_claims(
 
 @dataclass(frozen=True)
 class Factors:
-    """Factors in force for one group now.
+    """Present scale factors of one group.
 
     Attributes:
         tube: on the table's half-axes, by knot, (13,) [-]
-        horizon: on the largest half-axes, where the horizon is sought [-]
-        own: predictions of this aircraft behind them [-]
-        bounded: a level or factor of the tube stands at its upper bound: misses cannot widen the tube as they should
+        horizon: on the error ratio that determines the horizon [-]
+        own_count: number of this aircraft's predictions behind them [-]
+        bounded: a level or factor of the tube is at its upper bound, so further misses cannot widen the tube
     """
 
     tube: np.ndarray
@@ -97,7 +97,7 @@ class Factors:
 
 
 def factors(ledger: Ledger, group: str, table: Table, levels: Levels) -> Factors:
-    """Join the table with what the aircraft's own predictions of this group came to."""
+    """Compute scale factors from the table and the scores of the aircraft's own predictions of this group."""
     rows = np.flatnonzero(ledger.group == group)
     scores = ledger.score[np.ix_(rows, COLUMN)] * ledger.factor[rows]
     age = ledger.until - ledger.t0[rows]
@@ -112,14 +112,14 @@ def factors(ledger: Ledger, group: str, table: Table, levels: Levels) -> Factors
 
 
 def _join(atoms: np.ndarray, scores: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Return quantiles of the rows of scores (r, n), a table's atoms (20,) among them."""
+    """Return the quantiles of each row of scores (r, n) joined with a table's atoms (20,)."""
     r = len(scores)
     x = np.hstack([np.broadcast_to(atoms, (r, ATOMS)), scores])
     return weighted_quantile(x, np.hstack([np.full((r, ATOMS), _TABLE / ATOMS), weight]), level)
 
 
 def _horizon(ledger: Ledger, rows: np.ndarray, risks: np.ndarray, level: float) -> float:
-    """Return the factor that keeps the wanted share of first passages behind the horizon."""
+    """Return the factor at which a share `level` of first passages lies beyond the horizon."""
     followed, passed = ledger.followed[rows], ledger.passed[rows]
     x = critical(ledger.ratio[rows], followed)
     age = np.clip(ledger.until - ledger.t0[rows], 0.0, None)

@@ -1,7 +1,7 @@
-"""Calibration tables: how large errors were beside what was known of them before, by look-ahead, of one group.
+"""Calibration table of one group: error standard deviation and half-axes by look-ahead, from uncertainty features.
 
-By axis sigma^2 = scale^2 s^2 + lag^2 r^2 + floor^2, of the spread s of an ensemble and the revision r. Half-axes are
-factor sigma: each axis misses as often as another, and `QUANTILE` of the flights lie within all three at once.
+By axis sigma^2 = scale^2 s^2 + lag^2 r^2 + floor^2, with the ensemble spread s and the forecast revision r. Half-axes
+are factor sigma: all axes have the same coverage, and `NOMINAL_COVERAGE` of the flights lie within all three at once.
 """
 
 from dataclasses import dataclass, field
@@ -13,12 +13,12 @@ from scipy.special import erfinv
 from twin_worker.numerics.interpolation import straight
 from twin_worker.numerics.prediction_errors import AHEAD, QUANTILE
 
-KNOTS = np.array([1.0, 2, 3, 5, 8, 12, 18, 27, 40, 60, 80, 120, 180])  # look-aheads that tables are written at [s]
+KNOTS = np.array([1.0, 2, 3, 5, 8, 12, 18, 27, 40, 60, 80, 120, 180])  # look-aheads of the table rows [s]
 COLUMN = np.searchsorted(AHEAD, KNOTS)  # of each in AHEAD
-ATOMS = 20  # values a distribution is written as, in the middles of as many equal shares
+ATOMS = 20  # quantiles that represent a distribution, at the midpoints of equal shares
 LEVELS = (np.arange(ATOMS) + 0.5) / ATOMS
-INDEPENDENT = QUANTILE ** (1 / 3)  # share that each axis alone holds where errors of the axes are independent [-]
-_LAW = {  # expected spread of along, cross, vertical: base [m], growth [m/s^power], power
+INDEPENDENT = QUANTILE ** (1 / 3)  # coverage of each axis where errors of the axes are independent [-]
+_LAW = {  # default spread along, cross, vertical: base [m], growth [m/s^power], power
     "dynamics": ((0.3, 0.3, 0.3), (0.4, 0.15, 0.15), 1.2),
     "hybrid": ((0.3, 0.3, 0.3), (0.4, 0.15, 0.15), 1.2),
     "both": ((0.3, 0.3, 0.3), (0.4, 0.15, 0.15), 1.2),
@@ -27,25 +27,25 @@ _LAW = {  # expected spread of along, cross, vertical: base [m], growth [m/s^pow
     "greybox": ((0.5, 0.4, 0.4), (0.5, 0.3, 0.2), 1.3),
     "imm": ((1.0, 1.0, 0.5), (1.6, 1.6, 0.5), 1.4),
 }
-_SOON_S = 10.0  # how far predictions just before missed says little of less than this [s]
-_MOST_M = 1e6  # spreads beyond are noise [m]
+_SOON_S = 10.0  # the forecast revision is not informative below about this look-ahead [s]
+_MOST_M = 1e6  # larger spreads are invalid [m]
 
 
 @dataclass(frozen=True)
 class Table:
-    """What past flights of one group taught.
+    """Calibration of one group, fitted to past flights.
 
     Attributes:
-        group: method/law/airframe/parameters, `*` for any; the method alone where no flight taught anything
-        starts, flights: predictions and flights behind it
-        scale: share of the ensemble's spread, by knot and axis, (13, 3) [-]
-        lag: share of the departure from predictions made just before, (13, 3) [-]
-        floor: what neither knows of, (13, 3) [m]
+        group: method/law/airframe/parameters, `*` for any; the method alone for a default table
+        starts, flights: number of predictions and flights it was fitted to
+        scale: coefficient of the ensemble spread, by knot and axis, (13, 3) [-]
+        lag: coefficient of the forecast revision, (13, 3) [-]
+        floor: constant part of sigma, (13, 3) [m]
         factor: from sigma to half-axes, (13, 3) [-]
         scores: largest error over its half-axis, `ATOMS` quantiles [-]
         risks: critical factors of the horizon, `ATOMS` quantiles [-]
-        held_out: what it did on flights left out of it, by name
-        alone: share of the errors that the half-axis of each axis alone holds, `QUANTILE` to its cube root [-]
+        held_out: performance on held-out flights, by name
+        alone: coverage of each half-axis by itself, `NOMINAL_COVERAGE` to its cube root [-]
     """
 
     group: str
@@ -61,12 +61,12 @@ class Table:
     alone: float = INDEPENDENT
 
     def sigma(self, doubt: "Doubt", ahead: np.ndarray) -> np.ndarray:
-        """Return what errors to expect, growing beyond the last knot, (..., n, 3) [m]."""
+        """Return the expected error standard deviation, extrapolated beyond the last knot, (..., n, 3) [m]."""
         scale, lag, floor, _ = self._curves(ahead)
         return np.sqrt((scale * doubt.spread) ** 2 + (lag * doubt.revision) ** 2 + floor**2)
 
     def half_axes(self, doubt: "Doubt", ahead: np.ndarray) -> np.ndarray:
-        """Return the half-axes that held `QUANTILE` of these flights in each look-ahead, (..., n, 3) [m]."""
+        """Return the half-axes of coverage `NOMINAL_COVERAGE` at each look-ahead, (..., n, 3) [m]."""
         return self._curves(ahead)[3] * self.sigma(doubt, ahead)
 
     def _curves(self, ahead: np.ndarray) -> np.ndarray:
@@ -86,11 +86,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Doubt:
-    """What is known of the error of predictions before it happens.
+    """Features of a prediction that predict its error.
 
     Attributes:
-        spread: of an ensemble along, cross, vertical, the law of growth where there was none, (..., n, 3) [m]
-        revision: departure from the predictions made just before, the spread where there were none, (..., n, 3) [m]
+        spread: ensemble spread along, cross, vertical; `error_growth` without an ensemble, (..., n, 3) [m]
+        revision: departure from the predictions made just before; the spread without any, (..., n, 3) [m]
     """
 
     spread: np.ndarray
@@ -98,18 +98,18 @@ class Doubt:
 
 
 def at_look_aheads(ahead: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Interpolate what is written by knot and axis, (13, 3), at look-aheads, (n, 3)."""
+    """Interpolate table rows by knot and axis, (13, 3), at look-aheads, (n, 3)."""
     return straight(ahead, KNOTS, rows)
 
 
 def law_of_growth(method: str, ahead: np.ndarray) -> np.ndarray:
-    """Return the spread a method stands in for where no ensemble says any, (n, 3) [m]; a guess, before any flight."""
+    """Return the default spread of a method without an ensemble, (n, 3) [m]; not calibrated."""
     base, growth, power = _LAW.get(method, _LAW["greybox"])
     return np.hypot(base, np.outer(np.maximum(ahead, 0.0) ** power, growth))
 
 
 def doubt_of(spread: np.ndarray | None, revision: np.ndarray | None, method: str, ahead: np.ndarray) -> Doubt:
-    """Return the doubt (..., n, 3) of a prediction, by the law of growth where an ensemble gave none or nonsense."""
+    """Return the features of a prediction, with `error_growth` where the spread is absent or invalid."""
     whole = _filled(spread, law_of_growth(method, ahead))
     return Doubt(whole, _filled(revision, whole))
 
@@ -122,7 +122,7 @@ def _filled(values: np.ndarray | None, otherwise: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def untaught(method: str) -> Table:
-    """Return the table of a method no flight has taught anything: never narrower than its law of growth."""
+    """Return the table of a method without calibration flights: never narrower than `error_growth`."""
     law = law_of_growth(method, KNOTS)
     shape = np.sqrt(2.0) * erfinv(np.cbrt(LEVELS))  # the largest of three normal errors
     shape = shape / np.interp(QUANTILE, LEVELS, shape)

@@ -1,17 +1,17 @@
-"""Groups of predictions that share a calibration table: method / law / airframe / parameters, and wider ones."""
+"""Groups of predictions that share a calibration table: method / law / airframe / parameters, and parent groups."""
 
 ANY = "*"
-_WAYS = dict.fromkeys(("hybrid", "both", "dynamics"), "route")  # chosen among in flight; one ensemble tells their doubt
-_FAST = 40.0  # usual speed from which a winged aircraft is no small one; a tailwind is no other aircraft [m/s]
+_WAYS = dict.fromkeys(("hybrid", "both", "dynamics"), "route")  # selected in flight; they share one ensemble
+_FAST = 40.0  # usual speed above which a fixed wing forms a class of its own; well above small ones in tailwind [m/s]
 
 
 def group_of(method: str, law: str, airframe: str, parameters: str) -> str:
-    """Name the group of a prediction, e.g. hybrid/arduplane/fixed_wing/known.
+    """Return the group name of a prediction, e.g. hybrid/arduplane/fixed_wing/known.
 
     Args:
         method: as in `Prediction`
-        law: controller twin, e.g. arduplane: L1 + TECS; what is before the colon counts
-        airframe: class of aircraft, as `airframe_class` gives it
+        law: controller twin, e.g. arduplane: L1 + TECS; only the part before the colon is used
+        airframe: class of aircraft, from `airframe_class`
         parameters: known, identified or absent
     """
     parts = (method, law.partition(":")[0], airframe, parameters)
@@ -19,14 +19,14 @@ def group_of(method: str, law: str, airframe: str, parameters: str) -> str:
 
 
 def airframe_class(vehicle: str, speed: float) -> str:
-    """Name the class of an aircraft by its kind and usual speed [m/s]: fixed_wing, fixed_wing_fast, multirotor …."""
+    """Return the class of an aircraft by vehicle type and usual speed [m/s], e.g. fixed_wing_fast."""
     return f"{vehicle}_fast" if vehicle == "fixed_wing" and speed > _FAST else vehicle
 
 
 def wider(group: str) -> tuple[str, ...]:
-    """Return a group and those it belongs to, narrowest first: any of its ways, any airframe, any parameters, any law.
+    """Return a group and its parent groups, narrowest first: any method of its family, airframe, parameters, law.
 
-    Parameters matter more than the airframe, and the law more than either.
+    The airframe is dropped first and the law last: they affect errors least and most.
     """
     method, *rest = [*group.split("/"), *[ANY] * 4][:4]
     way = [_WAYS.get(method, method), *rest]
@@ -36,5 +36,5 @@ def wider(group: str) -> tuple[str, ...]:
 
 
 def setting(group: str) -> str:
-    """Return what a group says besides the method: law / airframe / parameters."""
+    """Return the group name without the method: law / airframe / parameters."""
     return group.partition("/")[2]

@@ -1,4 +1,4 @@
-"""What the flight answers of predictions, look-ahead by look-ahead."""
+"""Compiled scoring of predictions against the flight, look-ahead by look-ahead."""
 
 from math import sqrt
 from typing import NamedTuple
@@ -8,12 +8,12 @@ import numpy as np
 
 from twin_worker.numerics.prediction_errors import AHEAD, LIMIT
 
-_GAP_S = 2.5  # positions farther apart than this are a hole [s]
+_GAP_S = 2.5  # positions farther apart than this are a telemetry gap [s]
 _exact = nb.njit(cache=True, error_model="numpy", nogil=True)  # no fastmath: as numpy does it
 
 
 class Said(NamedTuple):
-    """What predictions said, one row each, as `Ledger` keeps it."""
+    """Arrays of `PredictionLog` that describe the predictions, one row each."""
 
     t0: np.ndarray
     size: np.ndarray
@@ -24,7 +24,7 @@ class Said(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What is known of them by now, changed in place, as `Ledger` keeps it."""
+    """Arrays of `PredictionLog` that describe the scores so far, changed in place."""
 
     score: np.ndarray
     next: np.ndarray
@@ -38,7 +38,7 @@ class Known(NamedTuple):
 
 @_exact
 def _before(at: float, t: np.ndarray) -> int:
-    """Return the row before `at`, at least the first, at most the last but one."""
+    """Return the row before an instant, at least the first, at most the last but one."""
     k: int = np.searchsorted(t, at)  # type: ignore[assignment]
     return max(min(k, len(t) - 1) - 1, 0)
 
@@ -53,7 +53,7 @@ def _between(at: float, t0: float, t1: float, x0: float, x1: float) -> float:
 
 @_exact
 def _run(at: float, odometer: np.ndarray) -> float:
-    """Return the length flown until `at` [m]."""
+    """Return the path length flown until an instant [m]."""
     k = _before(at, odometer[:, 0])
     (t0, x0), (t1, x1) = odometer[k], odometer[min(k + 1, len(odometer) - 1)]
     return _between(at, t0, t1, x0, x1)
@@ -61,7 +61,7 @@ def _run(at: float, odometer: np.ndarray) -> float:
 
 @_exact
 def _watch(r: int, j: int, relative: float, known: Known) -> None:
-    """See whether a prediction that is still watched has passed 10 % at a look-ahead."""
+    """Update the first passage of an uncensored prediction at one look-ahead."""
     before, last = known.before[r], AHEAD[max(j - 1, 0)]
     known.followed[r] = AHEAD[j]
     if relative > LIMIT:
@@ -73,12 +73,12 @@ def _watch(r: int, j: int, relative: float, known: Known) -> None:
 
 @_exact
 def answer_each(said: Said, known: Known, happened: tuple, answered: np.ndarray) -> int:
-    """Enter what has been flown of every prediction that is followed.
+    """Score the look-aheads that have been flown, of every open prediction.
 
     Args:
-        said, known: a row each
-        happened: times, rising, (n,) [s since 1970], positions, NED, (n, 3) [m], and times and lengths flown, (m, 2)
-        answered: rows and columns that were answered, holes among them, filled in, (k, 2)
+        predictions, state: one row each
+        flight: times, rising, (n,) [s since 1970], positions, NED, (n, 3) [m], and times and path lengths, (m, 2)
+        evaluated: rows and columns that were evaluated, those in telemetry gaps included, filled in, (k, 2)
     Returns:
         how many
     """
@@ -117,12 +117,13 @@ def answer_each(said: Said, known: Known, happened: tuple, answered: np.ndarray)
 
 @_exact
 def run_on(at: np.ndarray, points: np.ndarray, begin: np.ndarray, before: float, out: np.ndarray) -> None:
-    """Fill in times and lengths flown until then, (n, 2) [s since 1970, m].
+    """Compute the path length flown until each time, (n, 2) [s since 1970, m].
 
     Args:
-        at, points: times and positions, NED, (n,) and (n, 3) [s since 1970, m]
-        begin: where the first stride begins, (3,) [m]
-        before: length flown until there [m]
+        t, points: times and positions, NED, (n,) and (n, 3) [s since 1970, m]
+        start: position at which the first interval begins, (3,) [m]
+        start_length: path length flown until there [m]
+        out: times and path lengths, filled in
     """
     run, north, east, down = 0.0, begin[0], begin[1], begin[2]
     for k in range(len(at)):

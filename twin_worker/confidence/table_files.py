@@ -1,4 +1,4 @@
-"""Calibration tables on disk: JSON with the flights they came from, the date and the command that made them."""
+"""Calibration tables on disk: JSON with source flights, date and command."""
 
 import re
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from twin_worker.confidence.groups import wider
 from twin_worker.numerics.prediction_errors import QUANTILE
 
 FORMAT = 1
-GUESSED = "not calibrated"  # how the sentence of a prediction begins whose tube no flight has taught
+GUESSED = "not calibrated"  # begins the sentence of a prediction without a calibrated table
 _HERE = Path(__file__).parent
-_INNERMOST = re.compile(r"\[[^\[\]{}]*\]")  # lists of numbers: one a line
-_ALONE = 0.94  # `Table.alone` where a file does not tell it; measured: 0.96 to 30 s, 0.94 to 60 s, 0.91 to 120 s
-_MOST = 1e6  # numbers beyond are no calibration
+_INNERMOST = re.compile(r"\[[^\[\]{}]*\]")  # innermost lists: one per line
+_ALONE = 0.94  # default of `CalibrationTable.alone`; measured: 0.96 to 30 s, 0.94 to 60 s, 0.91 to 120 s
+_MOST = 1e6  # larger numbers are invalid
 
 
 class Source(msgspec.Struct, frozen=True):
@@ -30,7 +30,7 @@ class Source(msgspec.Struct, frozen=True):
 
 
 class Row(msgspec.Struct, frozen=True):
-    """One table as it is written; scale, lag, floor and factor by axis, then knot."""
+    """One table as stored; scale, lag, floor and factor by axis, then knot."""
 
     group: str
     starts: int
@@ -58,19 +58,19 @@ class Sheet(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Tables:
-    """All tables there are, by group, and what is wrong with the files."""
+    """All tables by group, and the errors of the files."""
 
     by_group: dict[str, Table]
     sentence: str = ""
 
     def choose(self, group: str) -> tuple[Table, str]:
-        """Return the narrowest table for a group, and which it is in words."""
+        """Return the narrowest table for a group, and a description of it."""
         method = group.partition("/")[0]
         for name in wider(group):
             if (table := self.by_group.get(name)) is not None:
                 own = "" if name == group else f", none for {group}"
                 return table, f"calibrated on {table.starts} predictions of {table.flights} flights ({name}{own})"
-        said = f"{GUESSED}: no table for {group}, a guess for {method} stands in"
+        said = f"{GUESSED}: no table for {group}, the default for {method} is used"
         return untaught(method), " ".join(filter(None, (said, self.sentence)))
 
 
@@ -78,7 +78,7 @@ def read_tables(path: Path) -> Tables:
     """Read a file of tables.
 
     Raises:
-        ValueError: when it is none; the sentence says what to do.
+        ValueError: when it is invalid; the message names the remedy.
     """
     try:
         sheet = msgspec.json.decode(path.read_bytes(), type=Sheet)
@@ -116,7 +116,7 @@ def _table(file: str, row: Row) -> Table:
 
 @lru_cache(maxsize=8)
 def load(folder: Path = _HERE) -> Tables:
-    """Read every file of tables in a folder; a later name overrides, a broken one is told and left out."""
+    """Read every file of tables in a folder; later names override, invalid files are skipped and reported."""
     found: dict[str, Table] = {}
     said = []
     for path in sorted(folder.glob("*.json")):
@@ -128,7 +128,7 @@ def load(folder: Path = _HERE) -> Tables:
 
 
 def write(path: Path, tables: Sequence[Table], sources: Sequence[Source], made: str, command: str) -> None:
-    """Write tables with where they come from."""
+    """Write tables with their sources."""
     sheet = Sheet(FORMAT, made, command, tuple(sources), KNOTS.tolist(), tuple(map(_row, tables)))
     text = msgspec.json.format(msgspec.json.encode(sheet), indent=1).decode()
     path.write_text(_INNERMOST.sub(lambda found: " ".join(found[0].split()), text) + "\n")

@@ -1,8 +1,8 @@
-"""How far a prediction may be trusted: tube and horizon from calibration tables and this aircraft's own past.
+"""Prediction region (tube) and confidence horizon from calibration tables and the aircraft's own past predictions.
 
-Covered means: at its look-ahead, the position lies within all three half-axes, along, cross and vertical, of the
-predicted track. That box is never wider than the ellipsoid that holds as many. A look-ahead is answered as soon as
-it has been flown; what was followed for a while without passing 10 % counts as that.
+A position is covered if it lies within all three half-axes (along, cross, vertical) of the predicted track at its
+look-ahead. This box is never wider than the ellipsoid of the same coverage. A look-ahead is scored as soon as it has
+been flown. A prediction that ends before it exceeds 10 % is a censored observation.
 
 M1, the relative error: |p_hat - p| / max(path flown, 2 s of ground speed).
 """
@@ -42,18 +42,18 @@ __all__ = [
     "path_length",
     "track_frame",
 ]
-_GROUPS = 8  # groups whose levels are remembered
-_ENDED = 60  # passages remembered per method
+_GROUPS = 8  # groups whose levels are stored
+_ENDED = 60  # passages stored per method
 _RENEWED_EVERY_S = (
-    5.38  # between continued rollouts that are scored: no multiple of usual periods, so all ages come [s]
+    5.38  # between extrapolated rollouts that are scored: no multiple of usual periods, so all ages occur [s]
 )
-_RENEWED_ROWS, _RENEWED_S = 48, 60.0  # of them remembered, and how far ahead they are scored [s]
-_RIPE_S = 60.0  # predictions younger say nothing about medians yet: the early failures come first [s]
+_RENEWED_ROWS, _RENEWED_S = 48, 60.0  # extrapolated rollouts stored, longest look-ahead that is scored [s]
+_RIPE_S = 60.0  # younger predictions would bias the median: early failures are observed first [s]
 
 
 @dataclass(frozen=True)
 class Made:
-    """A prediction, before anything is said about trust.
+    """A prediction without prediction region and horizon.
 
     Attributes:
         t: look-ahead 0 [s since 1970]
@@ -61,7 +61,7 @@ class Made:
         ahead: look-ahead of each point, (n,) [s]
         path: NED, (n, 3) [m]
         speed: over ground at t, climb included [m/s]
-        spread: standard deviation of an ensemble along, cross, vertical, (n, 3) [m]; None without one
+        spread: standard deviation of an ensemble along, cross, vertical, (n, 3) [m]; None without an ensemble
     """
 
     t: float
@@ -75,16 +75,16 @@ class Made:
 
 @dataclass(frozen=True)
 class Trust:
-    """How far a prediction may be trusted.
+    """Prediction region and confidence horizon of a prediction.
 
     Attributes:
         tube: half-axes along, cross, vertical, (n, 3) [m]
         horizon_s: confidence horizon, from look-ahead 0 [s]
-        horizon_open: still below 10 % at the last look-ahead
-        sentence: which table it rests on, and how many of the aircraft's own predictions
-        factor: how much wider than the table the tube is, by knot, (13,) [-]
-        ratio: what the horizon was sought in, (n,) [-]
-        alone: share of the errors that each half-axis alone holds [-]
+        horizon_open: the horizon is not reached at the last look-ahead
+        sentence: calibration table used, and number of own predictions behind the adaptation
+        factor: half-axes of the tube over those of the table, by knot, (13,) [-]
+        ratio: running maximum of half-axes over predicted path length, (n,) [-]
+        axis_quantile: coverage of each half-axis by itself [-]
     """
 
     tube: np.ndarray
@@ -98,7 +98,7 @@ class Trust:
 
 @dataclass
 class Record:
-    """Past predictions of one aircraft and what came of them."""
+    """Past predictions of one aircraft and their scores."""
 
     tables: Tables = field(default_factory=load)
     passages: dict[str, deque[tuple[float, bool]]] = field(default_factory=dict)  # ended: time to 10 % [s], censored
@@ -108,11 +108,11 @@ class Record:
     _earlier: Earlier = field(default_factory=Earlier)
     _levels: dict[str, Levels] = field(default_factory=dict)
     _joined: tuple[tuple[str, float], Factors] | None = None
-    _renewed: Ledger | None = None  # continued rollouts; none before the first
-    _renewed_due: float = -np.inf  # the next of them is remembered from then on [s since 1970]
+    _renewed: Ledger | None = None  # extrapolated rollouts; None before the first
+    _renewed_due: float = -np.inf  # earliest time of the next one [s since 1970]
 
     def trust(self, made: Made) -> Trust:
-        """Wrap a prediction in its tube and say up to when it stays within 10 %."""
+        """Compute the tube of a prediction and the horizon up to which it stays within 10 %."""
         table, said = self.tables.choose(made.group)
         now = self._factors(made.group, table)
         revision = self._earlier.revised(made.t, made.ahead, made.path)
@@ -120,13 +120,13 @@ class Record:
         length = path_length(made.path, made.speed, made.speed * float(made.ahead[0]))
         ratio = growth(half_axes, length)
         horizon, open_end = first_passage(now.horizon * ratio, made.ahead)
-        own = f", adapted by {now.own} of its own" if now.own else ""
-        own += "; at the bound of adaptation: the tube may hold fewer than it is meant to" if now.bounded else ""
+        own = f", adapted to {now.own} own predictions" if now.own else ""
+        own += "; adaptation is at its bound: coverage may be below the target" if now.bounded else ""
         tube = now.at(made.ahead)[:, None] * half_axes
         return Trust(tube, horizon, open_end, said + own, now.tube, ratio, table.alone)
 
     def _factors(self, group: str, table: Table) -> Factors:
-        """Return the factors in force, reckoned anew for every prediction that was kept."""
+        """Return the scale factors, recomputed after every prediction that was added."""
         key = group, self._ledger.newest
         if self._joined is None or self._joined[0] != key:
             levels = self._levels.get(group) or Levels()
@@ -134,16 +134,19 @@ class Record:
         return self._joined[1]
 
     def keep(self, made: Made, trust: Trust) -> None:
-        """Remember a prediction for scoring, at most one every few seconds.
+        """Store a prediction for scoring, at most one every few seconds.
 
         Raises:
-            ValueError: when its look-aheads are not the first of `AHEAD`; cut or sample it so.
+            ValueError: when its look-aheads are not the first n of `AHEAD`; resample it.
         """
         self.latest = made, trust
         n = len(made.ahead)
         if not np.array_equal(made.ahead, AHEAD[:n]):
-            raise ValueError(f"record: found {n} look-aheads up to {made.ahead[-1]:g} s, expected the first of AHEAD")
-        if made.t < self._ledger.newest:  # the clock was set back: nothing of before can be answered
+            raise ValueError(
+                f"prediction: found {n} look-aheads up to {made.ahead[-1]:g} s, expected the first {n} of AHEAD; "
+                "resample it"
+            )
+        if made.t < self._ledger.newest:  # the clock was set back: earlier predictions cannot be scored
             self.forget()
             self._ledger, self._renewed = Ledger(), None
         if made.t - self._ledger.newest < EVERY_S or n < 2:
@@ -155,12 +158,12 @@ class Record:
         book.ratio[r], book.ratio[r, :n] = trust.ratio[-1], trust.ratio
 
     def keep_renewed(self, t: float, method: str, path: np.ndarray, tube: np.ndarray) -> None:
-        """Remember a continued rollout for scoring, at most one every few seconds; it adapts nothing.
+        """Store an extrapolated rollout for scoring, at most one every few seconds; it does not affect adaptation.
 
         Args:
             t: look-ahead 0 [s since 1970]
             method: as in `Prediction`
-            path, tube: NED and half-axes over the first n of `AHEAD`, (n, 3) [m]
+            path, tube: NED positions and half-axes over the first n of `AHEAD`, (n, 3) [m]
         """
         if self._renewed is None or t < self._renewed.newest:
             self._renewed, self._renewed_due = Ledger(_RENEWED_ROWS, int(AHEAD.searchsorted(_RENEWED_S)) + 1), t
@@ -173,10 +176,10 @@ class Record:
         book.tube[r, :n] = tube[:n]
 
     def forget(self, *, moved: bool = False) -> None:
-        """Follow no prediction beyond now: an event (mode, mission, clock) has made them meaningless.
+        """Censor every open prediction: an event (mode, mission, clock) has invalidated them.
 
         Args:
-            moved: the origin of the local frame is another from now on
+            frame_changed: the origin of the local frame has changed
         """
         self._enter(self._ledger.end())
         for book in filter(None, (self._ledger, self._renewed)):
@@ -186,13 +189,13 @@ class Record:
         self._earlier.clear()
 
     def answer(self, t: np.ndarray, flown: np.ndarray) -> int:
-        """Answer every look-ahead that has been flown by now.
+        """Score every look-ahead that has been flown.
 
         Args:
-            t: times of the flown path, rising, from before `answered` on, (n,) [s since 1970]
-            flown: positions in the twin's NED frame, (n, 3) [m]
+            t: times of the flown path, rising, from before `evaluated_until` on, (n,) [s since 1970]
+            positions: flown positions in the twin's NED frame, (n, 3) [m]
         Returns:
-            how many predictions came to their end
+            number of predictions that ended
         """
         if len(t) < 2:
             return 0
@@ -209,7 +212,7 @@ class Record:
         return len(ended)
 
     def _enter(self, rows: np.ndarray) -> None:
-        """Enter what became of predictions that have ended."""
+        """Store the first passages of predictions that have ended."""
         for r in rows:
             method = self._ledger.method[r]
             self.scored[method] = self.scored.get(method, 0) + 1
@@ -218,34 +221,35 @@ class Record:
 
     @property
     def answered(self) -> float:
-        """Give up to when predictions have been answered [s since 1970]."""
+        """Return the time up to which predictions have been scored [s since 1970]."""
         return self._ledger.until
 
     @property
     def waits(self) -> bool:
-        """Return whether any prediction waits for answers."""
+        """Return whether any prediction is not yet fully scored."""
         return bool(self._ledger.live.any()) or (self._renewed is not None and bool(self._renewed.live.any()))
 
     @property
     def waiting(self) -> tuple[float, ...]:
-        """Return when the predictions that wait for answers were made [s since 1970]."""
+        """Return the start times of the predictions that are not yet fully scored [s since 1970]."""
         return tuple(self._ledger.t0[self._ledger.live].tolist())
 
     @property
     def held(self) -> tuple[float, int]:
-        """Return measured share of look-aheads inside the tube so far (nan before any) and the predictions behind."""
+        """Return the empirical coverage (nan before any score) and the number of predictions behind it."""
         return self._ledger.coverage
 
     @property
     def coverage_renewed(self) -> tuple[float | None, int]:
-        """Return the same of continued rollouts alone; None before any."""
+        """Return the empirical coverage of extrapolated rollouts (None before any score) and their number."""
         share, n = self._renewed.coverage if self._renewed is not None else (0.0, 0)
         return (share if n else None), n
 
     def t10(self, method: str) -> tuple[float | None, float | None, int]:
-        """Return the median first passage of 10 % [s], the share still within, and how many predictions that is.
+        """Return the median first passage of 10 % [s], the censored share, and the number of predictions.
 
-        Those still flown count by how long they have stayed within; the median of what never passed is the longest.
+        Open predictions count as censored at their present age. Where fewer than half have passed, the median is the
+        longest time that any prediction was followed.
         """
         book = self._ledger
         ripe = book.live & (book.method == method) & (book.t0 <= book.until - _RIPE_S)

@@ -1,4 +1,4 @@
-"""Quantiles of weighted scores, some of them known only from above.
+"""Quantiles of weighted scores, some of them left-censored (known only by an upper bound).
 
 Source: Tibshirani et al. 2019, "Conformal prediction under covariate shift" (weights); Kaplan & Meier 1958.
 """
@@ -9,10 +9,10 @@ import numpy as np
 
 
 def weighted_quantile(x: np.ndarray, weight: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Return a quantile of each row, interpolated between the middles of the weights.
+    """Return a quantile of each row, interpolated between the midpoints of the cumulative weights.
 
     Args:
-        x: values, (r, n); those of no weight may be anything
+        x: values, (r, n); values of zero weight are ignored
         weight: not negative, (r, n)
         level: wanted quantiles, (r,) 0..1
     Returns:
@@ -22,7 +22,7 @@ def weighted_quantile(x: np.ndarray, weight: np.ndarray, level: np.ndarray) -> n
     x, weight = np.take_along_axis(x, order, 1), np.take_along_axis(weight, order, 1)
     total = np.cumsum(weight, axis=1)
     place = (total - 0.5 * weight) / total[:, -1:]
-    n = np.maximum((weight > 0).sum(axis=1), 1)  # the weightless stand behind
+    n = np.maximum((weight > 0).sum(axis=1), 1)  # values of zero weight are sorted last
     right = np.clip((place < level[:, None]).sum(axis=1), 1, np.maximum(n - 1, 1))
     left, row = np.minimum(right - 1, n - 1), np.arange(len(x))
     right = np.minimum(right, n - 1)
@@ -32,18 +32,18 @@ def weighted_quantile(x: np.ndarray, weight: np.ndarray, level: np.ndarray) -> n
 
 
 def masses(x: np.ndarray, weight: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """Return each exact value its share of all the weight, where others are only known to lie below theirs.
+    """Return the probability mass of each exact value; the others are upper bounds (left-censored).
 
-    Kaplan-Meier from above: the weight of a bound goes to what lies below it.
+    Kaplan-Meier estimator from above: the weight of a bound is distributed over the values below it.
 
     Args:
-        x: values, or bounds from above, (n,)
+        x: values, or upper bounds, (n,)
         weight: not negative, (n,)
         exact: whether each is a value, (n,) bool
     Returns:
-        masses, 0 for bounds, (n,); they may add up to less than one: what is left lies below every value
+        masses, 0 for bounds, (n,); if their sum is below one, the rest lies below every value
     """
-    order = np.lexsort((~exact, -x))  # from the top, a value before a bound of the same size
+    order = np.lexsort((~exact, -x))  # descending, a value before a bound of the same size
     w, d = weight[order], exact[order]
     at_risk = np.cumsum(w[::-1])[::-1]
     stays = 1.0 - np.divide(w * d, at_risk, out=np.zeros(len(w)), where=at_risk > 0)
@@ -54,14 +54,14 @@ def masses(x: np.ndarray, weight: np.ndarray, exact: np.ndarray) -> np.ndarray:
 
 
 def censored_quantile(x: np.ndarray, weight: np.ndarray, exact: np.ndarray, level: float) -> float:
-    """Return a quantile of values of which some are only bounded from above; 0 where it lies below every value."""
+    """Return a quantile of left-censored values; 0 where the quantile lies below every value."""
     mass = masses(x, weight, exact)
     nothing = max(1.0 - float(mass.sum()), 0.0)
     x, mass = np.append(x, 0.0), np.append(mass, nothing)
     return float(weighted_quantile(x[None], mass[None], np.array([level]))[0])
 
 
-Passages = Sequence[tuple[float, bool]]  # time to 10 % [s], or how long it was followed without; whether the latter
+Passages = Sequence[tuple[float, bool]]  # first passage of 10 % or censoring time [s], whether it is censored
 
 
 def _survival(passages: Passages) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +73,7 @@ def _survival(passages: Passages) -> tuple[np.ndarray, np.ndarray]:
 
 
 def survival(passages: Passages, t: float) -> float:
-    """Return the share of predictions still within 10 % at `t` [s]; nan of none."""
+    """Return the share of predictions still within 10 % at `t` [s]; nan without predictions."""
     if not passages:
         return float("nan")
     times, share = _survival(passages)
@@ -82,7 +82,7 @@ def survival(passages: Passages, t: float) -> float:
 
 
 def median_passage(passages: Passages) -> float:
-    """Return the time at which half have passed 10 % [s]; where fewer ever do, the longest any was followed."""
+    """Return the time at which half have exceeded 10 % [s]; the longest follow-up time where fewer did."""
     times, share = _survival(passages)
     half = np.flatnonzero(share <= 0.5)
     return float(times[half[0]] if len(half) else times[-1])

@@ -1,4 +1,4 @@
-"""`python -m twin_worker.evaluation FILE…`: what `fleet assess` starts."""
+"""`python -m twin_worker.evaluation FILE…`: the process that `fleet assess` starts."""
 
 import argparse
 import json
@@ -17,7 +17,7 @@ from twin_worker.evaluation.scoring.summary import summary
 from twin_worker.evaluation.share import Found, assess
 from twin_worker.evaluation.table import table
 
-_WIDE = 150  # columns of the table where the output is no terminal
+_WIDE = 150  # columns of the table where the output is not a terminal
 
 
 def _say(line: str) -> None:
@@ -27,7 +27,7 @@ def _say(line: str) -> None:
 def _run(args: argparse.Namespace) -> int:
     check(args)
     _say("compiling the twin's physics, once")
-    from twin_worker.service.warm_up import warm_up  # numba is slow to import: say what happens first
+    from twin_worker.service.warm_up import warm_up  # numba is slow to import: report first
 
     warm_up()
     plan = Plan(args.every, args.method, chosen(args.methods), args.without_params)
@@ -69,7 +69,7 @@ def _draw(folder: Path, cases: list[Case]) -> None:
         if its:
             keep(folder / f"{name}.npz", its)
             made.append(folder / f"{name}.npz")
-    _say(f"wrote {', '.join(path.name for path in made) or 'nothing: no start counts'} in {folder}")
+    _say(f"wrote {', '.join(path.name for path in made) or 'nothing: every start is excluded'} in {folder}")
 
 
 def main(argv: list[str] | None = None) -> int:

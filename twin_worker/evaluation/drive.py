@@ -1,4 +1,4 @@
-"""Drive recordings through the twins as if live, and ask every method at the same instants."""
+"""Replay recordings through the twins as if live, with forecasts of every method at the same instants."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -16,20 +16,20 @@ from twin_worker.twin.state.state import AUTO, hear
 from twin_worker.twin.state.vehicle_class import seen
 from twin_worker.twin.step import Twin, advance, silence
 
-STAND_IN = "imm"  # predicts where another method cannot
-_LOOK_BACK_S = 62.0  # telemetry the simpler methods see [s]
-_SAME_S = 0.01  # what begins farther apart are two predictions [s]
+STAND_IN = "imm"  # fallback of a method that cannot predict
+_LOOK_BACK_S = 62.0  # telemetry available to the baselines [s]
+_SAME_S = 0.01  # predictions whose starts differ by more are different [s]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked of whom, how often.
+    """Settings of an evaluation.
 
     Attributes:
-        every_s: between starts [s]
-        method: of our twin
-        methods: names beside ours
-        without_params: keep the autopilot's parameters from every twin
+        every_s: interval between starts [s]
+        method: method of the twin
+        methods: names of the methods to compare with
+        without_params: withhold the autopilot's parameters from every twin
     """
 
     every_s: float = 5.0
@@ -40,17 +40,17 @@ class Plan:
 
 @dataclass
 class Examined:
-    """One aircraft under examination.
+    """One aircraft under evaluation.
 
     Attributes:
-        flight: its name in every result
-        twin: as live
-        paper: the same telemetry under the paper's method, turned at starts only; None where it was not asked for
-        log: what really happened
-        asked: starts so far
-        slot: number of the present stretch of `every_s`
-        answered: whether something was predicted in it
-        silent: stretches on a mission, late enough to count, in which nothing was predicted
+        flight: name of the flight in every result
+        twin: the twin, driven as live
+        paper_twin: twin of the paper's method on the same telemetry, stepped at starts only; None without that method
+        reference: the actual flight
+        starts: starts so far
+        slot: number of the present interval of `every_s`
+        predicted: whether the twin predicted in this interval
+        missed: intervals on a mission, late enough to count, without any prediction
     """
 
     flight: str
@@ -65,12 +65,13 @@ class Examined:
 
 @dataclass
 class Drive:
-    """The aircraft of one recording and the plan they are examined by.
+    """Evaluation of the aircraft of one recording.
 
     Attributes:
-        name: of the recording
-        plan: what is asked
-        mine: tells by order of appearance whether an aircraft is examined here
+        name: name of the recording
+        plan: settings
+        is_selected: whether to evaluate an aircraft, by its order of appearance
+        uavs: aircraft by UAV id; None: not selected
     """
 
     name: str
@@ -79,7 +80,7 @@ class Drive:
     examined: dict[int, Examined | None] = field(default_factory=dict)
 
     def run(self, messages: Iterable[Message]) -> Iterator[Case]:
-        """Drive messages through the twins in the order they were heard; return every start once it is answered."""
+        """Replay messages through the twins in the order they were received; yield every resolved start."""
         for message in messages:
             one = self._whose(message.uav)
             if one is None:
@@ -96,7 +97,7 @@ class Drive:
 
     @property
     def silent(self) -> int:
-        """Return how many starts nothing was predicted at."""
+        """Return the number of intervals without any prediction."""
         return sum(one.silent for one in self.examined.values() if one is not None)
 
     def _whose(self, uav: int) -> Examined | None:
@@ -116,13 +117,13 @@ def _clock_jumps(one: Examined, message: Message) -> bool:
 
 
 def _answers(one: Examined) -> Iterator[Case]:
-    """Say what came of every start of the log so far."""
+    """Yield every start so far, compared with the actual flight."""
     yield from (answer(one.log, asked) for asked in one.asked)
     one.asked.clear()
 
 
 def _advance(one: Examined, message: Message, plan: Plan) -> None:
-    """Advance the twin by one message, asking at every instant it predicts: nothing later is known there."""
+    """Advance the twin by one message and record its predictions, with no later data available to any method."""
     for at in silence(one.twin, message):
         _ask(one, advance(one.twin, (), at), plan)
     if one.paper is not None:
@@ -131,7 +132,7 @@ def _advance(one: Examined, message: Message, plan: Plan) -> None:
 
 
 def _ask(one: Examined, results: Iterable[Message], plan: Plan) -> None:
-    """Take the first prediction of every stretch of `every_s`, and ask the other methods beside it."""
+    """Record a start at the first prediction of every interval of `every_s`."""
     made = [result for result in results if isinstance(result, Prediction)]
     at = made[-1].t if made else one.twin.data_t
     if not np.isfinite([at, one.log.begun]).all():
@@ -181,7 +182,7 @@ def _start(one: Examined, made: Prediction, plan: Plan) -> None:
 
 
 def _path(name: str, now: Now, ours: Told) -> Told | None:
-    """Ask one simpler method; the coupled model is not flown again where ours is just that."""
+    """Return the forecast of one baseline; `dynamics` reuses ours where ours is `dynamics`."""
     if name == DYNAMICS and ours.made_by == DYNAMICS:
         return Told(ours.path, DYNAMICS)
     path = BASELINES[name](now)
@@ -190,7 +191,7 @@ def _path(name: str, now: Now, ours: Told) -> Told | None:
 
 
 def _told(made: Prediction, ahead: np.ndarray, t: float) -> Told:
-    """Read a prediction at look-aheads from `t`, which lies within a step of its own time."""
+    """Resample a prediction to look-aheads from `t`, which is within one step of its own time."""
     own = made.t + made.ahead.numpy().astype(float)
     path, tube = (
         np.column_stack([np.interp(t + ahead, own, column, right=np.nan) for column in rows.numpy().astype(float).T])
@@ -200,7 +201,7 @@ def _told(made: Prediction, ahead: np.ndarray, t: float) -> Told:
 
 
 def _paper(one: Examined, made: Prediction, ahead: np.ndarray) -> Told | None:
-    """Turn the paper's twin once, and take what it predicts by its own method."""
+    """Step the paper's twin once and return its forecast by the paper's method; None without one."""
     assert one.paper is not None
     results = advance(one.paper, (), one.twin.turned_t)
     found = [r for r in results if isinstance(r, Prediction) and r.method == PAPER]
@@ -208,7 +209,7 @@ def _paper(one: Examined, made: Prediction, ahead: np.ndarray) -> Told | None:
 
 
 def _kept(twin: Twin, made: Prediction, ahead: np.ndarray) -> tuple[str, np.ndarray]:
-    """Return what shares the calibration of a prediction, and its ensemble's standard deviations, (k, 3) [m] or nan."""
+    """Return the calibration group of a prediction and its ensemble spread, (k, 3) [m] or nan."""
     latest = twin.record.latest
     spread = np.full((len(ahead), 3), np.nan)
     if latest is None or abs(latest[0].t + latest[0].ahead[0] - made.t) > _SAME_S:

@@ -1,4 +1,4 @@
-"""Pictures of an assessment: the paper's figure 9, coverage, probability integral transform, error by look-ahead."""
+"""Figures of an evaluation: figure 9 of the paper, coverage, probability integral transform, error by look-ahead."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,15 +16,15 @@ from twin_worker.numerics.plot_style import house
 from twin_worker.telemetry.flight_phase import MODES
 
 _COLOURS = dict(zip((OURS, "paper", "dynamics", "route_wind", "route", "imm", "ct", "cv"), LINES, strict=True))
-_BESIDE = ("paper", "route_wind")  # drawn beside ours where all would be too many
+_BESIDE = ("paper", "route_wind")  # drawn with ours where all methods would be too many
 _WINDOW_S = 60.0  # of figure 9 [s]
-_PAPER_S = 16.5  # lower quartile of the paper's own times within 10 % [s]
+_PAPER_S = 16.5  # lower quartile of the times within 10 % in the paper [s]
 _PIT_S = (5, 16, 30, 60)
 _AXES = ("along", "cross", "vertical")
 
 
 def draw(folder: Path, cases: Sequence[Case]) -> list[Path]:
-    """Draw every picture of the starts that count into a folder; return the files."""
+    """Draw all figures of the included starts into a folder; return the files."""
     if not cases:
         return []
     names = [name for name in _COLOURS if all(name in case.asked.told for case in cases)]
@@ -45,7 +45,7 @@ def draw(folder: Path, cases: Sequence[Case]) -> list[Path]:
 
 
 def _usual(ours: Scores) -> int:
-    """Pick the start whose error after 60 s is the median: neither the best nor the worst is shown."""
+    """Return the start with the median error after 60 s."""
     column = ours.at(_WINDOW_S)
     assert column is not None
     return int(np.argsort(ours.distance[:, column])[len(ours.flight) // 2])
@@ -88,7 +88,7 @@ def _ellipse(path: np.ndarray, tube: np.ndarray, k: int) -> tuple[np.ndarray, np
 
 
 def _relative(cases: Sequence[Case], scores: dict[str, Scores]) -> Figure:
-    """Draw the relative error M1 over the look-ahead: median of every method, quartiles of ours."""
+    """Draw the relative error M1 over the look-ahead: median of every method, quartiles of ours and the paper's."""
     figure = Figure(figsize=(9, 5), layout="constrained")
     ax = figure.subplots()
     length = np.array([case.length for case in cases])
@@ -109,7 +109,7 @@ def _relative(cases: Sequence[Case], scores: dict[str, Scores]) -> Figure:
 
 
 def _boxes(scores: dict[str, Scores]) -> Figure:
-    """Draw the time within 10 % of every method as boxes."""
+    """Draw box plots of the time within 10 % of every method."""
     figure = Figure(figsize=(9, 5), layout="constrained")
     ax = figure.subplots()
     for place, (name, one) in enumerate(scores.items()):
@@ -141,7 +141,7 @@ def _coverage(scores: dict[str, Scores]) -> Figure:
         ax.plot([], [], color=MUTED, lw=0.9, alpha=0.5, label="one flight of ours")
     for name, one in scores.items():
         ax.plot(one.ahead[1:], 100 * _means(one.inside)[1:], color=_COLOURS[name], lw=2.0, label=name)
-    ax.axhline(100 * QUANTILE, color=INK, lw=1.0, ls="--", label="claimed")
+    ax.axhline(100 * QUANTILE, color=INK, lw=1.0, ls="--", label="target")
     lowest = min(float(np.nanmin(_means(one.inside))) for one in scores.values())
     ax.set_ylim(min(50.0, 100 * lowest - 5.0), 101)
     ax.set_xlabel("look-ahead [s]", fontsize=9, color=INK)
@@ -152,7 +152,7 @@ def _coverage(scores: dict[str, Scores]) -> Figure:
 
 
 def _pit(ours: Scores) -> Figure:
-    """Draw where errors fall in the normal law the tube stands for, by deciles: flat is honest."""
+    """Draw the PIT histogram of errors in the normal distribution of the tube; a calibrated tube gives a flat one."""
     figure = Figure(figsize=(10, 6.5), layout="constrained")
     look = [s for s in _PIT_S if ours.at(s) is not None]
     panels = figure.subplots(3, len(look), sharex=True, sharey=True, squeeze=False)
@@ -167,22 +167,22 @@ def _pit(ours: Scores) -> Figure:
             ax.axhline(10, color=INK, lw=1.0, ls="--")
             ax.set_axisbelow(True)
             house(ax, f"{axis}, {s} s")
-    figure.supxlabel("decile of the claimed law", fontsize=9, color=INK)
+    figure.supxlabel("decile of the predicted distribution", fontsize=9, color=INK)
     figure.supylabel("share of starts [%]", fontsize=9, color=INK)
-    said = "a heap in the middle: the tube is too wide; heaps at both ends: too narrow"
+    said = "peak in the middle: the tube is too wide; peaks at both ends: too narrow"
     figure.suptitle(said, fontsize=10, color=INK)
     return figure
 
 
 def _errors(scores: dict[str, Scores]) -> Figure:
-    """Draw the median error over the look-ahead of every method; of ours also where nine tenths lie."""
+    """Draw the median error over the look-ahead of every method, and the 90 % quantile of ours."""
     figure = Figure(figsize=(9, 6), layout="constrained")
     ax = figure.subplots()
     for name, one in scores.items():
         (middle,) = _quantiles(one.distance[:, 1:], (50,))
         ax.plot(one.ahead[1:], middle, color=_COLOURS[name], **_line(name), label=name)
     (high,) = _quantiles(scores[OURS].distance[:, 1:], (90,))
-    ax.plot(scores[OURS].ahead[1:], high, color=_COLOURS[OURS], lw=1.2, ls=":", label="ours, nine of ten")
+    ax.plot(scores[OURS].ahead[1:], high, color=_COLOURS[OURS], lw=1.2, ls=":", label="ours, 90 %")
     ax.set_xscale("log")
     ax.set_yscale("log")
     ticks = [s for s in (1, 2, 5, 10, 16, 30, 60, 120, 180) if s <= scores[OURS].ahead[-1]]
@@ -196,7 +196,7 @@ def _errors(scores: dict[str, Scores]) -> Figure:
 
 
 def _phases(scores: dict[str, Scores], phases: np.ndarray) -> Figure:
-    """Draw the median error over the look-ahead by the phase flown next."""
+    """Draw the median error over the look-ahead by flight phase after the start."""
     figure = Figure(figsize=(10, 7), layout="constrained")
     top = 0.0
     panels = figure.subplots(2, 2, sharex=True, sharey=True).flat
@@ -217,12 +217,12 @@ def _phases(scores: dict[str, Scores], phases: np.ndarray) -> Figure:
 
 
 def _line(name: str) -> dict[str, Any]:
-    """Return width and dashes: ours is wide, and what may lie upon it dashed."""
+    """Return line width and style: ours is wide; `dynamics`, which may coincide with it, is dashed."""
     return {"lw": 2.6 if name == OURS else 1.3, "ls": "--" if name == "dynamics" else "-"}
 
 
 def _quantiles(values: np.ndarray, shares: Sequence[float]) -> Any:
-    """Return quantiles by column of what is known; nan where nothing is, (q, k)."""
+    """Return quantiles of the valid values by column; nan without any, (q, k)."""
     out = np.full((len(shares), values.shape[1]), np.nan)
     known = np.isfinite(values).any(axis=0)
     out[:, known] = np.nanpercentile(values[:, known], shares, axis=0)

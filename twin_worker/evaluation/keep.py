@@ -1,4 +1,4 @@
-"""Our predictions beside what was flown, as a file that anyone can score."""
+"""Write our predictions and the flown positions to a file for independent scoring."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,29 +12,29 @@ from twin_worker.numerics.prediction_errors import QUANTILE, path_length, track_
 
 KEYS = {
     "t0": "start, (s,) [s since 1970]",
-    "t": "instants asked for, (s, k) [s since 1970]",
+    "t": "predicted instants, (s, k) [s since 1970]",
     "latitude": "(s, k) [deg]",
     "longitude": "(s, k) [deg]",
     "altitude": "above mean sea level, (s, k) [m]",
-    "covariance": "of a normal law as wide as the tube, NED, (s, k, 3, 3) [m2]",
+    "covariance": "of the normal distribution equivalent to the tube, NED, (s, k, 3, 3) [m2]",
     "horizon": "confidence horizon, (s,) [s]",
     "flight": "recording and aircraft, (s,)",
     "uav": "id, (s,)",
-    "apart": "why a start does not count; empty: it counts, (s,)",
+    "apart": "reason for exclusion of a start; empty: included, (s,)",
     "ahead": "look-ahead, (k,) [s]",
     "path": "predicted, NED from the aircraft's first position; nan beyond its end, (s, k, 3) [m]",
     "tube": "half-axes along, cross, vertical, (s, k, 3) [m]",
     "spread": "standard deviations of the ensemble along, cross, vertical; nan without one, (s, k, 3) [m]",
-    "flown": "what happened, NED; nan where not known or after an event, (s, k, 3) [m]",
+    "flown": "flown positions, NED; nan where unknown or after an event, (s, k, 3) [m]",
     "length": "path flown so far, at least two seconds of ground speed, (s, k) [m]",
     "predicted_length": "the same along the prediction, (s, k) [m]",
     "group": "method / law / vehicle / parameters, (s,)",
-    "method": "that made the prediction, (s,)",
+    "method": "prediction method, (s,)",
 }
 
 
 def keep(path: Path, cases: Sequence[Case]) -> None:
-    """Write our predictions and the flights that answered them; keys and units: `KEYS`."""
+    """Write our predictions and the flown positions; keys and units: `KEYS`."""
     rows = [_row(case) for case in cases]
     arrays = {name: np.array([row[name] for row in rows]) for name in KEYS if name != "ahead"}
     np.savez_compressed(path, ahead=cases[0].asked.ahead, **arrays)  # type: ignore[arg-type]
@@ -68,7 +68,7 @@ def _row(case: Case) -> dict[str, object]:
 
 
 def covariance(path: np.ndarray, tube: np.ndarray) -> np.ndarray:
-    """Return the covariance, NED, of independent normal errors of which the tube holds its share, (k, 3, 3) [m2]."""
+    """Return the NED covariance of independent normal errors with the coverage of the tube, (k, 3, 3) [m2]."""
     sigma = tube / ndtri(0.5 + 0.5 * QUANTILE ** (1 / 3))
     along = track_frame(path)
     axes = np.zeros((len(path), 3, 3))

@@ -1,4 +1,4 @@
-"""The recording driver: messages in time order through the same loop as live, never shedding, as fast as it can."""
+"""Offline driver: recorded messages in time order through the same loop as live, without load shedding."""
 
 from collections.abc import Iterable, Iterator
 
@@ -8,12 +8,12 @@ from twin_worker.twin.step import Twin, advance
 
 
 def run(messages: Iterable[Message], twins: dict[int, Twin], traffic: Traffic | None = None) -> Iterator[Message]:
-    """Drive twins by recorded messages; a twin is made for every new UAV.
+    """Drive twins with recorded messages; every new UAV gets a twin.
 
     Args:
-        messages: Sample, Status, Mission, Params in the order they were heard
+        messages: Sample, Status, Mission, Params in the order they were received
         twins: twins by UAV id, filled and changed in place
-        traffic: judge of all pairs, changed in place; None makes one that ends with the messages
+        traffic: conflict assessment of all pairs, changed in place; None: a new one
     Yields:
         Model, Prediction and Alert messages
     """

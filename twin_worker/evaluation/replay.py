@@ -1,8 +1,7 @@
 """`python -m twin_worker.evaluation.replay FILE…`: replay recordings through the twins, offline.
 
-Per UAV: vehicle, methods and how many predictions each made, when it was first verified, the share of predictions
-within 10 % (relative error M1) up to 10, 30, 60 and 120 s, those ended by an event counted as long as they were
-flown, and the last sentences.
+Per UAV: vehicle, predictions by method, time of the first verified model, the share of predictions within 10 %
+(relative error M1) up to 10, 30, 60 and 120 s (predictions that an event ends are censored), and the last sentences.
 """
 
 import argparse
@@ -24,7 +23,7 @@ from twin_worker.evaluation.offline import run
 from twin_worker.twin.step import Twin
 
 WITHIN_S = (10, 30, 60, 120)
-_SAY_EVERY_S = 60.0  # recorded time between two words of progress [s]
+_SAY_EVERY_S = 60.0  # recorded time between two lines of progress [s]
 
 EXAMPLES = """
   python -m twin_worker.evaluation.replay flight.tlog
@@ -34,22 +33,22 @@ EXAMPLES = """
 
 @dataclass
 class Tally:
-    """What one UAV's twin said of a whole recording."""
+    """Summary of one UAV over a recording."""
 
     methods: Counter[str] = field(default_factory=Counter)
     verified_s: float | None = None  # since its first message
     verdict: str = ""
     sentence: str = ""
     passages: dict[str, list[tuple[float, bool]]] = field(default_factory=dict)  # by method: time to 10 % [s], censored
-    seen: dict[str, int] = field(default_factory=dict)  # predictions already scored by method
+    seen: dict[str, int] = field(default_factory=dict)  # predictions scored so far, by method
 
 
 def replay(messages: Iterable[Message], progress: str = "") -> dict[str, dict[str, Any]]:
     """Run messages through the twins; return each UAV's row by its id.
 
     Args:
-        messages: Sample, Status, Mission, Params in the order they were heard
-        progress: name to report progress under on stderr; empty: silently
+        messages: Sample, Status, Mission, Params in the order they were received
+        progress: name under which progress is reported on stderr; empty: no progress
     """
     twins: dict[int, Twin] = {}
     traffic = Traffic()
@@ -66,7 +65,7 @@ def replay(messages: Iterable[Message], progress: str = "") -> dict[str, dict[st
             _take(tally, result, start)
         _collect(tally, twins[message.uav])
     for uav, twin in twins.items():
-        twin.record.forget()  # the recording is over: what was still followed counts as far as it went
+        twin.record.forget()  # the recording is over: open predictions are censored
         _collect(tallies[uav], twin)
     return {str(uav): _row(twins[uav], tallies[uav], begun[uav]) for uav in sorted(twins)}
 
@@ -82,7 +81,7 @@ def _take(tally: Tally, result: Message, start: float) -> None:
 
 
 def _collect(tally: Tally, twin: Twin) -> None:
-    """Keep every passage scored: the record itself remembers only the latest."""
+    """Collect every scored passage: the tracker stores only the latest."""
     for method, n in twin.record.scored.items():
         new = n - tally.seen.get(method, 0)
         if new:
@@ -107,7 +106,7 @@ def _row(twin: Twin, tally: Tally, start: float) -> dict[str, Any]:
 
 
 def text(uav: str, row: dict[str, Any]) -> str:
-    """Return one UAV's row as lines to read."""
+    """Format one UAV's row as lines of text."""
     methods = ", ".join(f"{n} {method}" for method, n in row["methods"].items()) or "none"
     verified = "never" if row["first_verified_s"] is None else f"after {row['first_verified_s']:.0f} s"
     lines = [f"uav-{uav}: {row['vehicle']}, {row['seconds']:.0f} s; predictions: {methods}; verified {verified}"]
@@ -132,7 +131,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the recordings named on the command line."""
+    """Run the command line: replay recordings through the twins."""
     parser = parser_for(
         "python -m twin_worker.evaluation.replay", "Run recordings through the twins offline.", EXAMPLES
     )

@@ -1,4 +1,4 @@
-"""Share the aircraft of some recordings among processes, and show how far they have come."""
+"""Distribute the aircraft of recordings over processes, and show progress."""
 
 import multiprocessing
 import signal
@@ -21,25 +21,31 @@ Task = tuple[Sequence[Path], Plan, int, tuple[int, int]]  # files, plan, offset,
 
 @dataclass
 class Progress:
-    """One recording, for the progress bar."""
+    """Progress of one recording."""
 
     name: str
-    shares: Any  # how far each process has come with it, 0..1
+    shares: Any  # progress of each process, 0..1
     at: slice = field(default_factory=lambda: slice(None))
 
     @property
     def share(self) -> float:
-        """Tell how far the slowest process has come with it, 0..1."""
+        """Return the progress of the slowest process, 0..1."""
         return float(min(self.shares[self.at]))
 
     def words(self) -> str:
-        """Say what is being done with it."""
+        """Return the activity."""
         return "assessed" if self.share >= 1.0 else "assessing"
 
 
 @dataclass(frozen=True)
 class Found:
-    """What came of the recordings: starts in the order of files, silent starts, remarks of the readers."""
+    """Result of an evaluation.
+
+    Attributes:
+        cases: evaluated starts, in the order of files
+        missed: intervals without any prediction
+        sentences: warnings of the readers
+    """
 
     cases: list[Case]
     silent: int
@@ -47,16 +53,16 @@ class Found:
 
 
 def assess(files: Sequence[Path], plan: Plan, *, jobs: int = 1, offset: int = 0, say: Any = print) -> Found:
-    """Drive every recording through the twins.
+    """Evaluate the twins on recordings.
 
     Args:
         files: recordings
-        plan: what is asked of whom
-        jobs: processes; each reads every file and examines its share of the aircraft
+        plan: settings
+        jobs: processes; each reads every file and evaluates its share of the aircraft
         offset: UAV id = MAVLink system id + this
-        say: takes a line of progress where there is no terminal
+        report: prints a line of progress where there is no terminal
     Raises:
-        ValueError: when one is no recording.
+        ValueError: when a file is not a recording.
     """
     context = multiprocessing.get_context("spawn")
     shares = context.Array("d", len(files) * jobs)
@@ -78,7 +84,7 @@ _shares: Any = None
 
 
 def _begin(shares: Any) -> None:
-    """Begin a process of the pool: Ctrl-C is the parent's business."""
+    """Initialise a process of the pool; it ignores Ctrl-C, which the parent handles."""
     global _shares
     _shares = shares
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -89,7 +95,7 @@ def _task(task: Task) -> Found:
 
 
 def _part(task: Task, shares: Any) -> Found:
-    """Examine the aircraft whose number among all, in order of appearance, is ours."""
+    """Evaluate this process's share of the aircraft, numbered in order of appearance."""
     files, plan, offset, mine = task
     k, jobs = mine
     cases: list[Case] = []
@@ -110,7 +116,7 @@ def _is_mine(before: int, mine: tuple[int, int], number: int) -> bool:
 
 
 def names(files: Sequence[Path]) -> list[str]:
-    """Name recordings: by the file, by its whole path where two files have one name."""
+    """Return the names of recordings: the file name, or the path where file names are equal."""
     often = Counter(path.name for path in set(files))
     return [path.name if often[path.name] == 1 else str(path) for path in files]
 

@@ -1,4 +1,4 @@
-"""The figures as tables for people; the same as the JSON."""
+"""Tables of the evaluation results, with the same content as the JSON."""
 
 from typing import Any, Literal
 
@@ -17,18 +17,18 @@ _LABELS = {
     "imm": "IMM (filterpy)",
     "route": "route at ground speed",
     "route_wind": "route + wind + leg speed",
-    "paper": "the paper's way",
-    "dynamics": "coupled model + controller",
+    "paper": "method of the paper",
+    "dynamics": "derivatives model + controller",
     OURS: "ours",
 }
 _ERRORS = ("5", "16", "30", "60")
 _STYLES = {BEATEN: "green", WORSE: "red"}
-_NOTHING = f"nothing was predicted, and no mission was followed after the first {FIRST_S:.0f} s"
+_NOTHING = f"no prediction, and no mission flown after the first {FIRST_S:.0f} s"
 _ASIDE = ("compare", "apart", "run")
 
 
 def table(found: dict[str, Any]) -> RenderableType:
-    """Lay out methods, trust, phases, comparison and what was not counted."""
+    """Format methods, tubes, phases, comparison and excluded starts."""
     names = [name for name in (*_LABELS, *found) if name in found and name not in _ASIDE]
     names = list(dict.fromkeys(names))
     parts: list[RenderableType] = []
@@ -43,7 +43,7 @@ def table(found: dict[str, Any]) -> RenderableType:
 def _methods(found: dict[str, Any], names: list[str]) -> Table:
     first = found[names[0]]
     title = f"{first['starts']} starts of {first['flights']} flights; t10: time within 10 % of the path flown (M1)"
-    out = _table(title, "method", "t10 quartile / median [s]", "t5 [s]", "60 s held", "M2 [s]")
+    out = _table(title, "method", "t10 quartile / median [s]", "t5 [s]", "within 60 s", "M2 [s]")
     for s in _ERRORS:
         _column(out, f"p50 {s} s [m]")
     _column(out, "p90 60 s [m]")
@@ -71,9 +71,9 @@ def _trust(found: dict[str, Any], names: list[str]) -> Table:
         _column(out, _LABELS.get(name, name))
     for s in look:
         out.add_row(f"{s} s", *(_inside(found[name], s) for name in its))
-    out.add_row("horizon held", *(_share(found[name]["horizon_hit_rate"]) for name in its))
-    out.add_row("its rank correlation", *(_number(found[name]["horizon_rank_corr"], 2) for name in its))
-    out.add_row("its median [s]", *(_number(found[name]["horizon_median_s"]) for name in its))
+    out.add_row("horizon hit rate", *(_share(found[name]["horizon_hit_rate"]) for name in its))
+    out.add_row("horizon rank correlation", *(_number(found[name]["horizon_rank_corr"], 2) for name in its))
+    out.add_row("horizon median [s]", *(_number(found[name]["horizon_median_s"]) for name in its))
     return out
 
 
@@ -83,7 +83,7 @@ def _inside(row: dict[str, Any], s: str) -> str:
 
 
 def _phases(phases: dict[str, Any]) -> Table:
-    out = _table("ours by the phase flown next", "phase", "starts", "t10 quartile [s]", "60 s held")
+    out = _table("ours by flight phase after the start", "phase", "starts", "t10 quartile [s]", "within 60 s")
     for s in _ERRORS:
         _column(out, f"p50 {s} s [m]")
     for name, row in phases.items():
@@ -109,7 +109,7 @@ def _difference(row: dict[str, Any] | None) -> Text:
 
 
 def notes(found: dict[str, Any], names: list[str]) -> list[str]:
-    """Say what stood in for whom, and which starts do not count."""
+    """Return notes on fallback predictions and excluded starts."""
     lines = [] if names else [_why_none(found)]
     for name in names:
         made = found[name]["made_by"]
@@ -119,20 +119,20 @@ def notes(found: dict[str, Any], names: list[str]) -> list[str]:
             lines.append(f"{_LABELS.get(name, name)}: of {found[name]['starts']} predictions {said}")
     for why, row in found["apart"].items():
         lines.append(
-            f"apart: {row['starts']} starts, {why}; ours held 10 % for {_number(row['m1_t10_lq_s'])} s (quartile)"
+            f"excluded: {row['starts']} starts, {why}; ours within 10 % for {_number(row['m1_t10_lq_s'])} s (quartile)"
         )
     return lines
 
 
 def _why_none(found: dict[str, Any]) -> str:
-    """Say why there are no figures, as the keys `apart` and `run` of the JSON do."""
+    """Return the reasons why there are no figures, from the keys `apart` and `run` of the JSON."""
     run, apart = found.get("run", {}), sum(row["starts"] for row in found["apart"].values())
-    reasons = [f"{apart} are set apart, see below"] if apart else []
+    reasons = [f"{apart} are excluded, see below"] if apart else []
     if counted := run.get("counted", 0):
-        reasons.append(f"at none of {counted} did every method predict")
+        reasons.append(f"{counted} lack a prediction of some method")
     if silent := run.get("silent", 0):
-        reasons.append(f"at {silent} on a mission nothing was predicted")
-    return f"no start counts: {'; '.join(reasons) or _NOTHING}"
+        reasons.append(f"{silent} on a mission have no prediction")
+    return f"no start is included: {'; '.join(reasons) or _NOTHING}"
 
 
 def _table(title: str, *columns: str) -> Table:
@@ -143,7 +143,7 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _column(out: Table, heading: str, justify: Literal["left", "right"] = "right") -> None:
-    """Add a column; its unit in brackets is no markup."""
+    """Add a column; `Text` keeps brackets of units from being parsed as markup."""
     out.add_column(Text(heading), justify=justify, no_wrap=justify == "left")
 
 
@@ -152,7 +152,7 @@ def _number(value: float | None, digits: int = 1) -> str:
 
 
 def _time(row: dict[str, Any], key: str) -> str:
-    """Return a quantile of times; `>`: fewer had passed by the end of what could be followed."""
+    """Format a quantile of times; `>`: the quantile lies beyond the longest follow-up time."""
     value, end = row[key], row["followed_s"]
     return f"> {end:.0f}" if value is not None and end is not None and value >= end else _number(value)
 

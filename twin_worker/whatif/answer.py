@@ -1,4 +1,4 @@
-"""A copy of the twin flies what a question asks; the twin itself and its aircraft know nothing of it."""
+"""Answer a what-if query with a prediction of a modified copy of the twin; twin and aircraft are not affected."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,22 +18,22 @@ from twin_worker.twin.state.vehicle_class import NO_WINGS, seen
 from twin_worker.twin.steps.predict_step import foresee
 from twin_worker.whatif.move_history import Motion, moved
 
-_FAR_M = 50_000.0  # a start farther than this gets its own local frame [m]
-_BACK_S = 6.0  # flight the controller is synchronised on where it flew none of this route [s]
+_FAR_M = 50_000.0  # a start farther away than this gets its own local frame [m]
+_BACK_S = 6.0  # flight on which the controller is synchronised if the aircraft is on another route [s]
 _SPEED = 178  # MAV_CMD: DO_CHANGE_SPEED
 
 
 def answer(twin: Twin, asked: WhatIf) -> Prediction:
-    """Predict under what is asked.
+    """Predict under the conditions of a query.
 
     Args:
         twin: a copy, which is changed
-        asked: checked by `question.read`
+        query: validated by `query.read_query`
     Raises:
-        ValueError: when there is nothing to start from, or to fly; the sentence says what is missing.
+        ValueError: when start or route are missing; the message names what is missing.
     """
     if twin.origin is None or not np.isfinite(twin.history.newest):
-        raise ValueError(f"what if: {twin.name} has told no position yet, expected one; wait for its telemetry")
+        raise ValueError(f"what if: {twin.name} has sent no position yet, expected one; wait for its telemetry")
     if asked.seq is not None and asked.items is None:
         _check_seq(twin, asked.seq)
     said = list(_words(twin, asked))
@@ -47,10 +47,10 @@ def answer(twin: Twin, asked: WhatIf) -> Prediction:
         if not follows or asked.start is not None:
             _as_if_on_it(twin, twin.instead)
     twin.prediction, twin.over = None, False  # the answer begins at the last good state, however old
-    twin.control_t = -np.inf  # the answer tells law and parameters in any case
+    twin.control_t = -np.inf  # the answer always contains control law and parameters
     made = [m for m in foresee(twin, twin.history.newest) if isinstance(m, Prediction)]
     if not made:
-        raise ValueError(f"what if: {twin.name} has sent too few positions of late, expected 2 s of them; wait")
+        raise ValueError(f"what if: {twin.name} has sent too few recent positions, expected 2 s of them; wait")
     return msgspec.structs.replace(made[0], sentence=f"what if {', '.join(said)}: {made[0].sentence}".rstrip(": "))
 
 
@@ -62,7 +62,7 @@ def _check_seq(twin: Twin, seq: int) -> None:
 
 
 def _words(twin: Twin, asked: WhatIf) -> Iterator[str]:
-    """Say what the question changes."""
+    """Yield descriptions of what the query changes."""
     if asked.items is not None:
         yield f"it flew a mission of {len(asked.items)} items"
     if asked.seq is not None:
@@ -80,13 +80,13 @@ def _words(twin: Twin, asked: WhatIf) -> Iterator[str]:
         was = twin.received.get(name)
         yield f"{name[:20]} were {value:g}" + (f" instead of {was:g}" if was is not None else "")
     if len(asked.params) > 5:
-        yield f"and {len(asked.params) - 5} more parameters were others"
+        yield f"and {len(asked.params) - 5} more parameters were changed"
     if asked == WhatIf():
-        yield "nothing were otherwise"
+        yield "nothing were changed"
 
 
 def _move(twin: Twin, asked: WhatIf) -> None:
-    """Move the flight so far to the start, and into the wind, that are asked for."""
+    """Transform the flight so far to the start and wind of the query."""
     assert twin.origin is not None
     told = twin.wind.wind
     if not np.isfinite(twin.wind.t):
@@ -103,13 +103,13 @@ def _move(twin: Twin, asked: WhatIf) -> None:
         twin.origin = to if float(np.linalg.norm(far)) > _FAR_M else twin.origin
     if asked.wind is not None:
         twin.wind.blow(twin.history.newest, then)
-        twin.history.put("wind", np.array([twin.history.newest]), then[None, :2])  # the autopilot knows it too
+        twin.history.put("wind", np.array([twin.history.newest]), then[None, :2])  # the autopilot's estimate, too
         twin.rotor = replace(twin.rotor, wind=(float(then[0]), float(then[1])))
     twin.grid.clear()
 
 
 def _into_auto(twin: Twin) -> Iterator[str]:
-    """Let it follow its mission, armed, whatever its mode."""
+    """Set the status to armed and a route mode; yield a description if the mode changes."""
     status = twin.status or Status(uav=twin.uav, t=twin.history.newest)
     if status.mode not in ROUTE_MODES:
         yield f"its mode were {ROUTE_MODES[0]}"
@@ -118,7 +118,7 @@ def _into_auto(twin: Twin) -> Iterator[str]:
 
 
 def _instead(twin: Twin, asked: WhatIf) -> Instead:
-    """Put route and parameters together."""
+    """Build the route override from route and parameters of the query."""
     on_board = twin.mission.items if twin.mission else ()
     items = on_board if asked.items is None else asked.items
     params = dict(asked.params)
@@ -137,7 +137,7 @@ def _at_speed(item: Item, speed: float) -> Item:
 
 
 def _first(items: tuple[Item, ...], twin: Twin) -> int:
-    """Return the first item to fly."""
+    """Return the sequence number of the first item to fly."""
     first = twin.first_item
     return min((item.seq for item in items if item.seq >= first), default=first)
 
@@ -149,7 +149,7 @@ def _in_force(twin: Twin) -> int:
 
 
 def _as_if_on_it(twin: Twin, instead: Instead) -> None:
-    """Let the last seconds count as flown on the route asked for, where what was flown belongs to none."""
+    """Record the last seconds as flown on the queried route, if the aircraft was on none or on another."""
     now = twin.history.newest
     twin.since = now - _BACK_S
     twin.mission = Mission(uav=twin.uav, t=now, items=instead.items, seq=instead.seq, complete=True)

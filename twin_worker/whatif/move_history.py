@@ -1,8 +1,8 @@
-"""Telemetry as it would be, had the same air-relative flight been flown elsewhere, on another heading, in another wind.
+"""Transform telemetry to another start, heading and wind with the same air-relative flight.
 
-Everything a twin learns in flight is relative to the air, so that a start elsewhere is a rigid motion of the flight so
-far:  v' = R (v - w) + w';  p' = start + R (p - p_end - w s) + w' s  with s = t - t_end.  What has no place (servos,
-commands, airspeed, rates) stays.
+Everything a twin identifies in flight is relative to the air, so another start is a rigid motion of the flight so far:
+v' = R (v - w) + w';  p' = start + R (p - p_end - w s) + w' s  with s = t - t_end.  Telemetry without a position
+(servos, commands, airspeed, rates) is unchanged.
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from twin_worker.telemetry.history import History
 
 @dataclass(frozen=True)
 class Motion:
-    """How the flight so far is moved.
+    """Rigid motion of the flight so far.
 
     Attributes:
-        to: start; None: where it is
-        heading: of the nose [rad]; None: as it is
-        wind, wind_then: as it is and as it would be, NED, (3,) [m/s]
+        start: new end position of the flight so far; None: unchanged
+        heading: new heading of the nose [rad]; None: unchanged
+        wind, new_wind: actual and hypothetical wind, NED, (3,) [m/s]
     """
 
     to: Origin | None
@@ -30,7 +30,7 @@ class Motion:
 
 
 def moved(history: History, origin: Origin, how: Motion) -> None:
-    """Move what is remembered, in place."""
+    """Move the telemetry history, in place."""
     t_p, place = history.rows("position")
     t_v, v = history.rows("velocity")
     t_a, attitude = history.rows("attitude")
@@ -40,7 +40,7 @@ def moved(history: History, origin: Origin, how: Motion) -> None:
     c, s = np.cos(turn), np.sin(turn)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     p, since = to_ned(origin, *place.T), (t_p - t_p[-1])[:, None]
-    path = (p - p[-1] - how.wind * since) @ R.T + how.wind_then * since  # from where it ends
+    path = (p - p[-1] - how.wind * since) @ R.T + how.wind_then * since  # from the last position
     placed = to_geodetic(origin, p[-1] + path) if how.to is None else to_geodetic(how.to, path)
     history.put("position", t_p, placed.astype(float))
     history.put("velocity", t_v, (v - how.wind) @ R.T + how.wind_then)
@@ -50,7 +50,7 @@ def moved(history: History, origin: Origin, how: Motion) -> None:
 
 
 def _heading(attitude: np.ndarray, air: np.ndarray) -> float:
-    """Return where the nose points: as sent, else along the flight through the air [rad]."""
+    """Return the heading: as received, else the direction of the air-relative velocity [rad]."""
     if len(attitude):
         return float(attitude[-1, 2])
     return float(np.arctan2(air[-1, 1], air[-1, 0])) if len(air) else 0.0

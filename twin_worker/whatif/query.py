@@ -1,4 +1,4 @@
-"""The payload of a query, read and checked: a `WhatIf`, or one sentence that says what is wrong with it."""
+"""Decode and validate the payload of a query: a `WhatIf`, or an error that names what is wrong."""
 
 from collections.abc import Iterator
 from math import isfinite, pi
@@ -16,10 +16,10 @@ _READ = msgspec.msgpack.Decoder(WhatIf)
 
 
 def read(payload: bytes) -> WhatIf:
-    """Read and check one question.
+    """Decode and validate one query.
 
     Raises:
-        ValueError: when it does not fit the contract or asks for what cannot be; the sentence says what to correct.
+        ValueError: when it violates the contract or a limit; the message names the correction.
     """
     if len(payload) > MOST_BYTES:
         raise ValueError(f"what if: found {len(payload):,} bytes, expected at most {MOST_BYTES:,}; shorten the mission")
@@ -27,7 +27,7 @@ def read(payload: bytes) -> WhatIf:
         asked = _READ.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         what = str(error) if isinstance(error, msgspec.ValidationError) else "no msgpack map"
-        raise ValueError(f"what if: found a payload that does not fit ({what}), expected {_EXPECTED}") from None
+        raise ValueError(f"what if: found an invalid payload ({what}), expected {_EXPECTED}") from None
     for complaint in _complaints(asked):
         raise ValueError(f"what if: {complaint}")
     return asked
@@ -37,13 +37,13 @@ _EXPECTED = f"a map of {', '.join(WhatIf.__struct_fields__)}; see `fleet schema 
 
 
 def _complaints(asked: WhatIf) -> Iterator[str]:
-    """Say what is wrong, the first thing first; nan fails every comparison."""
+    """Yield the errors of a query; nan fails every comparison."""
     items = asked.items or ()
     if len(items) > MAX_ITEMS:
         yield f"found {len(items):,} mission items, expected at most {MAX_ITEMS:,}; shorten the mission"
     seqs = {item.seq for item in items}
     if len(seqs) < len(items) or any(not 0 <= seq < MAX_ITEMS for seq in seqs):
-        yield f"items: found numbers {min(seqs)}..{max(seqs)}, expected each of 0..{MAX_ITEMS - 1} once; number anew"
+        yield f"items: found numbers {min(seqs)}..{max(seqs)}, expected each of 0..{MAX_ITEMS - 1} once; renumber them"
     if asked.seq is not None and asked.items is not None and asked.seq not in seqs:
         yield f"seq: found {asked.seq}, expected the number of one of the {len(items)} items; choose one of them"
     if asked.speed is not None and not 0 < asked.speed <= _MOST_SPEED:
@@ -68,7 +68,7 @@ def _start_complaints(start: WhatIfStart) -> Iterator[str]:
 
 def _params_complaints(params: dict[str, float]) -> Iterator[str]:
     if len(params) > _MOST_PARAMS:
-        yield f"params: found {len(params):,}, expected at most {_MOST_PARAMS:,}; name only what is to change"
+        yield f"params: found {len(params):,}, expected at most {_MOST_PARAMS:,}; name only those to change"
     for name, value in params.items():
         if not isfinite(value):
             yield f"params: found {name[:40]} {value}, expected a finite number; correct it"

@@ -1,4 +1,4 @@
-"""The look-ahead times a query asks for, and a prediction on them."""
+"""Look-ahead times of a query, and a prediction resampled to them."""
 
 import msgspec
 import numpy as np
@@ -9,10 +9,10 @@ from twin_worker.confidence.tube_and_horizon import AHEAD
 
 
 def wanted(asked: dict[str, str]) -> np.ndarray | None:
-    """Read `?horizon=30;step=0.5` into look-ahead times [s]; None where nothing was asked.
+    """Read `?horizon=30;step=0.5` into look-ahead times [s]; None without either.
 
     Raises:
-        ValueError: when they are no numbers or ask for more than 1,000 points.
+        ValueError: when they are not numbers or would give more than 1,000 points.
     """
     if not asked.keys() & {"horizon", "step"}:
         return None
@@ -22,17 +22,20 @@ def wanted(asked: dict[str, str]) -> np.ndarray | None:
         raise ValueError(f"query: found {asked}, expected numbers, e.g. ?horizon=30;step=0.5; correct them") from None
     if not (0 < horizon <= AHEAD[-1] and 0 < step <= 60 and horizon / step <= 1000):
         raise ValueError(
-            f"query: found horizon {horizon}, step {step}; ask for at most {AHEAD[-1]:.0f} s and 1,000 points"
+            f"query: found horizon {horizon}, step {step}, expected at most {AHEAD[-1]:.0f} s and 1,000 points; "
+            "correct them"
         )
     return np.arange(0.0, horizon + 1e-9, step)
 
 
 def resample(prediction: Prediction, grid: np.ndarray | None) -> Prediction:
-    """Return the prediction on other look-ahead times, (n,) [s], as far as it reaches; the whole of it for None."""
+    """Return the prediction on other look-ahead times, (n,) [s], up to its end; unchanged for None."""
     if grid is None:
         return prediction
     ahead = prediction.ahead.numpy().astype(float)
     grid = grid[grid <= ahead[-1] + 1e-6]
-    path = CubicSpline(ahead, prediction.path.numpy())(grid)  # a chord over 4 s of a turn would cut it by metres
+    path = CubicSpline(ahead, prediction.path.numpy())(
+        grid
+    )  # linear interpolation over 4 s of a turn has errors of metres
     tube = np.column_stack([np.interp(grid, ahead, column) for column in prediction.tube.numpy().T])
     return msgspec.structs.replace(prediction, ahead=Array.of(grid), path=Array.of(path), tube=Array.of(tube))

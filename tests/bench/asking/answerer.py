@@ -15,7 +15,7 @@ from twin_worker.service.worker import Worker
 from twin_worker.twin.step import Twin
 
 _EVERY_S = 1.0  # between predictions of an aircraft [s]
-_SAID = "hybrid/arduplane/fixed_wing/known, adapted by 24 of its own"
+_SAID = "hybrid/arduplane/fixed_wing/known, adapted to 24 own predictions"
 
 
 def prediction(uav: int) -> Prediction:

@@ -1,8 +1,8 @@
 """`python -m twin_worker.confidence.calibration fit|check FILE…`: fit and evaluate calibration tables.
 
-`fit` writes a table for every group and every wider one, and says what tables that had not seen a flight claim of it
-(a setting of law, airframe and parameters, where a table spans several). `check` says what tables claim of other
-predictions, alone and adapted.
+`fit` writes a table for every group and parent group, and prints their cross-validated coverage and horizons (folds are
+flights, or settings of law, airframe and parameters where a table spans several). `check` prints coverage and horizons
+of tables on other predictions, with and without adaptation.
 """
 
 import argparse
@@ -19,8 +19,8 @@ from twin_worker.confidence.calibration_table import Table
 from twin_worker.confidence.groups import ANY, wider
 from twin_worker.confidence.table_files import Source, load, read_tables, write
 
-LEAST_STARTS, LEAST_FLIGHTS = 30, 3  # fewer teach no table
-ENOUGH_FLIGHTS = 8  # fewer of one method are told apart from its like by chance
+LEAST_STARTS, LEAST_FLIGHTS = 30, 3  # minimum for a table
+ENOUGH_FLIGHTS = 8  # with fewer, differences between methods of one family are not significant
 
 EXAMPLES = """
   python -m twin_worker.confidence.calibration fit predictions.npz --out twin_worker/confidence/calibration/pretend.json
@@ -31,7 +31,7 @@ EXAMPLES = """
 def _fit(args: argparse.Namespace) -> int:
     scored = read(args.files)
     names = set(scored.group.tolist())
-    fitted: dict[bytes, Table] = {}  # by which predictions: a wider group of no more is the same table
+    fitted: dict[bytes, Table] = {}  # by selected rows: a parent group with the same predictions has the same table
     tables = []
     for group in dict.fromkeys(name for own in sorted(names) for name in wider(own)):
         rows = scored.within(group)
@@ -52,7 +52,7 @@ def _fit(args: argparse.Namespace) -> int:
 
 
 def _too_few(scored: Scored, group: str) -> str:
-    """Say why a group is too small for a table of its own; empty where it is not."""
+    """Return the reason why a group is too small for its own table; empty if it is not."""
     flights = _flights(scored, group)
     if scored.within(group).sum() < LEAST_STARTS or flights < LEAST_FLIGHTS:
         return f"{flights} flights; {LEAST_STARTS} of {LEAST_FLIGHTS} are needed"
@@ -76,7 +76,7 @@ def _table(mine: Scored, group: str) -> Table:
 
 
 def _named(path: Path) -> str:
-    """Name a file by its folder too: every flight's are called alike."""
+    """Return a file name with its folder, because the files of all flights have the same name."""
     return f"{path.absolute().parent.name}/{path.name}"
 
 
@@ -98,18 +98,16 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Fit or check calibration tables as the command line says."""
-    parser = parser_for(
-        "python -m twin_worker.confidence.calibration", "Calibration tables of tubes and horizons.", EXAMPLES
-    )
+    """Run the command line: fit or check calibration tables."""
+    parser = parser_for("python -m twin_worker.confidence.calibration", "Fit or check calibration tables.", EXAMPLES)
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="fit|check")
-    for verb, what in (("fit", "fit tables"), ("check", "measure what tables claim")):
+    for verb, what in (("fit", "fit tables"), ("check", "evaluate tables on other predictions")):
         one = verbs.add_parser(verb, help=what)
         one.add_argument("files", nargs="+", type=Path, metavar="FILE", help="scored predictions, .npz")
         if verb == "fit":
             one.add_argument("--out", type=Path, required=True, metavar="FILE", help="tables to write, .json")
         else:
-            one.add_argument("--with", dest="tables", type=Path, metavar="FILE", help="tables (those that come along)")
+            one.add_argument("--with", dest="tables", type=Path, metavar="FILE", help="tables (those of the package)")
     args = parser.parse_args(argv)
     return guarded("twin_worker.confidence.calibration", _fit if args.verb == "fit" else _check, args)
 

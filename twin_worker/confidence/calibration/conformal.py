@@ -1,7 +1,7 @@
-"""Factors from sigma to half-axes: each axis misses as often as another, and all three hold at once.
+"""Conformal factors from sigma to half-axes: equal coverage of every axis, and joint coverage of all three.
 
-One level of ranks for all axes: an axis of heavy tails is not paid for by the others, as it is where the largest of
-the three errors over sigma is ranked.
+All axes share one rank level, so an axis with heavy tails does not widen the others, as it would if the largest of
+the three normalised errors were ranked.
 
 Source: Messoudi, Destercke & Rousseau 2021, "Copula-based conformal prediction for multi-target regression".
 """
@@ -13,13 +13,13 @@ from twin_worker.numerics.prediction_errors import QUANTILE
 
 
 def factors_of(ratio: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the factors that hold `QUANTILE` of the next predictions too, (3,), and the share that one axis holds.
+    """Return the factors of joint coverage `NOMINAL_COVERAGE` on new predictions, (3,), and the coverage of one axis.
 
-    That share is `QUANTILE` where all axes err at once and its cube root where they are independent; both are nan where
-    nothing is known.
+    The latter is `NOMINAL_COVERAGE` for fully dependent axes and its cube root for independent ones. Without scores
+    both are nan.
 
     Args:
-        ratio: errors along, cross, vertical over their sigma, nan where not known, (s, k, 3) [-]
+        ratio: errors along, cross, vertical over their sigma, nan where unknown, (s, k, 3) [-]
         weight: of each prediction, (s,)
     """
     known = np.isfinite(ratio).all(axis=2)

@@ -1,4 +1,4 @@
-"""What tables are worth on given predictions: coverage, half-axes and horizons, before and after adaptation."""
+"""Evaluation of tables on given predictions: coverage, half-axes and horizons, with and without adaptation."""
 
 from collections.abc import Iterable
 
@@ -19,14 +19,14 @@ Claims = tuple[np.ndarray, np.ndarray]  # tubes (s, k, 3) [m], horizons (s,) [s]
 
 
 def claimed(table: Table, scored: Scored) -> Claims:
-    """Return what a table alone claims of predictions."""
+    """Return the regions of predictions from a table without adaptation."""
     tube = table.half_axes(scored.doubt, AHEAD)
     ratio = growth(tube, scored.predicted_length) * np.interp(QUANTILE, LEVELS, table.risks)
     return tube, np.array([first_passage(one)[0] for one in ratio])
 
 
 def adapted(tables: Tables, scored: Scored) -> Claims:
-    """Return what a record claims that learns from each flight as it goes, predictions in the order they were made."""
+    """Return the regions of predictions with adaptation in flight, each flight in time order."""
     tube, horizon = np.empty(scored.path.shape), np.empty(len(scored))
     for flight in dict.fromkeys(scored.flight.tolist()):
         rows = np.flatnonzero(scored.flight == flight)
@@ -47,7 +47,7 @@ def adapted(tables: Tables, scored: Scored) -> Claims:
 
 
 def _flight(scored: Scored) -> tuple[np.ndarray, np.ndarray]:
-    """Piece one flight together from what was flown after each prediction: times (n,), positions (n, 3)."""
+    """Merge the positions flown after each prediction into one flight: times (n,), positions (n, 3)."""
     t = (scored.t0[:, None] + AHEAD).ravel()
     flown = scored.flown.reshape(-1, 3)
     known = np.isfinite(flown).all(axis=1)
@@ -56,7 +56,7 @@ def _flight(scored: Scored) -> tuple[np.ndarray, np.ndarray]:
 
 
 def left_out(scored: Scored, group: str) -> Claims:
-    """Return what tables fitted without each flight (or each group, of a wider one) claim of it."""
+    """Return cross-fitted regions: each flight (or each setting of a parent group) from a table fitted without it."""
     folds = scored.folds(group)
     tube, horizon = np.empty(scored.path.shape), np.empty(len(scored))
     for fold in np.unique(folds):
@@ -66,7 +66,7 @@ def left_out(scored: Scored, group: str) -> Claims:
 
 
 def figures(scored: Scored, claims: Claims) -> dict[str, float]:
-    """Measure claims against what happened; shares 0..1, lengths in m, times in s."""
+    """Compute coverage, half-axes and horizon figures of regions; shares 0..1, lengths in m, times in s."""
     tube, horizon = claims
     error = scored.errors()
     known: np.ndarray = np.isfinite(error[..., 0])
@@ -82,7 +82,7 @@ def figures(scored: Scored, claims: Claims) -> dict[str, float]:
 
 
 def _horizons(relative: np.ndarray, known: np.ndarray, horizon: np.ndarray) -> dict[str, float]:
-    """Measure horizons on predictions that were followed for long enough to judge, whatever came of them."""
+    """Compute horizon figures from the predictions that were followed at least to their horizon."""
     followed = np.array([AHEAD[-1] if row.all() else AHEAD[max(int(row.argmin()) - 1, 0)] for row in known])
     passage = np.array([first_passage(row)[0] for row in relative])
     judged, whole = np.flatnonzero(followed >= horizon), np.flatnonzero(followed >= AHEAD[-1])
@@ -103,7 +103,7 @@ def _mean(values: np.ndarray) -> float:
 
 
 def said(name: str, got: dict[str, float]) -> str:
-    """Put figures in a few lines."""
+    """Format figures as a few lines of text."""
     lines = [
         f"{name}: coverage {got['coverage']:.1%}, worst flight {got['coverage_worst_flight']:.0%}; horizon hit "
         f"{got['hit_rate']:.1%}, rank correlation {got['rank_correlation']:.2f}, median {got['horizon_median_s']:.0f} s"

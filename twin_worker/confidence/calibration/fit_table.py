@@ -1,4 +1,4 @@
-"""Fit a calibration table: likelihood for what sigma is, left-out predictions for how many of them to claim.
+"""Fit a calibration table: sigma by maximum likelihood, half-axes by cross-conformal prediction.
 
 Source: Vovk 2015, "Cross-conformal predictors"; Angelopoulos et al. 2024, "Conformal risk control".
 """
@@ -15,26 +15,26 @@ from twin_worker.confidence.horizon_risk import critical, growth
 from twin_worker.confidence.weighted_quantile import censored_quantile, weighted_quantile
 from twin_worker.numerics.prediction_errors import AHEAD, QUANTILE, first_passage
 
-_NEAR = 1.2  # look-aheads within this factor of a knot speak for it [-]
-_SPEAKERS = 3  # as many of them, evenly: neighbours say much the same
+_NEAR = 1.2  # look-aheads within this factor of a knot are used for it [-]
+_SPEAKERS = 3  # number of them, evenly spaced: neighbours are highly correlated
 _NU = 4.0  # degrees of freedom of the errors: heavy tails
 _USUAL_LAG = np.log(0.5)
 _USUAL_FLOOR = 0.3  # of the median error [-]
-_RIDGE = np.array([0.05, 0.01, 0.01])  # hold scale, lag and floor near what is usual where errors leave them free [-]
-_MOST = 3.0  # scale and lag lie within exp of this, either way
-_QUIET = 20  # predictions below which a flight speaks the less for being short
-_FOLDS = 4  # most of them when a table is fitted; leaving one out is another matter
+_RIDGE = np.array([0.05, 0.01, 0.01])  # ridge penalty of scale, lag and floor towards typical values [-]
+_MOST = 3.0  # bound on |log scale| and |log lag|
+_QUIET = 20  # flights with fewer predictions than this have a smaller weight
+_FOLDS = 4  # maximum number of folds when a table is fitted
 _LEAST_M = 0.02  # smallest floor [m]
 
 
 def near(knot: float) -> np.ndarray:
-    """Return the columns of the look-ahead grid that speak for a knot."""
+    """Return the columns of the look-ahead grid that are used for a knot."""
     found = np.flatnonzero(np.abs(np.log(np.maximum(AHEAD, 1e-9) / knot)) <= np.log(_NEAR))
     return found[np.unique(np.linspace(0, len(found) - 1, _SPEAKERS).round().astype(int))]
 
 
 def fit_sigma(doubt: Doubt, error: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fit scale, lag and floor by knot and axis to doubts and errors (s, k, 3) [m]; each (13, 3)."""
+    """Fit scale, lag and floor by knot and axis to features and errors (s, k, 3) [m]; each (13, 3)."""
     found = np.tile([1.0, 1.0, _LEAST_M], (len(KNOTS), 3, 1))
     for i, knot in enumerate(KNOTS):
         columns = near(knot)
@@ -49,7 +49,7 @@ def fit_sigma(doubt: Doubt, error: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _likeliest(s2: np.ndarray, r2: np.ndarray, e2: np.ndarray) -> np.ndarray:
-    """Return scale, lag and floor under errors with Student's t law of `_NU` degrees of freedom, (3,)."""
+    """Estimate scale, lag and floor for errors of Student's t distribution with `_NU` degrees of freedom, (3,)."""
     typical = max(float(np.sqrt(np.median(e2))), _LEAST_M)
     usual = np.array([0.0, _USUAL_LAG, np.log(_USUAL_FLOOR * typical)])
     parts = np.stack([s2, r2, np.ones_like(e2)])
@@ -69,9 +69,9 @@ def _likeliest(s2: np.ndarray, r2: np.ndarray, e2: np.ndarray) -> np.ndarray:
 
 
 def fit(scored: Scored, group: str) -> Table:
-    """Fit the table of one group to its predictions; every score comes from a fit that had not seen its flight."""
+    """Fit the table of one group to its predictions; every score comes from a fit without its flight."""
     error, folds = scored.errors()[..., :3], scored.folds(group)
-    weight = 1.0 / np.maximum(np.bincount(folds), _QUIET)[folds]  # each flight speaks as loud, unless it is short
+    weight = 1.0 / np.maximum(np.bincount(folds), _QUIET)[folds]  # equal weight per flight, less for short ones
     sigma = fit_sigma(scored.doubt, error)
     ratio = np.empty(error.shape)  # to sigma
     batch = folds % min(_FOLDS, int(folds.max()) + 1)
@@ -90,7 +90,7 @@ def fit(scored: Scored, group: str) -> Table:
 
 
 def _scores(table: Table, ratio: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return how the largest error over its half-axis was distributed, over all look-aheads, (20,)."""
+    """Return the quantiles of the largest error over its half-axis, over all look-aheads, (20,)."""
     score = (ratio / at_look_aheads(AHEAD, table.factor)).max(axis=2)[:, 1:]
     known = np.isfinite(score)
     loud = np.where(known, weight[:, None], 0.0).reshape(1, -1)
@@ -104,7 +104,7 @@ def _raw(group: str, scale: np.ndarray, lag: np.ndarray, floor: np.ndarray) -> T
 
 
 def _known(factor: np.ndarray) -> np.ndarray:
-    """Let look-aheads nobody followed take the factors of their neighbours, (13, 3)."""
+    """Interpolate the factors of look-aheads without scores from their neighbours, (13, 3)."""
     known = np.isfinite(factor[:, 0])
     if not known.any():
         return np.full_like(factor, 2.0)
@@ -112,7 +112,7 @@ def _known(factor: np.ndarray) -> np.ndarray:
 
 
 def _with_risks(table: Table, scored: Scored, weight: np.ndarray) -> Table:
-    """Add how the critical factors of these predictions are distributed."""
+    """Return the table with the quantiles of the critical factors of these predictions."""
     ratio = growth(table.half_axes(scored.doubt, AHEAD), scored.predicted_length)
     relative = scored.errors()[..., 3] / scored.length
     followed, censored = zip(*(first_passage(miss) for miss in relative), strict=True)

@@ -1,4 +1,4 @@
-"""Scored predictions as `assess` writes them: what was said, and what then happened."""
+"""Predictions and the positions flown afterwards, as written by `assess`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from twin_worker.confidence.groups import ANY, setting, wider
 from twin_worker.confidence.lagged_ensemble import Earlier
 from twin_worker.numerics.prediction_errors import AHEAD, axes_error
 
-_LEAST = 30  # predictions of a setting, to be left out by itself
+_LEAST = 30  # minimum predictions of a setting that forms a fold of its own
 _WHOLE = ("path", "spread", "flown")
 _ROWS = ("t0", "length", "predicted_length", "group", "method", "flight")
 
@@ -21,10 +21,10 @@ class Scored:
     """Predictions (s of them) on the common look-ahead grid of k points.
 
     Attributes:
-        t0: start of each, (s,) [s since 1970]
-        path: as predicted, NED, (s, k, 3) [m]
-        doubt: spread of the ensemble and revision of each, (s, k, 3) [m]
-        flown: what happened, nan where it was not followed, (s, k, 3) [m]
+        t0: start times, (s,) [s since 1970]
+        path: predicted positions, NED, (s, k, 3) [m]
+        features: ensemble spread and forecast revision, (s, k, 3) [m]
+        flown: flown positions, NED, nan where unknown, (s, k, 3) [m]
         length, predicted_length: path length so far, never below two seconds of ground speed, (s, k) [m]
         group, method, flight: names, (s,)
     """
@@ -43,32 +43,32 @@ class Scored:
         return len(self.t0)
 
     def part(self, rows: np.ndarray) -> "Scored":
-        """Choose rows."""
+        """Return the predictions of these rows."""
         doubt = Doubt(self.doubt.spread[rows], self.doubt.revision[rows])
         return replace(self, doubt=doubt, **{name: getattr(self, name)[rows] for name in ("path", "flown", *_ROWS)})
 
     def errors(self) -> np.ndarray:
-        """Return errors along, cross, vertical and the distance, nan where not followed, (s, k, 4) [m]."""
+        """Return errors along, cross, vertical and the distance, nan where unknown, (s, k, 4) [m]."""
         return axes_error(self.path, self.flown)
 
     def within(self, group: str) -> np.ndarray:
-        """Tell which belong to a group, or to a wider one with `*`, (s,) bool."""
+        """Return which predictions belong to a group or parent group, (s,) bool."""
         named = {name: group in wider(name) for name in set(self.group.tolist())}
         return np.array([named[name] for name in self.group.tolist()], bool)
 
     def several(self, group: str) -> bool:
-        """Return whether a table of a group would span several settings (law, airframe, parameters) worth the name."""
+        """Return whether a group spans several settings (law, airframe, parameters) with enough predictions."""
         return ANY in group and len(set(self._settings().tolist())) > 1
 
     def folds(self, group: str) -> np.ndarray:
-        """Number what is left out together, (s,): a whole setting of several, else a flight.
+        """Return the validation fold of each prediction, (s,): its setting if the group has several, else its flight.
 
-        A table of several settings stands in for one it has not seen: that is what leaving out must show.
+        A table of several settings is used for settings without a table, so validation leaves out settings.
         """
         return np.unique(self._settings() if self.several(group) else self.flight, return_inverse=True)[1]
 
     def _settings(self) -> np.ndarray:
-        """Name the setting of each prediction, (s,); those of too few predictions go with the commonest."""
+        """Return the setting of each prediction, (s,); rare settings are merged with the most common one."""
         names = np.array([setting(name) for name in self.group.tolist()])
         known, count = np.unique(names, return_counts=True)
         few = np.isin(names, known[count < _LEAST])
@@ -76,16 +76,16 @@ class Scored:
 
 
 def read(paths: Sequence[Path]) -> Scored:
-    """Read and join files of scored predictions.
+    """Read and concatenate files of scored predictions.
 
     Raises:
-        ValueError: when one does not hold what `assess` writes.
+        ValueError: when a file was not written by `assess`.
     """
     return joined([_read(path) for path in paths])
 
 
 def joined(parts: Sequence[Scored]) -> Scored:
-    """Join sets of predictions."""
+    """Concatenate sets of predictions."""
     doubt = Doubt(*(np.concatenate([getattr(part.doubt, name) for part in parts]) for name in ("spread", "revision")))
     names = ("path", "flown", *_ROWS)
     return Scored(doubt=doubt, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
@@ -104,7 +104,9 @@ def _read(path: Path) -> Scored:
     wanted |= dict.fromkeys(("length", "predicted_length"), (s, k))
     for name, value in held.items():
         if value.shape != wanted.get(name, (s,)):
-            raise ValueError(f"{path.name}: found {name} of shape {value.shape}, expected {wanted.get(name, (s,))}")
+            raise ValueError(
+                f"{path.name}: found {name} of shape {value.shape}, expected {wanted.get(name, (s,))}; assess again"
+            )
     spread = held.pop("spread")
     revision = revisions(held["t0"], held["path"], held["flight"])
     methods = held["method"].tolist()
@@ -114,7 +116,7 @@ def _read(path: Path) -> Scored:
 
 
 def revisions(t0: np.ndarray, path: np.ndarray, flight: np.ndarray) -> np.ndarray:
-    """Return the revision of each of s predictions of some flights, nan where it has none, (s, k, 3) [m]."""
+    """Compute the forecast revision of each prediction within its flight, nan where undefined, (s, k, 3) [m]."""
     out = np.full(path.shape, np.nan)
     for name in dict.fromkeys(flight.tolist()):
         earlier = Earlier()

@@ -1,12 +1,12 @@
-"""The methods ours is compared with: what a user could do instead, from the same telemetry and nothing later.
+"""Baseline methods for comparison, with the same telemetry and no later data.
 
-cv          straight on at constant velocity
+cv          constant velocity
 ct          constant turn rate and constant speed
 imm         interacting multiple model of straight flight and turns
 route       the mission at the present ground speed
-route_wind  the mission at the commanded airspeed through the estimated wind, rejoined smoothly
-paper       two linear axes, identified and refined, flown by the controller twin (a twin of its own)
-dynamics    the identified coupled model, flown by the controller twin, whatever the twin itself would choose
+route_wind  the mission at the commanded airspeed in the estimated wind, rejoined smoothly
+paper       two linear axes, identified and refined, in closed loop with the controller twin (a separate twin)
+dynamics    the identified derivatives model in closed loop with the controller twin, independent of model selection
 """
 
 from collections.abc import Callable
@@ -27,22 +27,22 @@ from twin_worker.telemetry.track import STEP, Track
 from twin_worker.twin.state.state import Twin
 from twin_worker.twin.state.vehicle_class import NO_WINGS
 
-_VELOCITY_S = 0.3  # mean that is the velocity now [s]
-_TURN_S = 1.5  # stretch its turn rate is fitted on [s]
-_OFF_S, _REJOIN_S = 6.0, 4.0  # an offset and a speed beside the line die out within [s]
-_SPEED_UP_S = 4.0  # the wanted speed along the line is taken up within [s]
-_SLOWEST = 1.0  # along a line [m/s]
-_LOOK_BACK_S = 62.0  # telemetry a flight ahead starts from [s]
+_VELOCITY_S = 0.3  # averaging time of the present velocity [s]
+_TURN_S = 1.5  # window of the turn rate fit [s]
+_OFF_S, _REJOIN_S = 6.0, 4.0  # time constants with which cross-track offset and speed decay [s]
+_SPEED_UP_S = 4.0  # time constant of the approach to the commanded speed [s]
+_SLOWEST = 1.0  # minimum speed along the route [m/s]
+_LOOK_BACK_S = 62.0  # telemetry before a closed-loop prediction [s]
 
 
 @dataclass(frozen=True)
 class Now:
-    """Everything a method may use.
+    """Input of a baseline method.
 
     Attributes:
-        twin: what was heard so far, and learnt from it
-        flown: positions and velocities of late, unbroken
-        ahead: wanted look-ahead from the end of `flown`, rising, (k,) [s]
+        twin: telemetry so far, and the models identified from it
+        track: recent positions and velocities, without gaps
+        ahead: look-ahead from the end of `track`, rising, (k,) [s]
     """
 
     twin: Twin
@@ -56,17 +56,17 @@ class Now:
 
     @property
     def v(self) -> np.ndarray:
-        """Return the velocity now, NED, (3,) [m/s]."""
+        """Return the present velocity, NED, (3,) [m/s]."""
         return self.flown.v[-round(_VELOCITY_S / STEP) :].mean(axis=0)
 
 
 def straight(now: Now) -> np.ndarray:
-    """Hold the velocity, (k, 3) [m]."""
+    """Predict at constant velocity, (k, 3) [m]."""
     return now.p + np.outer(now.ahead, now.v)
 
 
 def turning(now: Now) -> np.ndarray:
-    """Hold turn rate and speed, (k, 3) [m]."""
+    """Predict at constant turn rate and speed, (k, 3) [m]."""
     recent = now.flown.v[-round(_TURN_S / STEP) :]
     course = np.unwrap(np.arctan2(recent[:, 1], recent[:, 0]))
     rate = float(np.polyfit(STEP * np.arange(len(course)), course, 1)[0]) if len(course) > 3 else 0.0
@@ -77,12 +77,12 @@ def turning(now: Now) -> np.ndarray:
 
 
 def on_route(now: Now) -> np.ndarray | None:
-    """Follow the mission at the present ground speed, (k, 3) [m]; None without one."""
+    """Predict along the mission at the present ground speed, (k, 3) [m]; None without a mission."""
     return _ride(now, lambda points: np.full(len(points) - 1, np.hypot(*now.v[:2])))
 
 
 def on_route_in_wind(now: Now) -> np.ndarray | None:
-    """Follow the mission at the commanded airspeed through the estimated wind, (k, 3) [m]; None without a mission."""
+    """Predict along the mission at the commanded airspeed in the estimated wind, (k, 3) [m]; None without a mission."""
     if now.twin.vehicle in NO_WINGS:
         return _ride(now, lambda points: _level_speed(now, points))
     wind = now.twin.wind.wind if np.isfinite(now.twin.wind.t) else None
@@ -93,7 +93,7 @@ def on_route_in_wind(now: Now) -> np.ndarray | None:
 
     def ground_speed(points: np.ndarray) -> np.ndarray:
         commanded = points[1:, 3]
-        # a leg that commands none is flown as now: after a jump back that is seldom the cruise of the parameters
+        # a leg without commanded airspeed keeps the present one: after a jump back it is seldom the cruise parameter
         flown = commanded[0] <= 0 or "AIRSPEED_CRUISE" in absent
         cruise = V if flown else par[P.VA_CRUISE] * scale
         Va = np.where(commanded > 0, commanded * scale, cruise)
@@ -106,15 +106,15 @@ def on_route_in_wind(now: Now) -> np.ndarray | None:
 
 
 def _level_speed(now: Now, points: np.ndarray) -> np.ndarray:
-    """Return the speed of what hangs on rotors: as commanded, else as flown."""
+    """Return the speed of a multirotor: as commanded, else the present speed."""
     return np.where(points[1:, 3] > 0, points[1:, 3], np.hypot(*now.v[:2]))
 
 
 def _ride(now: Now, ground_speed: Callable[[np.ndarray], np.ndarray]) -> np.ndarray | None:
-    """Ride along the route at a speed by point, from the speed and the place it has now.
+    """Predict along the route at the ground speed of each point, from the present position and velocity.
 
-    Progress starts at the velocity's share along the line and takes up the wanted speed with `_SPEED_UP_S`, which is
-    how a turn onto the line costs time; what position and velocity have across it dies out.
+    Speed starts at the along-track component of the velocity and approaches the commanded speed with time constant
+    `_ACCELERATION_S`, which models the time lost in a turn onto the route; cross-track position and velocity decay.
     """
     points = _line(now)
     if points is None:
@@ -135,7 +135,7 @@ def _ride(now: Now, ground_speed: Callable[[np.ndarray], np.ndarray]) -> np.ndar
 
 
 def _line(now: Now) -> np.ndarray | None:
-    """Return the route ahead as points; None where the aircraft follows none, or which part of it is not known."""
+    """Return the route ahead as points; None without a route or without a known active item."""
     twin = now.twin
     if twin.why_no_route() or twin.mission is None or twin.origin is None:
         return None
@@ -155,7 +155,7 @@ def _line(now: Now) -> np.ndarray | None:
 
 
 def coupled(now: Now) -> np.ndarray | None:
-    """Fly the identified coupled model in closed loop, (k, 3) [m]; None where there is none or no route."""
+    """Predict with the identified derivatives model in closed loop, (k, 3) [m]; None without model or route."""
     twin = now.twin
     window = twin.window(_LOOK_BACK_S)
     if not isinstance(twin.plant, Coupled) or window is None or not window.ok[-1] or twin.why_no_route():

@@ -1,7 +1,7 @@
-"""The route ahead as a line of points: straight legs, circles with their tangents, corners as they are drawn.
+"""Route ahead as a line of points: straight legs, circles with their tangents, sharp corners.
 
-Columns of a point: north, east, down [m], commanded airspeed [m/s], 0 for cruise. What a ground station shows, no more:
-no guidance, no bank, no energy.
+Columns of a point: north, east, down [m], commanded airspeed [m/s], 0 for cruise. The line is purely geometric, as
+drawn by a ground station: no guidance, bank angle or energy.
 """
 
 from collections.abc import Iterator
@@ -27,21 +27,21 @@ from fleet.mission import (
 
 _CIRCLES = (LOITER_TURNS, LOITER_UNLIMITED, LOITER_TIME, LOITER_TO_ALT)
 _STEP = 5.0  # between points [m]
-_ON_CIRCLE = 1.3  # within so many radii it circles [-]
-_LATE = 0.6  # past the course to the next target by less, a circle is left at once [rad]
+_ON_CIRCLE = 1.3  # an aircraft within this many radii is on the circle [-]
+_LATE = 0.6  # a circle is left at once if the exit direction was passed by less than this [rad]
 _CLIMB = 2.5  # climb while circling to an altitude [m/s]
 
 
 @dataclass(frozen=True)
 class Ride:
-    """What the line depends on beside the route.
+    """Inputs of the line besides the route.
 
     Attributes:
-        p: where the aircraft is, NED, (3,) [m]
-        past: where it was on the item in force, NED, oldest first, (n, 3) [m]
+        position: of the aircraft, NED, (3,) [m]
+        on_item: positions since the active item began, NED, oldest first, (n, 3) [m]
         speed: usual ground speed [m/s]
-        par: autopilot parameters
-        length: of line wanted [m]
+        params: autopilot parameters
+        length: required length of the line [m]
     """
 
     p: np.ndarray
@@ -52,7 +52,7 @@ class Ride:
 
 
 def line(way: Route, ride: Ride) -> np.ndarray:
-    """Return the route from abreast of the aircraft on, points every few metres, (n, 4)."""
+    """Return the route from the point abeam the aircraft on, points every few metres, (n, 4)."""
     parts, left = [], ride.length
     at = way.start if np.isfinite(way.start).all() else ride.past[0]
     at = _abreast(at, way.legs[0, P_N : P_D + 1], ride.p)
@@ -68,14 +68,14 @@ def line(way: Route, ride: Ride) -> np.ndarray:
 
 
 def _abreast(start: np.ndarray, end: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return the point of a straight leg nearest to the aircraft, seen from above, (3,) [m]."""
+    """Return the point of a straight leg horizontally nearest to the aircraft, (3,) [m]."""
     way = end - start
     share = (p[:2] - start[:2]) @ way[:2] / max(float(way[:2] @ way[:2]), 1e-6)
     return start + np.clip(share, 0.0, 1.0) * way
 
 
 def _leg(leg: np.ndarray, at: np.ndarray, after: np.ndarray | None, ride: Ride, *, first: bool) -> Iterator[np.ndarray]:
-    """Return the points of one leg, (n, 3) each part: the way there, then the circle."""
+    """Yield the points of one leg, (n, 3) each part: the straight part, then the circle."""
     target = leg[P_N : P_D + 1]
     if int(leg[KIND]) not in _CIRCLES:
         yield _straight(at, target, ride.length)
@@ -101,7 +101,7 @@ def _leg(leg: np.ndarray, at: np.ndarray, after: np.ndarray | None, ride: Ride, 
 
 
 def _straight(start: np.ndarray, end: np.ndarray, longest: float) -> np.ndarray:
-    """Return points from start towards end, no farther than is wanted, (n, 3) [m]."""
+    """Return points from start towards end, up to a maximum length, (n, 3) [m]."""
     length = hypot(*(end - start)[:2])
     share = min(longest / max(length, 1e-6), 1.0)
     along = np.linspace(0.0, share, int(share * length / _STEP) + 2)[:, None]
@@ -109,7 +109,7 @@ def _straight(start: np.ndarray, end: np.ndarray, longest: float) -> np.ndarray:
 
 
 def _swept(past: np.ndarray, centre: np.ndarray, within: float) -> float:
-    """Return the angle already flown around a centre, since the circle was reached [rad]."""
+    """Return the angle flown around a centre since the circle was reached [rad]."""
     out = past[:, :2] - centre[:2]
     near = np.hypot(*out.T) < within
     on = out[int(np.argmax(near)) :] if near.any() else out[:0]
@@ -118,7 +118,7 @@ def _swept(past: np.ndarray, centre: np.ndarray, within: float) -> float:
 
 
 def _arc(leg: np.ndarray, R: float, at: np.ndarray, ride: Ride) -> float:
-    """Return the angle to circle by the item's own measure [rad]."""
+    """Return the angle to circle according to the item: turns, time or altitude [rad]."""
     kind = int(leg[KIND])
     if kind == LOITER_TURNS:
         return 2 * pi * leg[TURNS]
@@ -126,11 +126,11 @@ def _arc(leg: np.ndarray, R: float, at: np.ndarray, ride: Ride) -> float:
         return leg[TURNS] * ride.speed / R
     if kind == LOITER_TO_ALT:
         return abs(leg[P_D] - at[2]) / _CLIMB * ride.speed / R
-    return ride.length / R + 2 * pi  # for good
+    return ride.length / R + 2 * pi  # unlimited
 
 
 def _to_tangent(angle: float, centre: np.ndarray, after: np.ndarray, circle: tuple[float, float]) -> float:
-    """Return how much further to circle until the course points at the next target [rad]."""
+    """Return the further angle to circle until the course points at the next target [rad]."""
     R, side = circle
     out = after - centre[:2]
     leave = atan2(out[1], out[0]) - side * acos(R / max(hypot(*out), R))

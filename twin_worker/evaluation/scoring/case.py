@@ -1,4 +1,4 @@
-"""One start: what every method said of the seconds to come, and what then happened."""
+"""One evaluated start: the forecasts of every method, and the actual flight."""
 
 from dataclasses import dataclass
 
@@ -11,11 +11,11 @@ OURS = "ours"
 
 @dataclass(frozen=True)
 class Told:
-    """What one method said at one start.
+    """Forecast of one method at one start.
 
     Attributes:
         path: NED, (k, 3) [m]
-        made_by: what really made it: the method itself, or what stood in for it
+        source: the method itself, or the fallback that replaced it
         tube: half-axes along, cross, vertical, (k, 3) [m]; None where the method has none
         horizon_s: confidence horizon [s]; nan where the method has none
     """
@@ -28,19 +28,19 @@ class Told:
 
 @dataclass(frozen=True)
 class Asked:
-    """One start, as far as it was known then.
+    """One start with the data available at that time.
 
     Attributes:
-        flight, uav: whose
-        t: when the look-ahead begins [s since 1970]
-        first_s: seconds since the first sample [s]
+        flight, uav: flight name and UAV id
+        t: time of look-ahead 0 [s since 1970]
+        first_s: time since the first sample [s]
         ahead: look-ahead of every method, rising, (k,) [s]
         origin: of the NED frame of all paths
         speed: over ground, climb included [m/s]
-        follows: why no mission was followed, or empty
-        group: method / law / vehicle / parameters of ours
-        told: by method
-        spread: of our ensemble along, cross, vertical, (k, 3) [m]; nan without one
+        no_route_reason: why the aircraft follows no mission; empty: it follows one
+        group: calibration group of ours: method / law / vehicle / parameters
+        forecasts: by method
+        spread: ensemble spread of ours along, cross, vertical, (k, 3) [m]; nan without an ensemble
     """
 
     flight: str
@@ -58,15 +58,15 @@ class Asked:
 
 @dataclass(frozen=True)
 class Case:
-    """One start and what happened.
+    """One start and the actual flight after it.
 
     Attributes:
-        asked: the start
-        flown: NED, nan where not known, (k, 3) [m]
-        length: path flown so far, at least two seconds of ground speed, (k,) [m]
-        phase: climb, level, turn or descent, by what was flown next
+        start: the start
+        positions: flown positions, NED, nan where unknown, (k, 3) [m]
+        length: path length flown, at least two seconds of ground speed, (k,) [m]
+        phase: climb, level, turn or descent, from the flight after the start
         route: mission on board, NED, (n, 3) [m]
-        apart: why this start does not count; empty: it counts
+        exclusion: reason for exclusion; empty: included
     """
 
     asked: Asked

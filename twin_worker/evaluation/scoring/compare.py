@@ -1,6 +1,6 @@
-"""Ours against every other method on the same starts: paired differences with intervals that know the flights.
+"""Comparison of ours with every other method on the same starts: paired differences with confidence intervals.
 
-Starts of one flight depend on each other, so flights are drawn, not starts.
+Starts of one flight are dependent, so the bootstrap resamples flights, not starts.
 Source: Davison & Hinkley 1997, "Bootstrap methods and their application", section 3.8 (cluster bootstrap, percentile).
 """
 
@@ -21,11 +21,11 @@ BEATEN, MATCHED, WORSE, ONE_FLIGHT = "beaten", "matched", "worse", "one flight, 
 
 
 def compare(scores: dict[str, Scores]) -> dict[str, Any]:
-    """Give, by method, ours minus it: mean first passage up to 60 s, median errors; and the verdict on each.
+    """Compare ours with each method: difference (ours minus other) of mean first passage up to 60 s and median errors.
 
     Returns:
         by method: `t10_s`, `p50_16_m`, `p50_60_m`, each with difference, low, high, verdict; `skill_16`, `skill_60`:
-        1 - median error of ours over its
+        1 - median error of ours / median error of the other
     """
     ours = scores.get(OURS)
     return {name: _against(ours, other) for name, other in scores.items() if ours is not None and name != OURS}
@@ -49,12 +49,12 @@ def _against(ours: Scores, other: Scores) -> dict[str, Any]:
 def _difference(
     pairs: np.ndarray, flight: np.ndarray, middle: Callable[..., Any], *, better: float
 ) -> dict[str, float | str | None]:
-    """Return the difference of two middles, ours first, its 95 % interval over flights, and the verdict.
+    """Return the difference of a statistic (ours minus other), its 95 % interval over flights, and the verdict.
 
     Args:
         pairs: ours and the other at each start, (s, 2)
-        flight: whose start, (s,)
-        middle: mean or median
+        flight: flight of each start, (s,)
+        statistic: mean or median
         better: sign of a difference in our favour
     """
     names = np.unique(flight)

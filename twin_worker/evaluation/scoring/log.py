@@ -1,4 +1,4 @@
-"""What one aircraft really did: positions, and the events that end what a prediction can be asked for."""
+"""Actual flight of one aircraft: positions, and the events that end the scoring of a prediction."""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from fleet.contract import Item, Message, Mission, Params, Sample, Status
 from fleet.frames import Origin, to_ned
 from twin_worker.telemetry.history import History
 
-_HOLE_S = 2.0  # positions farther away than this say nothing of an instant [s]
+_HOLE_S = 2.0  # an instant without a position within this time is in a telemetry gap [s]
 _LANDING = (21, 85)  # MAV_CMD: NAV_LAND, NAV_VTOL_LAND
 _FOR_EVER = 1e9  # [s]
 
 
 class Log:
-    """Positions and events of one stretch between two jumps of the clock."""
+    """Positions and events between two clock jumps."""
 
     def __init__(self) -> None:
         self.begun = np.nan  # first sample [s since 1970]
@@ -27,7 +27,7 @@ class Log:
         self._positions: tuple[np.ndarray, np.ndarray] | None = None
 
     def hear(self, message: Message) -> None:
-        """Take one message from the recording."""
+        """Add one message of the recording."""
         if isinstance(message, Sample):
             self._hear_sample(message)
         elif isinstance(message, Status):
@@ -56,12 +56,12 @@ class Log:
     def _hear_status(self, status: Status) -> None:
         if self.status and self.status.mode and status.mode != self.status.mode:
             self.events.append((status.t, "mode changed"))
-        if self._armed and not status.armed:  # and every second it stays so: those starts are on the ground
+        if self._armed and not status.armed:  # repeated while disarmed: those starts are on the ground
             self.events.append((status.t, "disarmed"))
         self.status, self._armed = status, self._armed or status.armed
 
     def until(self, t: float) -> tuple[float, str]:
-        """Return the first event after `t` or the recording's end [s since 1970], and which it is."""
+        """Return the time of the first event after `t`, or of the recording's end [s since 1970], and its name."""
         after = [(self.ended_at(), "recording ends"), *((at, why) for at, why in self.events if at > t)]
         return min(after)
 
@@ -71,12 +71,12 @@ class Log:
         return float(t[-1]) if len(t) else -np.inf
 
     def flown(self, origin: Origin, at: np.ndarray) -> np.ndarray:
-        """Return where it was at times `at`, NED, straight across holes, (n, 3) [m]."""
+        """Return the positions at some instants, NED, interpolated linearly across gaps, (n, 3) [m]."""
         t, place = self._rows()
         return np.column_stack([np.interp(at, t, column) for column in to_ned(origin, *place.T).T])
 
     def seen(self, at: np.ndarray) -> np.ndarray:
-        """Tell at which times a position was received nearby, (n,) bool."""
+        """Return whether a position was received close to each instant, (n,) bool."""
         t, _ = self._rows()
         right = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
         return np.minimum(np.abs(t[right] - at), np.abs(at - t[right - 1])) <= _HOLE_S

@@ -1,8 +1,8 @@
 """Scores of one method over many starts: relative error, first passages, axes, coverage, horizon.
 
-M1 is |p_hat - p| / max(path flown, 2 s of ground speed), M2 the same over max(displacement, 2 s of ground speed); both
-first passages are censored where the flight was followed no further. Quantiles of censored times are Kaplan and
-Meier's.  Source: Kaplan & Meier 1958, "Nonparametric estimation from incomplete observations".
+M1 is |p_hat - p| / max(path flown, 2 s of ground speed), M2 is |p_hat - p| / max(displacement, 2 s of ground speed).
+First passages are censored at the end of the known flight; their quantiles are Kaplan-Meier estimates.
+Source: Kaplan & Meier 1958, "Nonparametric estimation from incomplete observations".
 """
 
 from collections.abc import Sequence
@@ -13,21 +13,21 @@ import numpy as np
 from twin_worker.evaluation.scoring.case import Case
 from twin_worker.numerics.prediction_errors import LIMIT, along_cross_down, first_passage, least_length, track_frame
 
-LIMITS = (0.10, 0.05, 0.03)  # relative errors whose first passage is told [-]
+LIMITS = (0.10, 0.05, 0.03)  # relative errors whose first passage is reported [-]
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How one method fared, one row a start.
+    """Scores of one method, one row per start.
 
     Attributes:
         ahead: look-ahead, (k,) [s]
-        flight: whose, (s,)
-        made_by: what really predicted, (s,)
+        flight: flight of each start, (s,)
+        source: the method itself or its fallback, (s,)
         error: along, cross, vertical in the frame of the predicted path, signed, nan unknown, (s, k, 3) [m]
         distance: nan unknown, (s, k) [m]
         passages: by limit, first passage of M1 and whether it is censored, (s, 2) [s, 0 or 1]
-        strict: the same for M2 at 10 %, (s, 2)
+        m2_passages: first passage of M2 at 10 % and whether it is censored, (s, 2) [s, 0 or 1]
         tube: half-axes, nan where the method has none, (s, k, 3) [m]
         horizon: nan where the method has none, (s,) [s]
     """
@@ -43,7 +43,7 @@ class Scores:
     horizon: np.ndarray
 
     def at(self, seconds: float) -> int | None:
-        """Return the column of a look-ahead; None where predictions do not reach so far."""
+        """Return the column of a look-ahead; None if the grid has none there."""
         found = np.flatnonzero(np.abs(self.ahead - seconds) < 0.5)
         return int(found[0]) if len(found) else None
 
@@ -54,7 +54,7 @@ class Scores:
         return np.where(known, (np.abs(self.error) <= self.tube).all(axis=2), np.nan)
 
     def part(self, rows: np.ndarray) -> "Scores":
-        """Choose rows."""
+        """Return the scores of these rows."""
         passages = {limit: found[rows] for limit, found in self.passages.items()}
         return Scores(
             self.ahead,
@@ -70,7 +70,7 @@ class Scores:
 
 
 def score(cases: Sequence[Case], method: str) -> Scores:
-    """Score one method over starts that all have the same look-aheads."""
+    """Score one method over starts with the same look-aheads."""
     told = [case.asked.told[method] for case in cases]
     flown, path = np.array([case.flown for case in cases]), np.array([one.path for one in told])
     distance = np.linalg.norm(flown - path, axis=2)
@@ -100,7 +100,7 @@ def passages(relative: np.ndarray, ahead: np.ndarray, limit: float) -> np.ndarra
     """Return the first passage of a limit by start and whether it is censored, (s, 2) [s, 0 or 1].
 
     Args:
-        relative: relative errors, nan where not known, (s, k) [-]
+        relative: relative errors, nan where unknown, (s, k) [-]
         ahead: look-ahead, (k,) [s]
         limit: relative error [-]
     """
@@ -112,13 +112,13 @@ def passages(relative: np.ndarray, ahead: np.ndarray, limit: float) -> np.ndarra
 
 
 def quantile(found: np.ndarray, share: float) -> float:
-    """Return the time at which a share of the starts has passed, by Kaplan and Meier [s].
+    """Return the Kaplan-Meier estimate of the time at which a share of the starts has passed [s].
 
     Args:
-        found: times and whether they are censored, (s, 2) [s, 0 or 1]
+        passages: times and whether they are censored, (s, 2) [s, 0 or 1]
         share: 0..1
     Returns:
-        the time; the longest followed where fewer passed; nan without starts
+        the time; the longest follow-up time where fewer passed; nan without starts
     """
     if not len(found):
         return float("nan")
@@ -130,5 +130,5 @@ def quantile(found: np.ndarray, share: float) -> float:
 
 
 def surviving(found: np.ndarray, seconds: float) -> float:
-    """Return the share still within the limit after so long, every start followed so far; nan without starts."""
+    """Return the share within the limit at a time up to which all starts were followed [s]; nan without starts."""
     return float(np.mean(found[:, 0] >= seconds - 1e-6)) if len(found) else float("nan")

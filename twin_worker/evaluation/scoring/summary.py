@@ -1,4 +1,4 @@
-"""The figures of every method over all starts that count, as the table and the JSON show them."""
+"""Summary figures of every method over the included starts, for table and JSON."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -13,14 +13,14 @@ from twin_worker.evaluation.scoring.score import LIMITS, Scores, quantile, score
 from twin_worker.evaluation.scoring.truth import WHOLE_S
 from twin_worker.telemetry.flight_phase import MODES
 
-LOOK_S = (5, 10, 16, 30, 60, 120, 180)  # look-aheads that are told, as far as predictions reach [s]
+LOOK_S = (5, 10, 16, 30, 60, 120, 180)  # reported look-aheads, as far as predictions reach [s]
 _HEAD = ("t10", "t5", "t3")
 
 
 def summary(cases: Sequence[Case]) -> dict[str, Any]:
-    """Return the figures of every method by its name, then how ours compares, and what was not counted.
+    """Compute the figures of every method, the comparison with ours, and the excluded starts.
 
-    Keys: every method's name; `compare`, by method; `apart`, starts that do not count, by reason.
+    Keys: every method's name; `compare`, by method; `apart`, excluded starts by reason.
     """
     counted = [case for case in cases if not case.apart]
     names = list(dict.fromkeys(name for case in counted for name in case.asked.told))
@@ -34,7 +34,7 @@ def summary(cases: Sequence[Case]) -> dict[str, Any]:
 
 
 def figures(found: Scores) -> dict[str, Any]:
-    """Return the figures of one method."""
+    """Compute the figures of one method."""
     look = {str(s): column for s in LOOK_S if (column := found.at(s)) is not None}
     stand_ins = Counter(found.made_by.tolist())
     out: dict[str, Any] = {}
@@ -57,7 +57,7 @@ def figures(found: Scores) -> dict[str, Any]:
 
 
 def _trust(found: Scores, look: dict[str, int]) -> dict[str, Any]:
-    """Return coverage, size of the tube, and what the horizon was worth; null where the method claims nothing."""
+    """Compute coverage and size of the tube, and accuracy of the horizon; null for a method without them."""
     inside = found.inside
     by_flight = [inside[found.flight == name] for name in np.unique(found.flight)]
     worst = {s: min((_mean(rows[:, k]) for rows in by_flight), default=np.nan) for s, k in look.items()}
@@ -74,9 +74,9 @@ def _trust(found: Scores, look: dict[str, int]) -> dict[str, Any]:
 
 
 def _horizon(found: Scores) -> tuple[float, float]:
-    """Return the share that stayed within 10 % up to its horizon, and Spearman's correlation of horizon and passage.
+    """Compute the share that stayed within 10 % up to its horizon, and Spearman's correlation of horizon and passage.
 
-    A horizon beyond what was followed is judged up to there.
+    A horizon beyond the follow-up time is evaluated up to that time.
     """
     known = np.isfinite(found.horizon)
     if not known.any():
@@ -91,7 +91,7 @@ def _horizon(found: Scores) -> tuple[float, float]:
 
 
 def _phases(found: Scores, phases: np.ndarray) -> dict[str, Any]:
-    """Return passages and errors by the phase flown next."""
+    """Compute passages and errors by flight phase after the start."""
     out = {}
     for phase in MODES:
         if not (rows := phases == phase).any():
@@ -110,7 +110,7 @@ def _phases(found: Scores, phases: np.ndarray) -> dict[str, Any]:
 
 
 def _apart(cases: Sequence[Case]) -> dict[str, Any]:
-    """Return how many starts do not count and how ours fared at them while it could be followed, by reason."""
+    """Compute the number of excluded starts and the first passages of ours at them, by reason."""
     out = {}
     for why, n in Counter(case.apart for case in cases if case.apart).most_common():
         its = score([case for case in cases if case.apart == why], "ours")
@@ -120,7 +120,7 @@ def _apart(cases: Sequence[Case]) -> dict[str, Any]:
 
 
 def _followed(found: Scores) -> float | None:
-    """Return the longest any start was followed [s]."""
+    """Return the longest follow-up time of any start [s]."""
     known = np.isfinite(found.distance).any(axis=0)
     return _round(float(found.ahead[known][-1])) if known.any() else None
 

@@ -1,4 +1,4 @@
-"""What happened after a start, and whether the start counts."""
+"""Actual flight after a start, and whether the start is included."""
 
 import numpy as np
 
@@ -9,19 +9,19 @@ from twin_worker.evaluation.scoring.log import Log
 from twin_worker.numerics.prediction_errors import path_length
 from twin_worker.telemetry.flight_phase import mode_named
 
-FIRST_S = 120.0  # a start counts from here on: before, the twin has not seen its identification window [s]
-WHOLE_S = 60.0  # a start counts where so much was flown without an event [s]
-_PHASE_S = 10.0  # the flight after a start that names its phase [s]
-_STILL = 3.0  # slower than this, what has wings is on the ground [m/s]
+FIRST_S = 120.0  # minimum time since the first sample: the identification window must be complete [s]
+WHOLE_S = 60.0  # minimum flight without an event after a start [s]
+_PHASE_S = 10.0  # flight after a start that determines its phase [s]
+_STILL = 3.0  # a slower fixed wing is on the ground [m/s]
 
 
 def answer(log: Log, asked: Asked) -> Case:
-    """Lay what was flown beside what was asked; look-aheads after an event or in a hole stay unknown."""
+    """Attach the actual flight to a start; look-aheads after an event or in a telemetry gap are unknown."""
     end, why = log.until(asked.t)
     at = asked.t + asked.ahead
     flown = log.flown(asked.origin, at)
     flown[(at > end) | ~log.seen(at)] = np.nan
-    grid = np.arange(0.0, asked.ahead[-1] + 1.0)  # at 1 s noise lengthens no path, and no turn is cut
+    grid = np.arange(0.0, asked.ahead[-1] + 1.0)  # 1 s: position noise adds no length, and turns are resolved
     length = path_length(log.flown(asked.origin, asked.t + grid), asked.speed)
     return Case(
         asked=asked,
@@ -34,7 +34,7 @@ def answer(log: Log, asked: Asked) -> Case:
 
 
 def _apart(log: Log, asked: Asked, end: float, why: str) -> str:
-    """Say why a start does not count, or nothing."""
+    """Return the reason for exclusion of a start; empty: included."""
     wings = log.status is not None and log.status.vehicle == "fixed_wing"
     if asked.follows:
         return asked.follows
@@ -50,7 +50,7 @@ def _apart(log: Log, asked: Asked, end: float, why: str) -> str:
 
 
 def _phase(log: Log, asked: Asked) -> str:
-    """Name what was flown next, by the bank its turn takes and its climb; positions are enough for both."""
+    """Return the flight phase after a start, from bank angle and climb rate computed from positions."""
     p = log.flown(asked.origin, asked.t + np.arange(0.0, _PHASE_S + 1.0))
     v = np.diff(p, axis=0)
     course = np.unwrap(np.arctan2(v[:, 1], v[:, 0]))
@@ -60,6 +60,6 @@ def _phase(log: Log, asked: Asked) -> str:
 
 
 def _route(log: Log, asked: Asked) -> np.ndarray:
-    """Return the corners of the whole mission, for pictures only, (n, 3) [m]."""
+    """Return the corners of the whole mission, for figures only, (n, 3) [m]."""
     legs = route(log.items, seq=1, origin=asked.origin, params={}).legs if len(log.items) > 1 else np.empty((0, 9))
     return legs[:, P_N : P_D + 1]
