@@ -157,7 +157,7 @@ REFUSED = {  # before anything is begun
 }
 REFUSED_LATER = {
     ("--router", "nowhere"): "--router: found 'nowhere', expected",
-    ("--router", "tcp/192.0.2.1:7447"): "nobody answers and none can be opened here",
+    ("--router", "tcp/192.0.2.1:7447"): "no response, and no router can be opened here",
     ("--link", "ftp:a:1"): "--link: found 'ftp:a:1', expected udpin:HOST:PORT",
 }
 
