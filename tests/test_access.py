@@ -183,10 +183,10 @@ def test_an_authority_is_replaced_without_anyone_being_shut_out(tmp_path: Path) 
     assert script("router", site, "127.0.0.1").returncode == 0 and script("drop-ca", site).returncode == 0
     with open_router(Entry(at, certificates=site)):
         assert answers(Entry(at, "worker", site))
-        with pytest.raises(ConnectionError, match="not to be believed"):
+        with pytest.raises(ConnectionError, match="found its certificate not valid"):
             answers(Entry(at, "worker", old))
         shutil.copy(site / "ca.pem", old)
-        with pytest.raises(ConnectionError, match="refuses us as worker"):
+        with pytest.raises(ConnectionError, match="certificate of worker rejected"):
             answers(Entry(at, "worker", old))
 
 
