@@ -79,7 +79,7 @@ def test_paths_hold_wherever_what_is_written_with_them_is_read(
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("[router", "is no TOML"),
+        ("[router", "found invalid TOML"),
         ("[gateway]\nlink = 1", "found 'gateway' in"),
         ('[router]\nca = "x"', "found 'ca' in .* at, certificates, passwords at most"),
         ("[router]\nat = 7447", "a value that is no text"),

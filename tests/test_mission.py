@@ -139,7 +139,7 @@ BAD = {
     "nan home": ([waypoint(0, 0, alt_m=NAN), waypoint(2, 2)], 1, "item 0"),
     "item lost": ([HOME, waypoint(2, 2)], 1, "found 2 of 3 items"),
     "jump circle": ([HOME, jump(1, 1, -1), waypoint(2, 2)], 1, "item 1: found a jump loop"),
-    "jump circle of two": ([HOME, jump(1, 2, -1), jump(2, 1, -1), waypoint(3, 2)], 1, "jump circle"),
+    "jump circle of two": ([HOME, jump(1, 2, -1), jump(2, 1, -1), waypoint(3, 2)], 1, "jump loop"),
     "jump too far": ([HOME, jump(1, 9, 1), waypoint(2, 2)], 1, "item 1: found jump to 9"),
     "jump home": ([HOME, jump(1, 0, 1), waypoint(2, 2)], 1, "item 1: found jump to 0"),
     "jump to nan": ([HOME, jump(1, NAN, 1), waypoint(2, 2)], 1, "item 1: found jump to nan"),
@@ -204,7 +204,7 @@ def test_without_home_item_0_is_flown_and_jumps_go_to_it():
     assert np.isnan(r.start).all()
     assert seqs(without_home([waypoint(0, 1)], seq=99)) == [0, -1]
     empty = without_home([])
-    assert not len(empty.legs) and "one at least" in empty.sentences[0]
+    assert not len(empty.legs) and "at least one" in empty.sentences[0]
 
 
 def test_without_home_circles_have_a_radius_and_an_exit_of_their_own():
