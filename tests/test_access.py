@@ -81,12 +81,12 @@ def test_paths_hold_wherever_what_is_written_with_them_is_read(
     [
         ("[router", "found invalid TOML"),
         ("[gateway]\nlink = 1", "found 'gateway' in"),
-        ('[router]\nca = "x"', "found 'ca' in .* at, certificates, passwords at most"),
-        ("[router]\nat = 7447", "a value that is no text"),
+        ('[router]\nca = "x"', "found 'ca' in .* at, certificates, passwords; correct it"),
+        ("[router]\nat = 7447", "a value that is not a string"),
         ('[router]\nat = "udp/x:1"', "--router: found 'udp/x:1'"),
         ('[router]\nat = "tls/x:1"', "tls/x:1 without certificates"),
         ('[router]\ncertificates = "c"', "tcp/127.0.0.1:7447 with certificates"),
-        ("router = 3", "expected \\[router\\]"),
+        ("router = 3", "expected only \\[router\\]"),
     ],
 )
 def test_a_file_that_makes_no_sense_is_refused_in_a_sentence(tmp_path: Path, text: str, sentence: str) -> None:

@@ -185,7 +185,7 @@ def test_a_busy_port_is_refused_in_one_sentence() -> None:
         with process("fleet.cli", "up", *ports, "--mavlink", f"127.0.0.1:{held.getsockname()[1]}") as up:
             code, _, errors = ended(up)
     assert code == 2
-    assert errors.count("\n") == 1 and "is a fleet already up? name another" in errors
+    assert errors.count("\n") == 1 and "stop the other fleet, or name another port" in errors
 
 
 # --- a recording -----------------------------------------------------------------------------------------------------
