@@ -11,7 +11,7 @@ from fleet.process.logs import tell
 EXAMPLES = """
   fleet assess flight.tlog
   fleet assess monday/*.tlog.xz --out monday --json monday.json --jobs 2
-  fleet assess flight.tlog --methods route_wind --without-params     the twin against one method, without autopilot parameters
+  fleet assess flight.tlog --methods route_wind --without-params     without autopilot parameters
 """
 OWN = ("auto", "dynamics", "hybrid", "paper")
 METHODS = ("cv", "ct", "imm", "route", "route_wind", "paper", "dynamics")
