@@ -195,7 +195,7 @@ def test_the_script_refuses_what_would_lose_something(papers: Path, tmp_path: Pa
     again = script("ca", papers)
     assert again.returncode == 2 and "found" in again.stderr and (papers / "ca.key").read_bytes() == before
     assert "found role 'pilot'" in script("role", papers, "pilot").stderr
-    assert "make it first: ca" in script("role", tmp_path, "worker").stderr
+    assert "create it first: ca" in script("role", tmp_path, "worker").stderr
     assert script("router", papers).returncode == 2 and script().returncode == 2
     shown = script("show", papers).stdout
     assert all(f"{role}.pem: subject=CN = {role}" in shown for role in (*ROLES, ROUTER_ROLE))

@@ -46,7 +46,7 @@ _PUT_ASIDE = 20_000  # messages of a class buffered until `dispatch`
 _UNHEARD = 4096  # messages of a subscription, or queries of a queryable, waiting for Python; the oldest are dropped
 _ANSWERS = 4096  # replies waiting to be read
 _SHORT = {"priority": zenoh.Priority.DATA_HIGH}  # queries and replies of kilobytes: a queue separate from telemetry
-_LARGE = {  # replies of megabytes: telemetry and predictions overtake them, and a slow reader blocks nobody
+_LARGE = {  # replies of megabytes: telemetry and predictions overtake them, and a slow reader blocks no one else
     "priority": zenoh.Priority.DATA_LOW,
     "congestion_control": zenoh.CongestionControl.DROP,
 }

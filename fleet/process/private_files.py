@@ -8,7 +8,7 @@ _WRITABLE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def trouble(path: Path) -> str:
-    """Return the reason for which another local user could change the content of a path; empty: nobody can.
+    """Return the reason for which another local user could change the content of a path; empty: none could.
 
     The current user must own the path. The current user or root must own each parent folder, and others may write to
     a parent only where it is sticky.
