@@ -1,5 +1,5 @@
 #!/bin/sh
-# Find a browser for the viewer's tests; install one where we may, else say how. Called by `make test`.
+# Find a browser for the viewer's tests; install one if permitted, else print how. Called by `make test`.
 set -eu
 
 has_browser() {
@@ -18,5 +18,5 @@ if command -v apt-get >/dev/null; then
     DEBIAN_FRONTEND=noninteractive $as apt-get -qq install -y chromium >/dev/null 2>&1 || true
 fi
 has_browser && exit 0
-echo "browser: found none and may not install one; the browser tests will be skipped (with CI=1: fail)." >&2
+echo "browser: found none and cannot install one; the browser tests are skipped (with CI=1: fail)." >&2
 echo "browser: install chromium (apt-get install chromium, dnf install chromium), or name one: PARAUAV_CHROMIUM=/path/to/chrome" >&2

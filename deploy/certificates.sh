@@ -1,20 +1,20 @@
 #!/bin/sh
-# A site's own certificate authority, and a certificate for its router and for each role, with openssl alone.
+# Create a site's certificate authority and the certificates of its router and of each role, with openssl.
 set -eu
 umask 077
 usage() {
     cat <<'END'
-usage: certificates.sh COMMAND FOLDER [...]     FOLDER holds ca.key: keep it on one machine, offline at best
+usage: certificates.sh COMMAND FOLDER [...]     FOLDER contains ca.key: store it on one machine, preferably offline
 
-  all FOLDER NAME...       everything a new site needs; NAME: what the router is called, host names or addresses
-  ca FOLDER                the authority alone (ca.pem is for everyone, ca.key for nobody else)
-  router FOLDER NAME...    the router's certificate, for these names; again: a new one
-  role FOLDER ROLE...      a role's certificate (gateway worker viewer tools); again: a new one
-  next-ca FOLDER           a new authority; ca.pem holds both until the old one is dropped
-  drop-ca FOLDER           trust the new authority alone
-  show FOLDER              whose certificates, until when
+  all FOLDER NAME...       all files of a new site; NAME: host names or addresses of the router
+  ca FOLDER                only the authority (distribute ca.pem, never ca.key)
+  router FOLDER NAME...    certificate of the router for these names, or its renewal
+  role FOLDER ROLE...      certificates of roles (gateway worker viewer tools), or their renewal
+  next-ca FOLDER           a new authority; ca.pem contains both until drop-ca
+  drop-ca FOLDER           remove the old authority from ca.pem
+  show FOLDER              subject and expiry of all certificates
 
-DAYS=90 certificates are valid so long (CA_DAYS=3650 the authority).
+DAYS=90: validity of certificates in days (CA_DAYS=3650: of the authority).
 END
     exit 2
 }
@@ -26,23 +26,23 @@ make_ca() {
         -addext basicConstraints=critical,CA:true,pathlen:0 -addext keyUsage=critical,keyCertSign,cRLSign 2>/dev/null
 }
 
-sign() { # FOLDER NAME USAGE [SAN]: a new key and certificate, put in place once both are there
+sign() { # FOLDER NAME USAGE [SAN]: create a key and a certificate; install them when both exist
     folder=$1 name=$2
-    [ -f "$folder/ca.key" ] || fail "found no $folder/ca.key, expected the site's authority; make it first: ca $folder"
+    [ -f "$folder/ca.key" ] || fail "found no $folder/ca.key, expected the site's authority; create it first: ca $folder"
     { printf 'basicConstraints=critical,CA:false\nkeyUsage=critical,digitalSignature\nextendedKeyUsage=%s\n' "$3"
       [ -z "${4:-}" ] || printf 'subjectAltName=%s\n' "$4"; } >"$folder/$name.ext"
     openssl req -new -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -subj "/CN=$name" \
         -keyout "$folder/$name.key.new" -out "$folder/$name.csr" 2>/dev/null
     openssl x509 -req -sha256 -days "${DAYS:-90}" -in "$folder/$name.csr" -CA "$folder/ca.signing" \
         -CAkey "$folder/ca.key" -set_serial "0x$(openssl rand -hex 16)" -extfile "$folder/$name.ext" \
-        -out "$folder/$name.pem.new" 2>/dev/null || fail "openssl would not sign $name"
+        -out "$folder/$name.pem.new" 2>/dev/null || fail "openssl could not sign $name"
     mv "$folder/$name.key.new" "$folder/$name.key"
     mv "$folder/$name.pem.new" "$folder/$name.pem"
     chmod 644 "$folder/$name.pem"
     rm -f "$folder/$name.csr" "$folder/$name.ext"
 }
 
-names() { # what a router is called, as openssl writes it
+names() { # host names and addresses of a router in the format of openssl
     out=
     for name; do
         case $name in
@@ -56,7 +56,7 @@ names() { # what a router is called, as openssl writes it
 
 ca() {
     mkdir -p "$1"
-    [ ! -e "$1/ca.key" ] || fail "found $1/ca.key already, expected none; use it, or make the next one: next-ca $1"
+    [ ! -e "$1/ca.key" ] || fail "found an existing $1/ca.key, expected none; use it, or create the next one: next-ca $1"
     make_ca "$1"
     mv "$1/ca.new" "$1/ca.signing"
     cp "$1/ca.signing" "$1/ca.pem"

@@ -5,7 +5,7 @@ cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}
 log=.venv/setup.log
 
-say() { printf 'setup: %s\n' "$*"; }
+report() { printf 'setup: %s\n' "$*"; }
 fail() { printf 'setup: %s\n' "$*" >&2; exit 1; }
 
 command -v "$python" >/dev/null || fail "found no '$python', expected Python 3.11 or newer; install it or run: make setup PYTHON=/path/to/python3"
@@ -16,11 +16,11 @@ found=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
     fail "found Python $found without venv; install it, e.g. on Debian or Ubuntu: apt-get install python3-venv"
 
 rm -f .venv/setup-done
-say "1/3 a virtual environment in .venv (Python $found)"
+report "1/3 create a virtual environment in .venv (Python $found)"
 "$python" -m venv --clear .venv
 
 total=$(grep -c '==' requirements.lock)
-say "2/3 $total packages, about 300 MB; a few minutes the first time"
+report "2/3 install $total packages, about 300 MB; a few minutes the first time"
 { .venv/bin/python -m pip install --disable-pip-version-check --progress-bar off --require-hashes -r requirements.lock 2>&1 ||
     echo 'SETUP-FAILED'; } | {
     count=0
@@ -30,17 +30,17 @@ say "2/3 $total packages, about 300 MB; a few minutes the first time"
         case $line in
         Collecting*)
             count=$((count + 1))
-            if [ $((count % 5)) = 0 ]; then say "    $count/$total"; fi ;;
-        Installing*) say "    unpacking" ;;
+            if [ $((count % 5)) = 0 ]; then report "    $count/$total"; fi ;;
+        Installing*) report "    unpacking" ;;
         esac
     done
 }
 if grep -q '^SETUP-FAILED$' "$log"; then
     tail -n 20 "$log" >&2
-    fail "pip could not install requirements.lock; the whole story is in $log"
+    fail "pip could not install requirements.lock; see $log for the complete output"
 fi
 
-say "3/3 ParaUAV itself"
+report "3/3 install ParaUAV"
 .venv/bin/python -m pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation -e .
 pwd >.venv/setup-done
-say "done"
+report "done"

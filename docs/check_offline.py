@@ -12,14 +12,14 @@ REMOTE_IN_CSS = re.compile(r"(?:@import\s+|url\()\s*[\"']?((?:https?:)?//[^\"')\
 
 
 class Resources(HTMLParser):
-    """Collect the addresses that a browser loads with a page."""
+    """Collect the remote addresses that a browser loads with a page."""
 
     def __init__(self) -> None:
         super().__init__()
         self.remote: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Note remote addresses of one element."""
+        """Collect the remote addresses of one element."""
         given = dict(attrs)
         if tag == "link" and set((given.get("rel") or "").split()) <= PASSIVE:
             return
@@ -41,7 +41,7 @@ def remote_resources(site: Path) -> list[str]:
 
 
 def main(argv: list[str]) -> int:
-    """Print the remote resources; 1 where there is one, or where there is no site."""
+    """Print the remote resources; return 1 if there are any, or if there is no site."""
     site = Path(argv[0])
     found = remote_resources(site) if (site / "index.html").is_file() else [f"{site}: no site, run `make docs`"]
     print("\n".join(found), end="\n" if found else "", file=sys.stderr)

@@ -1,7 +1,7 @@
 """Generate the reference pages of the documentation from the code: `python -m docs.generate`.
 
-Every page is a function without arguments that returns Markdown. `make docs` writes them beside the written pages; they
-are not tracked, so that they cannot disagree with the code.
+Every page is a function without arguments that returns Markdown. `make docs` writes them next to the other pages; they
+are not tracked, so that they always match the code.
 """
 
 import contextlib
@@ -48,7 +48,7 @@ def help_of(command: str, *verb: str) -> str:
 
 
 def cli_page() -> str:
-    """Describe every command with the text of its own help."""
+    """Describe every command by the text of its `--help`."""
     text = "# Commands\n\nThe text that each command prints with `--help`.\n"
     for command in COMMANDS:
         text += f"\n## {command}\n\n```text\n{help_of(command)}\n```\n"
@@ -63,7 +63,9 @@ def cli_page() -> str:
 def messages_page() -> str:
     """Describe every key, the message on it, and the fields of that message."""
     text = "# Keys and messages\n\n"
-    text += "Read off `fleet/contract.py`; `fleet schema` prints the same, `fleet schema --json` the JSON schemas.\n"
+    text += (
+        "Generated from `fleet/contract.py`; `fleet schema` prints the same, `fleet schema --json` the JSON schemas.\n"
+    )
     text += "Array fields give their shape and numpy type; units are in brackets.\n\n"
     text += table(
         ("Key", "Message", "Content"),
@@ -109,12 +111,12 @@ def fields(kind: type) -> str:
 
 
 def anchor(kind: type) -> str:
-    """Name the heading of a class."""
+    """Return the anchor of a class."""
     return kind.__name__.lower()
 
 
 def summary(kind: type) -> str:
-    """Return the first sentence of a class."""
+    """Return the first line of the docstring of a class."""
     return schema.summary(kind)
 
 
@@ -122,17 +124,17 @@ def summary(kind: type) -> str:
 
 
 def configuration_page() -> str:
-    """Show the two configuration files with their comments, and the rules by role."""
+    """Describe the two configuration files, with comments, and the rules by role."""
     text = "# Configuration\n\n## Router and identity\n\n"
     text += "Every command takes this file as `--config FILE`. It is `deploy/fleet.toml`:\n\n"
     text += f"```toml\n{(ROOT / 'deploy' / 'fleet.toml').read_text().rstrip()}\n```\n"
-    text += "\n## Rules by role\n\nEnforced by the router where certificates or passwords are used; whatever is not "
-    text += "listed is denied.\nThe size limit holds everywhere.\n\n"
+    text += "\n## Rules by role\n\nEnforced by the router where certificates or passwords are used; everything not "
+    text += "listed is denied.\nThe size limit applies everywhere.\n\n"
     rows = [
         (code(keys(topic)), ", ".join(rule.by), ", ".join(rule.asked), f"{rule.most / 1024:,.0f} KiB")
         for topic, rule in SAID.items()
     ]
-    text += table(("Keys", "Published and answered by", "Queried by", "Largest message"), rows)
+    text += table(("Keys", "Published by, replies by", "Queried by", "Largest message"), rows)
     text += (
         "\n## Airframe\n\n`twin_worker --airframe FILE` takes a copy of `fleet/airframes/small_fixed_wing.toml`:\n\n"
     )
@@ -146,7 +148,7 @@ def configuration_page() -> str:
 def metrics_page() -> str:
     """List every metric of gateway and worker with its type, labels and meaning."""
     text = "# Metrics\n\nServed as Prometheus text at `/metrics` of the address given with `--metrics HOST:PORT`.\n"
-    text += "CPU time, memory and open files of the process are served beside them (`process_*`).\n"
+    text += "CPU time, memory and open files of the process are included (`process_*`).\n"
     for title, families in (("gateway", gateway_families()), ("twin_worker", worker_families())):
         rows = []
         for family in families:
@@ -158,17 +160,17 @@ def metrics_page() -> str:
 
 
 def gateway_families() -> Iterable[Any]:
-    """Return the metrics of a gateway whose every number is known."""
+    """Return the metrics of a gateway with all optional numbers present."""
     return gateway_metrics.counters(lambda: (filled(Account), [filled(Status)]))()
 
 
 def worker_families() -> Iterable[Any]:
-    """Return the metrics of a worker whose every number is known."""
+    """Return the metrics of a worker with all optional numbers present."""
     return worker_metrics.counters(lambda: filled(FleetState), MemoryBus())()
 
 
 def filled(hint: Any) -> Any:
-    """Make a value of a type in which every optional part is present."""
+    """Create a value of a type in which every optional part is present."""
     if hasattr(hint, "__metadata__"):
         return filled(get_args(hint)[0])
     origin, inner = get_origin(hint), get_args(hint)
@@ -199,8 +201,8 @@ def filled(hint: Any) -> Any:
 def effects_page() -> str:
     """Describe every effect of the catalogue."""
     effects = catalogue("")
-    text = "# Effects\n\nThe candidates for missing physics, as `fleet effects` lists them; one file each in\n"
-    text += "`fleet/effects/`. A parameter marked *nuisance* accompanies the others and is no evidence.\n\n"
+    text = "# Effects\n\nThe candidates for missing physics, as listed by `fleet effects`; one file each in\n"
+    text += "`fleet/effects/`. A parameter marked *nuisance* is estimated with the others and is not evidence.\n\n"
     text += table(
         ("Effect", "Stage", "Channel", "Equation"),
         [(f"[{e.name}](#{e.name})", e.stage, e.channel, code(e.equation)) for e in effects.values()],
@@ -222,12 +224,12 @@ def effects_page() -> str:
 
 
 def deployment_page() -> str:
-    """Copy `deploy/README.md`, so that the site has it too."""
+    """Return `deploy/README.md`."""
     return (ROOT / "deploy" / "README.md").read_text()
 
 
 def changelog_page() -> str:
-    """Copy `CHANGELOG.md`."""
+    """Return `CHANGELOG.md`."""
     return (ROOT / "CHANGELOG.md").read_text()
 
 
@@ -240,11 +242,11 @@ PAGES: dict[str, Callable[[], str]] = {
     "deployment.md": deployment_page,
     "changelog.md": changelog_page,
 }
-"""Name of each generated page in docs/reference, and what makes it."""
+"""Generated pages in docs/reference: name and function."""
 
 
 def code(text: str) -> str:
-    """Set text in monospace."""
+    """Format text as code."""
     return f"`{text}`" if text else ""
 
 

@@ -1,6 +1,6 @@
-"""ParaUAV: a fleet of digital twins for UAV swarms (what every process shares)."""
+"""ParaUAV: a fleet of digital twins for UAV swarms (code shared by all processes)."""
 
-from fleet.process import interrupt as interrupt  # first: from here on it handles Ctrl-C
+from fleet.process import interrupt as interrupt  # first, so that Ctrl-C is handled from here on
 
 # isort: split
 
@@ -16,13 +16,13 @@ from pathlib import Path
 from fleet.process import private_files
 
 __version__ = "0.1.0"
-_UNUSED_S = 30 * 86_400  # a compile cache of other sources is removed after so long [s]
+_UNUSED_S = 30 * 86_400  # age at which the compile cache of other sources is removed [s]
 
 
 def _sources_hash() -> str:
-    """Hash every source file of the four packages, so that an edit anywhere renews the compile cache.
+    """Hash every source file of the four packages, so that any edit invalidates the compile cache.
 
-    numba's own cache looks at one file only and silently returns the old answer after an edit in another.
+    numba's own cache checks one file only and silently returns old code after an edit in another.
     """
     root = Path(__file__).resolve().parent.parent
     digest = hashlib.sha256()
@@ -36,13 +36,13 @@ SOURCES = _sources_hash()
 
 
 def _compile_cache() -> tuple[Path, str]:
-    """Find the folder of compiled functions, which numba unpickles: whoever may write there runs code as this user.
+    """Select the folder of compiled functions. numba unpickles them, so write access there is code execution.
 
     Returns:
-        the folder, where nobody else may write; what `fleet doctor` should note of it
+        the folder, writable by this user only; a note for `fleet doctor`, or empty
     Raises:
-        ValueError: when the user names one that others could have changed.
-        OSError: when it cannot be made.
+        ValueError: when the configured folder is writable by others.
+        OSError: when it cannot be created.
     """
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         return private_files.folder(Path(given).absolute(), "NUMBA_CACHE_DIR"), ""
@@ -56,11 +56,11 @@ def _compile_cache() -> tuple[Path, str]:
     except (ValueError, OSError, RuntimeError) as error:
         found = Path(tempfile.mkdtemp(prefix="parauav-cache-"))
         atexit.register(_remove, found, os.getpid())
-        return found, f"the user's cache folder does not serve ({error}), so every start compiles; see PARAUAV_CACHE"
+        return found, f"the user's cache folder is not usable ({error}), so every start compiles; see PARAUAV_CACHE"
 
 
 def _within(base: Path) -> Path:
-    """Return the folder of these sources, for its owner alone; with a new one those that nobody uses any more go."""
+    """Return the private cache folder of the current sources; when it is new, remove expired folders of others."""
     found = base / f"numba-{SOURCES}"
     if not found.exists():
         for old in base.glob("numba-*"):
@@ -80,7 +80,9 @@ def _remove(folder: Path, pid: int) -> None:
 try:
     _folder, CACHE_NOTE = _compile_cache()
 except (ValueError, OSError) as _error:
-    _why = str(_error) if isinstance(_error, ValueError) else f"compile cache: found {_error}, expected to write there"
+    _why = (
+        str(_error) if isinstance(_error, ValueError) else f"compile cache: found {_error}, expected a writable folder"
+    )
     print(f"{_why}; or leave NUMBA_CACHE_DIR and PARAUAV_CACHE unset", file=sys.stderr, flush=True)
     raise SystemExit(2) from None
 os.environ["NUMBA_CACHE_DIR"] = str(_folder)

@@ -1,4 +1,4 @@
-"""The `fleet` command: one verb a file in `fleet/commands/`; and the frame every console command shares."""
+"""The `fleet` command, one verb per file in `fleet/commands/`, and functions common to all console commands."""
 
 import argparse
 import importlib
@@ -14,13 +14,13 @@ from fleet import __version__, commands
 from fleet.process.interrupt import INTERRUPTED, PARENT, exits_with, interruptible
 from fleet.process.logs import begin, fail
 
-GRACE_S = 30.0  # an orphan may take so long to end by its own door [s]
+GRACE_S = 30.0  # time for an orphan process to shut down in order [s]
 
 Run = Callable[[argparse.Namespace], int]
 
 
 def parser_for(prog: str, summary: str, examples: str) -> argparse.ArgumentParser:
-    """Make a parser whose help ends in examples."""
+    """Create a parser whose help ends with examples."""
     parser = argparse.ArgumentParser(
         prog=prog,
         description=summary,
@@ -32,7 +32,7 @@ def parser_for(prog: str, summary: str, examples: str) -> argparse.ArgumentParse
 
 
 def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
-    """Run a command; an expected failure becomes one sentence and exit code 2, Ctrl-C one and exit code 130.
+    """Run a command; report an expected failure in one line with exit code 2, Ctrl-C with exit code 130.
 
     A command that runs until it is stopped handles Ctrl-C itself (`stop_on_signal`) and returns 0.
     """
@@ -43,16 +43,16 @@ def guarded(prog: str, run: Run, args: argparse.Namespace) -> int:
     except (ValueError, OSError) as error:
         fail(prog, str(error), logged=logs)
         return exits_with(2)
-    if code == INTERRUPTED and not os.environ.get(PARENT):  # else the parent says so
+    if code == INTERRUPTED and not os.environ.get(PARENT):  # otherwise the parent reports it
         fail(prog, "interrupted", logged=logs)
     return exits_with(code)
 
 
 def stop_on_signal() -> threading.Event:
-    """Give an event that Ctrl-C, SIGTERM and the death of a parent set, so that every process ends by its own door."""
+    """Return an event that Ctrl-C, SIGTERM and the end of the parent set, for an orderly shutdown."""
     stop, told = threading.Event(), queue.SimpleQueue[int]()
     for number in (signal.SIGINT, signal.SIGTERM):
-        # not stop.set(): a handler runs in the main thread, which may hold that event's own lock in wait(), for ever
+        # not stop.set(): a handler runs in the main thread, which may own that event's lock in wait(): a deadlock
         signal.signal(number, lambda number, _: told.put(number))
     threading.Thread(target=_pass_on, args=(told, stop), daemon=True).start()
     if parent := os.environ.get(PARENT):
@@ -61,25 +61,25 @@ def stop_on_signal() -> threading.Event:
 
 
 def _pass_on(told: queue.SimpleQueue[int], stop: threading.Event) -> None:
-    """Set the event once a signal was told of."""
+    """Set the event after a signal."""
     told.get()
     stop.set()
 
 
 def _outlive_nobody(parent: int, stop: threading.Event) -> None:
-    """Stop once the process that started this one is gone, even if it was killed and could not say so."""
+    """Stop when the parent process has ended, also if it was killed."""
     while not stop.wait(1.0):
         if os.getppid() != parent:
             stop.set()
-            threading.Event().wait(GRACE_S)  # whoever hangs in a foreign library, as on a router that died, ends here
+            threading.Event().wait(GRACE_S)  # after this a process blocked in a foreign library is ended
             os._exit(1)
 
 
 def id_range(text: str) -> range:
-    """Read `0-49` or `7` as UAV ids.
+    """Parse `0-49` or `7` as UAV ids.
 
     Raises:
-        ValueError: when it is no range of ids below 1,000,000; argparse shows the sentence.
+        ArgumentTypeError: when it is not a range of ids below 1,000,000; argparse shows the text.
     """
     low, _, high = text.partition("-")
     if not low.isdecimal() or (high and not high.isdecimal()) or int(high or low) < int(low) or len(high or low) > 6:

@@ -3,28 +3,28 @@
     key                                  class        from     what
     parauav/{uav}/sample                 Sample       gateway  telemetry rows on the fleet clock, about every 100 ms
     parauav/{uav}/status                 Status       gateway  link, mode, rates, losses (1 Hz and on change)
-    parauav/{uav}/mission                Mission      gateway  the route on board and the item in force
+    parauav/{uav}/mission                Mission      gateway  the route on board and the current item
     parauav/{uav}/params                 Params       gateway  autopilot parameters
-    parauav/{uav}/history                History      gateway  only answers: the last minutes of one aircraft
+    parauav/{uav}/history                History      gateway  query only: the last minutes of one aircraft
     parauav/{uav}/model                  Model        worker   identified model with its verdict
-    parauav/{uav}/prediction             Prediction   worker   mean path, tube, horizon; also answers queries
-    parauav/{uav}/mismatch               Mismatch     worker   where, what physics, fit before and after; queries too
-    parauav/{uav}/alert                  Alert        worker   predicted conflict, fence, ground, …; answers queries
-                                                      gateway  a second sender that uses this id; answers queries
-    parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; answers queries
-    parauav/@fleet/prediction/{writer}   Predictions  worker   only answers: the newest of all it holds
-    parauav/@gateway/{writer}            Account      gateway  counters of one gateway; answers queries
-    parauav/@claim/{writer}              Claim        worker   which aircraft it writes for; every 0.25 s; queries too
-    parauav/@handover/{writer}           Handover     worker   answers a `Wanted` of another worker: twins to go on with
-    parauav/@live/worker/{writer}/{lo-hi}/{incarnation}        a liveliness token: this worker lives, and may hold these
+    parauav/{uav}/prediction             Prediction   worker   mean path, prediction region, horizon; also queryable
+    parauav/{uav}/mismatch               Mismatch     worker   location, effect, fit before and after; also queryable
+    parauav/{uav}/alert                  Alert        worker   predicted conflict, geofence, ground, …; also queryable
+                                                      gateway  a second sender with the same id; also queryable
+    parauav/@fleet/state/{writer}        FleetState   worker   one row per UAV; also queryable
+    parauav/@fleet/prediction/{writer}   Predictions  worker   query only: the newest prediction of all its aircraft
+    parauav/@gateway/{writer}            GatewayCounters gateway counters of one gateway; also queryable
+    parauav/@claim/{writer}              Claim        worker   aircraft it writes for; every 0.25 s; also queryable
+    parauav/@handover/{writer}           Handover     worker   query only, with a `HandoverRequest`: copies of twins
+    parauav/@live/worker/{writer}/{lo-hi}/{incarnation}        liveliness token of a worker and the ids it may own
 
 `*` and `**` never match a chunk that starts with `@`, so `parauav/*/prediction` is aircraft only.
 
 Wire: a msgpack map; any msgpack library reads it. Arrays are maps `{dtype, shape, data}`. The Zenoh encoding
 carries the version: `application/msgpack;parauav.prediction.1`. Fields may be added (with a default); a reader
 refuses another major version. Worker results carry an attachment of 16 bytes, little endian: epoch u64, writer u64.
-An epoch is the time of the claim [ms since 1970], or one above the last: readers refuse one over 5 minutes ahead of
-their own clock, and keep the highest of the others per UAV.
+An epoch is the time of the claim [ms since 1970], at least the previous epoch plus one. Readers reject an epoch more
+than 5 minutes ahead of their own clock and accept the highest of the others per UAV.
 
 Time `t` is seconds since 1970 on the fleet clock. Angles in rad, SI throughout, NED and FRD frames.
 """
@@ -44,7 +44,7 @@ _SIZES = {name: np.dtype(name).itemsize for name in DTYPES}
 MAX_ITEMS = 1_000  # mission items accepted from outside
 
 
-class Array(msgspec.Struct, frozen=True, gc=False):  # no cycle goes through numbers
+class Array(msgspec.Struct, frozen=True, gc=False):  # numbers form no reference cycles
     """A numpy array on the wire: `numpy.frombuffer(data, dtype).reshape(shape)`."""
 
     dtype: Annotated[str, Meta(description="numpy dtype string, little endian: " + " ".join(DTYPES))]
@@ -58,10 +58,10 @@ class Array(msgspec.Struct, frozen=True, gc=False):  # no cycle goes through num
         return cls(dtype, a.shape, a.tobytes())
 
     def numpy(self) -> np.ndarray:
-        """Unwrap; read-only.
+        """Return the values as a read-only numpy array.
 
         Raises:
-            ValueError: when dtype, shape and byte count disagree; the sender must repair it.
+            ValueError: when dtype, shape and byte count disagree; the sender must correct it.
         """
         size, shape = _SIZES.get(self.dtype), self.shape
         if size is None or len(shape) > 4 or (shape and not 0 <= min(shape) <= max(shape) < 2**31):
@@ -73,7 +73,7 @@ class Array(msgspec.Struct, frozen=True, gc=False):  # no cycle goes through num
 
 
 class Rows(msgspec.Struct, frozen=True, gc=False):
-    """Measurements of one kind, each row with its own time."""
+    """Measurements of one type, each row with its own time."""
 
     t: Annotated[Array, Meta(description="fleet time of each row, (n,) <f8 [s since 1970]")]
     x: Annotated[Array, Meta(description="values, (n, k); columns as in COLUMNS")]
@@ -90,23 +90,23 @@ COLUMNS: dict[str, tuple[tuple[str, str], ...]] = {
         ("phi_c", "rad"),
         ("theta_c", "rad"),
         ("xtrack_error", "m"),
-        ("alt_error", "m, wanted minus flown"),
-        ("Va_error", "m/s, wanted minus flown"),
+        ("alt_error", "m, setpoint minus actual"),
+        ("Va_error", "m/s, setpoint minus actual"),
     ),
-    "leg": (("seq", "mission item in force"),),
+    "leg": (("seq", "current mission item"),),
     "wind": (("w_n", "m/s"), ("w_e", "m/s")),
     "target": (("lat", "1e-7 deg"), ("lon", "1e-7 deg"), ("alt", "mm above mean sea level")),
     "pressure": (("static", "Pa"),),
-    "gnss": (("alt", "mm above mean sea level, as the receiver says"),),
+    "gnss": (("alt", "mm above mean sea level, as reported by the receiver"),),
     "height": (("above_home", "m"),),
 }
 """Columns of each `Rows` field of a `Sample`: name and unit, in wire order. Specific force and rates are FRD."""
 UNTOLD = {"command": 2}
-"""Fields whose columns from this one on are nan where the autopilot does not tell them."""
+"""Index of the first column that is nan where the autopilot does not report it, by field."""
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True):
-    """What every message has: the aircraft and the time."""
+    """Base of all messages about one aircraft: its id and the time."""
 
     topic: ClassVar[str] = ""
     version: ClassVar[int] = 1
@@ -116,7 +116,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Sample(Message, frozen=True, kw_only=True, gc=False):
-    """Telemetry rows of one aircraft since the message before; a kind without news is absent."""
+    """Telemetry rows of one aircraft since the previous message; a field without new rows is absent."""
 
     topic: ClassVar[str] = "sample"
 
@@ -128,11 +128,11 @@ class Sample(Message, frozen=True, kw_only=True, gc=False):
     servo: Rows | None = None
     command: Rows | None = None
     leg: Rows | None = None
-    wind: Annotated[Rows | None, Meta(description="as the autopilot says, where it blows to [m/s]")] = None
-    target: Annotated[Rows | None, Meta(description="the point the autopilot says it steers for")] = None
-    pressure: Annotated[Rows | None, Meta(description="as the barometer says, no estimator in between [Pa]")] = None
-    gnss: Annotated[Rows | None, Meta(description="as the satellite receiver says, no estimator in between")] = None
-    height: Annotated[Rows | None, Meta(description="above home, as the autopilot says [m]")] = None
+    wind: Annotated[Rows | None, Meta(description="estimated by the autopilot, the direction it blows to [m/s]")] = None
+    target: Annotated[Rows | None, Meta(description="guidance target reported by the autopilot")] = None
+    pressure: Annotated[Rows | None, Meta(description="raw barometer reading [Pa]")] = None
+    gnss: Annotated[Rows | None, Meta(description="raw reading of the satellite receiver")] = None
+    height: Annotated[Rows | None, Meta(description="above home, as reported by the autopilot [m]")] = None
 
 
 class Link(StrEnum):
@@ -143,44 +143,45 @@ class Link(StrEnum):
 
 
 class Status(Message, frozen=True, kw_only=True):
-    """How the link and the aircraft are."""
+    """State of the link and of the aircraft."""
 
     topic: ClassVar[str] = "status"
 
     link: Link = Link.LIVE
-    mode: Annotated[str, Meta(description="flight mode as the autopilot names it, e.g. AUTO")] = ""
+    mode: Annotated[str, Meta(description="flight mode as named by the autopilot, e.g. AUTO")] = ""
     armed: bool = False
     autopilot: Annotated[str, Meta(description="ardupilot, px4 or generic")] = "generic"
     vehicle: Annotated[str, Meta(description="fixed_wing, quadplane, multirotor, helicopter or unknown")] = "unknown"
     rates_hz: Annotated[dict[str, float], Meta(description="received rate of each message [Hz]")] = {}
     received: Annotated[int, Meta(description="messages received")] = 0
-    missed: Annotated[int, Meta(description="messages missed, from gaps in the sequence number")] = 0
-    rejected: Annotated[int, Meta(description="messages or fields refused (not finite, out of range, stale)")] = 0
+    missed: Annotated[int, Meta(description="messages lost, from gaps in the sequence number")] = 0
+    rejected: Annotated[int, Meta(description="messages or fields rejected (not finite, out of range, stale)")] = 0
     clock_offset_s: Annotated[float, Meta(description="fleet time minus the aircraft's boot time [s]")] = 0.0
-    clock_jumps: Annotated[int, Meta(description="times the aircraft's clock jumped")] = 0
+    clock_jumps: Annotated[int, Meta(description="number of jumps of the aircraft's clock")] = 0
     clock_advance_s: Annotated[
         float,
-        Meta(description="sum of the steps by which telemetry that fell behind its arrival was dated anew, later [s]"),
+        Meta(description="sum of the forward corrections of timestamps that lagged behind their arrival [s]"),
     ] = 0.0
     clock_drift: Annotated[
-        float | None, Meta(description="what the aircraft's clock loses on the fleet clock [s/s]; null: not known yet")
+        float | None,
+        Meta(description="drift of the aircraft's clock behind the fleet clock [s/s]; null: not known yet"),
     ] = None
     latency_s: Annotated[
-        float, Meta(description="how much later than the quickest of the last half minute messages come, mean [s]")
+        float, Meta(description="mean delay of messages relative to the fastest of the last 30 s [s]")
     ] = 0.0
-    latency_worst_s: Annotated[float, Meta(description="the same, the latest since the status before [s]")] = 0.0
+    latency_worst_s: Annotated[float, Meta(description="the same, maximum since the previous status [s]")] = 0.0
     round_trip_s: Annotated[
-        float | None, Meta(description="to the aircraft and back, the quickest lately (TIMESYNC) [s]; null: no answer")
+        float | None, Meta(description="minimum recent round-trip time (TIMESYNC) [s]; null: no reply")
     ] = None
     gps_offset_s: Annotated[
         float | None,
-        Meta(description="fleet time minus satellite time of the same instant (SYSTEM_TIME) [s]; null: not told"),
+        Meta(description="fleet time minus satellite time of the same instant (SYSTEM_TIME) [s]; null: not reported"),
     ] = None
-    sentence: Annotated[str, Meta(description="what an operator should know, or empty")] = ""
+    sentence: Annotated[str, Meta(description="note for the operator, or empty")] = ""
 
 
 class Item(msgspec.Struct, frozen=True, kw_only=True):
-    """One mission item as MAVLink knows it (MISSION_ITEM_INT)."""
+    """One mission item of MAVLink (MISSION_ITEM_INT)."""
 
     seq: int
     command: Annotated[int, Meta(description="MAV_CMD")]
@@ -200,13 +201,13 @@ class Mission(Message, frozen=True, kw_only=True):
     topic: ClassVar[str] = "mission"
 
     items: tuple[Item, ...] = ()
-    seq: Annotated[int, Meta(description="item in force when this was sent; -1 unknown")] = -1
-    complete: Annotated[bool, Meta(description="every item arrived")] = False
-    sentence: Annotated[str, Meta(description="what is wrong with it, or empty")] = ""
+    seq: Annotated[int, Meta(description="current item when this was sent; -1 unknown")] = -1
+    complete: Annotated[bool, Meta(description="every item was received")] = False
+    sentence: Annotated[str, Meta(description="error in the mission, or empty")] = ""
 
 
 class Params(Message, frozen=True, kw_only=True):
-    """Autopilot parameters, named and scaled as the autopilot does; never non-finite."""
+    """Autopilot parameters, in the autopilot's names and units; always finite."""
 
     topic: ClassVar[str] = "params"
 
@@ -216,17 +217,17 @@ class Params(Message, frozen=True, kw_only=True):
 
 
 class History(Message, frozen=True, kw_only=True):
-    """What one aircraft said lately, oldest first; `?seconds=20` asks for less of it."""
+    """Recent messages of one aircraft, oldest first; `?seconds=20` limits the length."""
 
     topic: ClassVar[str] = "history"
 
-    since: Annotated[float, Meta(description="fleet time from which on nothing is left out [s since 1970]")] = 0.0
+    since: Annotated[float, Meta(description="fleet time from which on the history is complete [s since 1970]")] = 0.0
     samples: tuple[Sample, ...] = ()
     statuses: tuple[Status, ...] = ()
 
 
 class Outcome(StrEnum):
-    """Verdict on an identification; not an error, an answer."""
+    """Outcome of an identification; an outcome other than VERIFIED is not an error."""
 
     VERIFIED = "verified"
     STARVED = "starved"
@@ -238,21 +239,24 @@ class Outcome(StrEnum):
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """Whether a model deserves belief, out of sample."""
+    """Validation of a model on data it was not identified from."""
 
     outcome: Outcome
     sentence: str
     fit: Annotated[dict[str, float], Meta(description="100 (1 - nrmse) per state at `horizon_s` [%]")] = {}
-    fit_hold: Annotated[dict[str, float], Meta(description="the same for holding the last value [%]")] = {}
+    fit_hold: Annotated[
+        dict[str, float], Meta(description="the same for the persistence forecast (last value) [%]")
+    ] = {}
     fit_at: Annotated[
         dict[str, float], Meta(description="mean fit of both axes by free-run length in s, e.g. lon16, lat16 [%]")
     ] = {}
     whiteness: Annotated[
-        dict[str, float], Meta(description="share of one-step residual autocorrelations that are noise's, 0..1")
+        dict[str, float],
+        Meta(description="share of one-step residual autocorrelations within the bounds of white noise, 0..1"),
     ] = {}
-    horizon_s: Annotated[float, Meta(description="free-run length the fit is over [s]")] = 0.0
-    threshold: Annotated[float, Meta(description="omega: least mean fit [%]")] = 0.0
-    tries: Annotated[int, Meta(description="identifications tried for this verdict")] = 0
+    horizon_s: Annotated[float, Meta(description="free-run length of the fit [s]")] = 0.0
+    threshold: Annotated[float, Meta(description="omega: minimum mean fit [%]")] = 0.0
+    tries: Annotated[int, Meta(description="identification attempts for this verdict")] = 0
 
 
 class Linear(msgspec.Struct, frozen=True, kw_only=True):
@@ -281,18 +285,18 @@ class Derivatives(msgspec.Struct, frozen=True, kw_only=True):
     names: Annotated[tuple[str, ...], Meta(description="X_0 X_u ... N_0 w_n w_e")]
     value: Annotated[Array, Meta(description="(n,) <f8")]
     covariance: Annotated[Array, Meta(description="(n, n) <f4")]
-    told: Annotated[Array, Meta(description="share of each prior variance that the data removed, (n,) 0..1")]
-    U0: Annotated[float, Meta(description="airspeed the derivatives belong to [m/s]")]
+    told: Annotated[Array, Meta(description="relative reduction of each prior variance by the data, (n,) 0..1")]
+    U0: Annotated[float, Meta(description="airspeed of the trim point of the derivatives [m/s]")]
     W0: Annotated[float, Meta(description="velocity down the body at trim [m/s]")]
     tau_s: Annotated[Array, Meta(description="lags of delta_a delta_e delta_r delta_t, (4,) [s]")]
-    prior: Annotated[str, Meta(description="airframe that holds what the data do not tell")] = ""
-    window_t0: Annotated[float, Meta(description="first instant of the stretch it came from [s since 1970]")] = 0.0
-    window_s: Annotated[float, Meta(description="length of that stretch [s]")] = 0.0
-    sentence: Annotated[str, Meta(description="what the data identified and what the prior held")] = ""
+    prior: Annotated[str, Meta(description="airframe used as prior for what the data do not identify")] = ""
+    window_t0: Annotated[float, Meta(description="first instant of the identification window [s since 1970]")] = 0.0
+    window_s: Annotated[float, Meta(description="length of the identification window [s]")] = 0.0
+    sentence: Annotated[str, Meta(description="parameters identified from the data and those set by the prior")] = ""
 
 
 class Model(Message, frozen=True, kw_only=True):
-    """The model in force (none before the first verified one), the newest window and its verdict."""
+    """Active model (none before the first verified one), newest identification window and its verdict."""
 
     topic: ClassVar[str] = "model"
 
@@ -304,7 +308,7 @@ class Model(Message, frozen=True, kw_only=True):
     derivatives: Annotated[Derivatives | None, Meta(description="of the coupled model; null for method paper")] = None
     earned: Annotated[
         dict[str, float],
-        Meta(description="share of a 10 s free run's departure from the mean that unseen flight bore out, 0..1"),
+        Meta(description="weight of the model against persistence in a 10 s free run, from held-out data, 0..1"),
     ] = {}
     window_t0: Annotated[float, Meta(description="first instant of the identification window [s since 1970]")] = 0.0
     window_s: Annotated[float, Meta(description="length of the identification window [s]")] = 0.0
@@ -312,12 +316,12 @@ class Model(Message, frozen=True, kw_only=True):
     wind_n: Annotated[float, Meta(description="estimated wind, north, the direction it blows to [m/s]")] = 0.0
     wind_e: Annotated[float, Meta(description="estimated wind, east [m/s]")] = 0.0
     extended: Annotated[
-        str, Meta(description="missing physics put into the model in force, since when; empty: as identified")
+        str, Meta(description="missing physics added to the active model, and since when; empty: as identified")
     ] = ""
 
 
 class State(StrEnum):
-    """Where one aircraft's twin stands; the worst news wins."""
+    """State of one aircraft's twin; the most severe applicable state."""
 
     UNCLAIMED = "unclaimed"
     WAITING = "waiting"
@@ -328,20 +332,20 @@ class State(StrEnum):
 
 
 class Controller(msgspec.Struct, frozen=True, kw_only=True):
-    """The law a prediction is flown by and the parameters that matter to it, apart by how each is known.
+    """Control law of a prediction and its parameters, grouped by provenance.
 
     Names and units are the autopilot's.
     """
 
     law: Annotated[str, Meta(description="e.g. arduplane: L1 + TECS")]
-    received: Annotated[dict[str, float], Meta(description="told by the autopilot")] = {}
-    identified: Annotated[dict[str, float], Meta(description="not told; learnt from flight")] = {}
-    default: Annotated[dict[str, float], Meta(description="not told, not learnt; the autopilot's default assumed")] = {}
-    asked: Annotated[dict[str, float], Meta(description="what-if only: as the question has it")] = {}
+    received: Annotated[dict[str, float], Meta(description="reported by the autopilot")] = {}
+    identified: Annotated[dict[str, float], Meta(description="not reported; identified from flight data")] = {}
+    default: Annotated[dict[str, float], Meta(description="neither; the autopilot's default is assumed")] = {}
+    asked: Annotated[dict[str, float], Meta(description="what-if only: set by the request")] = {}
 
 
 class Event(StrEnum):
-    """What began the present prediction anew, or what it coasts through; `Prediction.event_said` has the details."""
+    """Event that restarted the current prediction or made it coast; `Prediction.event_text` has the details."""
 
     MODE = "mode"
     MISSION = "mission"
@@ -359,25 +363,25 @@ class Event(StrEnum):
 
 
 SENTENCES: dict[Event, str] = {
-    Event.MODE: "another flight mode: what was predicted before is void",
-    Event.MISSION: "another mission on board: what was predicted before is void",
-    Event.PARAMETERS: "the autopilot flies with other parameters: what was predicted before is void",
-    Event.TAKE_OFF: "it has taken off: predictions on the route begin",
-    Event.LANDING: "it is landing: what is predicted ends at the touch-down point",
-    Event.TOUCH_DOWN: "it is on the ground: predictions on the route end",
-    Event.LINK_LOST: "the link is lost: the twin flies on from the last good state",
-    Event.LINK_BACK: "the link is back: the twin flies from telemetry again",
-    Event.HORIZON_OVER: "the confidence horizon is over: nothing more is claimed until telemetry returns",
-    Event.TELEMETRY_BROKEN: "positions have stopped while other telemetry comes: the twin flies on from the last one",
-    Event.TELEMETRY_WHOLE: "positions come again: the twin flies from telemetry again",
-    Event.CLOCK: "the aircraft's clock has jumped: what was learnt on the old time is forgotten",
-    Event.ORIGIN: "the origin of the local frame has moved to the aircraft",
+    Event.MODE: "flight mode changed: previous predictions are invalid",
+    Event.MISSION: "mission on board changed: previous predictions are invalid",
+    Event.PARAMETERS: "autopilot parameters changed: previous predictions are invalid",
+    Event.TAKE_OFF: "take-off: predictions along the route start",
+    Event.LANDING: "landing: predictions end at the touch-down point",
+    Event.TOUCH_DOWN: "touch-down: predictions along the route end",
+    Event.LINK_LOST: "link lost: the twin predicts from the last valid state",
+    Event.LINK_BACK: "link restored: the twin predicts from telemetry again",
+    Event.HORIZON_OVER: "confidence horizon exceeded: no prediction until telemetry returns",
+    Event.TELEMETRY_BROKEN: "positions stopped but other telemetry continues: the twin predicts from the last position",
+    Event.TELEMETRY_WHOLE: "positions received again: the twin predicts from telemetry again",
+    Event.CLOCK: "the aircraft's clock jumped: estimates on the old time base are discarded",
+    Event.ORIGIN: "the origin of the local frame was moved to the aircraft",
 }
-"""One sentence for each event."""
+"""Text of each event."""
 
 
 class Prediction(Message, frozen=True, kw_only=True):
-    """Where one aircraft will be, and how far to trust that."""
+    """Predicted path of one aircraft, its prediction region and confidence horizon."""
 
     topic: ClassVar[str] = "prediction"
 
@@ -387,45 +391,48 @@ class Prediction(Message, frozen=True, kw_only=True):
         Meta(
             description="dynamics (identified coupled model and controller twin in closed loop on the mission), "
             "paper (the same with two linear axes), "
-            "copter (on rotors: the route at limited speed, acceleration and jerk behind a lag, or holding its place), "
+            "copter (multirotor: the route at limited speed, acceleration and jerk behind a lag, or position hold), "
             "greybox (fixed wing without a model: L1 guidance and lags on the route) or imm (no route: turn rate only)"
         ),
     ]
-    law: Annotated[str, Meta(description="controller twin in force, e.g. arduplane: L1 + TECS")] = ""
+    law: Annotated[str, Meta(description="active controller twin, e.g. arduplane: L1 + TECS")] = ""
     origin: Annotated[tuple[int, int, int], Meta(description="NED origin: lat, lon [1e-7 deg], alt [mm AMSL]")]
-    ahead: Annotated[Array, Meta(description="look-ahead from `t`, rising, not evenly, (n,) <f4 [s]")]
+    ahead: Annotated[Array, Meta(description="look-ahead from `t`, increasing, unequally spaced, (n,) <f4 [s]")]
     path: Annotated[Array, Meta(description="mean position, NED from origin, (n, 3) <f4 [m]")]
-    tube: Annotated[Array, Meta(description="half-axes along, cross, vertical; to be held all at once, (n, 3) <f4 [m]")]
-    quantile: Annotated[float, Meta(description="share of flights the tube is meant to hold, 0..1")] = 0.9
+    tube: Annotated[
+        Array,
+        Meta(description="half-axes of the simultaneous region: along, cross, vertical, (n, 3) <f4 [m]"),
+    ]
+    quantile: Annotated[float, Meta(description="nominal coverage of the prediction region, 0..1")] = 0.9
     axis_quantile: Annotated[
         float,
-        Meta(description="share of flights that each half-axis alone holds; 0: as of independent axes"),
+        Meta(description="nominal coverage of each half-axis alone; 0: as of independent axes"),
     ] = 0.0
-    horizon_s: Annotated[float, Meta(description="confidence horizon: `quantile` of its like stay within 10 % [s]")] = (
-        0.0
-    )
+    horizon_s: Annotated[
+        float, Meta(description="confidence horizon: `quantile` of similar predictions stay within 10 % [s]")
+    ] = 0.0
     horizon_open: Annotated[bool, Meta(description="true: still below 10 % at the end of `ahead`")] = False
-    held: Annotated[float, Meta(description="share of answered look-aheads inside the tube, 0..1; nan before any")] = (
-        float("nan")
-    )
-    held_n: Annotated[int, Meta(description="past predictions behind `held`")] = 0
+    held: Annotated[
+        float, Meta(description="empirical coverage of the prediction region, 0..1; nan before any evaluation")
+    ] = float("nan")
+    held_n: Annotated[int, Meta(description="past predictions behind `coverage`")] = 0
     rollout_age_s: Annotated[
-        float, Meta(description="age of the rollout that is continued from the newest position; 0: a new rollout [s]")
+        float, Meta(description="age of the rollout propagated from the newest position; 0: a new rollout [s]")
     ] = 0.0
     coverage_renewed: Annotated[
-        float | None, Meta(description="as `held`, of continued rollouts alone, up to 60 s, 0..1; null before any")
+        float | None, Meta(description="as `coverage`, propagated rollouts only, up to 60 s, 0..1; null before any")
     ] = None
-    coverage_renewed_n: Annotated[int, Meta(description="past predictions behind `coverage_renewed`")] = 0
-    calibration: Annotated[str, Meta(description="table that tube and horizon rest on, and how far adapted")] = ""
-    coast_s: Annotated[float, Meta(description="time flown by the twin alone since the last sample [s]")] = 0.0
+    coverage_renewed_n: Annotated[int, Meta(description="past predictions behind `coverage_propagated`")] = 0
+    calibration: Annotated[str, Meta(description="calibration table of region and horizon, and its adaptation")] = ""
+    coast_s: Annotated[float, Meta(description="time predicted without telemetry since the last sample [s]")] = 0.0
     seq: Annotated[int, Meta(description="mission item the prediction starts on; -1 none")] = -1
-    sentence: Annotated[str, Meta(description="what limits this prediction, or empty")] = ""
-    event: Annotated[Event | None, Meta(description="what last made it begin anew, or what it coasts through")] = None
-    event_t: Annotated[float, Meta(description="when that was; 0 never [s since 1970]")] = 0.0
-    event_said: Annotated[str, Meta(description="the event's sentence, with its particulars")] = ""
+    sentence: Annotated[str, Meta(description="limitation of this prediction, or empty")] = ""
+    event: Annotated[Event | None, Meta(description="last event that restarted it or made it coast")] = None
+    event_t: Annotated[float, Meta(description="time of that event; 0 never [s since 1970]")] = 0.0
+    event_said: Annotated[str, Meta(description="text of the event, with details")] = ""
     controller: Annotated[
         Controller | None,
-        Meta(description="law and parameters in force; null: as last told. Told on change, every 10 s, to queries"),
+        Meta(description="active law and parameters; null: unchanged. Sent on change, every 10 s and to queries"),
     ] = None
 
     def ned_origin(self) -> Origin:
@@ -434,7 +441,7 @@ class Prediction(Message, frozen=True, kw_only=True):
 
 
 class WhatIfStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where a what-if begins; heading and speed stay as they are where they are not given."""
+    """Start of a what-if; heading and speed are unchanged where null."""
 
     lat_e7: Annotated[int, Meta(description="[1e-7 deg]")]
     lon_e7: Annotated[int, Meta(description="[1e-7 deg]")]
@@ -444,24 +451,22 @@ class WhatIfStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class WhatIf(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Payload of a query on `parauav/{uav}/prediction`: what to fly otherwise from now on. Changes no aircraft."""
+    """Payload of a query on `parauav/{uav}/prediction`: hypothetical changes from now on. Affects no aircraft."""
 
     items: Annotated[
-        tuple[Item, ...] | None, Meta(description="another mission, numbered as the autopilot does, at most 1,000")
+        tuple[Item, ...] | None, Meta(description="another mission, numbered as by the autopilot, at most 1,000 items")
     ] = None
     seq: Annotated[
-        int | None, Meta(description="item to fly to first; null: the first of `items`, or the one in force")
+        int | None, Meta(description="item to fly to first; null: the first of `items`, or the current one")
     ] = None
-    speed: Annotated[
-        float | None, Meta(description="airspeed wherever the mission commands none else or one [m/s]")
-    ] = None
+    speed: Annotated[float | None, Meta(description="airspeed on the whole route, overrides the mission [m/s]")] = None
     start: WhatIfStart | None = None
-    wind: Annotated[tuple[float, float] | None, Meta(description="north, east, where it blows to [m/s]")] = None
+    wind: Annotated[tuple[float, float] | None, Meta(description="north, east, the direction it blows to [m/s]")] = None
     params: Annotated[dict[str, float], Meta(description="parameters, in the autopilot's names and units")] = {}
 
 
 class Found(StrEnum):
-    """What became of a diagnosis."""
+    """Outcome of a diagnosis."""
 
     NONE = "none"
     SUSPECTED = "suspected"
@@ -472,51 +477,52 @@ class Found(StrEnum):
 class Cause(msgspec.Struct, frozen=True, kw_only=True):
     """One effect that explains the flight, named or suspected."""
 
-    name: Annotated[str, Meta(description="effect, as `fleet effects` lists it; unknown: none of them")]
-    channel: Annotated[str, Meta(description="where it lives, e.g. actuator, thrust, air, airspeed, or a residual")] = (
-        ""
-    )
+    name: Annotated[str, Meta(description="effect, as listed by `fleet effects`; unknown: none of them")]
+    channel: Annotated[
+        str, Meta(description="where it acts, e.g. actuator, thrust, air, airspeed, or the name of a residual")
+    ] = ""
     surface: Annotated[str, Meta(description="aileron, elevator, rudder, all surfaces; empty: no surface")] = ""
-    rivals: Annotated[tuple[str, ...], Meta(description="effects it cannot be told from by this flight")] = ()
+    rivals: Annotated[tuple[str, ...], Meta(description="effects that this flight cannot distinguish from it")] = ()
     segments: Annotated[
-        tuple[tuple[float, float], ...], Meta(description="when, from and to; the last to the newest [s since 1970]")
+        tuple[tuple[float, float], ...],
+        Meta(description="active intervals; the last ends at the newest [s since 1970]"),
     ] = ()
-    parameters: Annotated[dict[str, float], Meta(description="its numbers, unit in the name")] = {}
+    parameters: Annotated[dict[str, float], Meta(description="estimated parameters, unit in the name")] = {}
     sigma: Annotated[dict[str, float], Meta(description="their standard deviations, same names and units")] = {}
 
 
 class Mismatch(Message, frozen=True, kw_only=True):
-    """Where flight and twin part ways, and what physics explains it; answers queries."""
+    """Deviation of the flight from the twin, and the physics that explains it; answers queries."""
 
     topic: ClassVar[str] = "mismatch"
 
     outcome: Annotated[
-        Found, Meta(description="named: proven on data held out; suspected: not; unknown: no effect explains it")
+        Found, Meta(description="named: verified on held-out data; suspected: not; unknown: no effect explains it")
     ] = Found.NONE
-    causes: Annotated[tuple[Cause, ...], Meta(description="the most telling first; empty for none")] = ()
+    causes: Annotated[tuple[Cause, ...], Meta(description="most significant first; empty for none")] = ()
     fit_before: Annotated[
         float | None,
-        Meta(description="rms residual on data held out [standard deviations of nominal flight]; null: not proven"),
+        Meta(description="rms residual on held-out data [standard deviations of nominal flight]; null: not verified"),
     ] = None
     fit_after: Annotated[
         float | None, Meta(description="the same with the causes in the simulation [standard deviations]")
     ] = None
-    force_before: Annotated[float | None, Meta(description="rms error of specific force, held out [m/s2]")] = None
+    force_before: Annotated[float | None, Meta(description="rms error of specific force, held-out data [m/s2]")] = None
     force_after: Annotated[float | None, Meta(description="the same with the causes [m/s2]")] = None
-    stray_before: Annotated[float | None, Meta(description="rms attitude error of free flights of 5 s [deg]")] = None
+    stray_before: Annotated[float | None, Meta(description="rms attitude error of free runs of 5 s [deg]")] = None
     stray_after: Annotated[float | None, Meta(description="the same with the causes [deg]")] = None
-    seen_t0: Annotated[float, Meta(description="first instant of the flight it was diagnosed on [s since 1970]")] = 0.0
-    adapted: Annotated[bool, Meta(description="true: predictions are flown with the causes in the model")] = False
-    sentence: Annotated[str, Meta(description="all of it in one sentence, and which model predicts")] = ""
+    seen_t0: Annotated[float, Meta(description="first instant of the diagnosed flight [s since 1970]")] = 0.0
+    adapted: Annotated[bool, Meta(description="true: the prediction model includes the causes")] = False
+    sentence: Annotated[str, Meta(description="summary, and which model predicts")] = ""
 
     @property
     def onset(self) -> float | None:
-        """Return when the first cause began [s since 1970]; None where there is none."""
+        """Return the onset of the first cause [s since 1970]; None without a cause."""
         return self.causes[0].segments[0][0] if self.causes and self.causes[0].segments else None
 
 
 class AlertKind(StrEnum):
-    """What an alert warns of."""
+    """Type of an alert."""
 
     LINK_LOST = "link_lost"
     SHORT_HORIZON = "short_horizon"
@@ -528,11 +534,11 @@ class AlertKind(StrEnum):
 
 
 About = tuple[AlertKind, int]
-"""What the alerts of one UAV are told apart by: the kind, and the other UAV of a conflict (-1 none)."""
+"""Identity of an alert within one UAV: its kind, and the other UAV of a conflict (-1 none)."""
 
 
 class Alert(Message, frozen=True, kw_only=True):
-    """A warning for the operator, raised once; the same with `active` false withdraws it, once."""
+    """Warning for the operator, published once when raised and once, with `active` false, when cleared."""
 
     topic: ClassVar[str] = "alert"
 
@@ -540,20 +546,22 @@ class Alert(Message, frozen=True, kw_only=True):
     active: bool = True
     sentence: str = ""
     other: Annotated[int, Meta(description="the other UAV of a conflict, always the higher id; -1 none")] = -1
-    probability: Annotated[float | None, Meta(description="that it comes to pass, 0..1; null: it is so now")] = None
-    at: Annotated[float | None, Meta(description="when it is predicted for [s since 1970]; null: now")] = None
-    lat: Annotated[int | None, Meta(description="where, latitude [1e-7 deg]; null: no one place")] = None
-    lon: Annotated[int | None, Meta(description="where, longitude [1e-7 deg]")] = None
-    alt: Annotated[int | None, Meta(description="where, height above mean sea level [mm]")] = None
+    probability: Annotated[
+        float | None, Meta(description="probability of the event, 0..1; null: it is present now")
+    ] = None
+    at: Annotated[float | None, Meta(description="predicted time [s since 1970]; null: now")] = None
+    lat: Annotated[int | None, Meta(description="latitude of the event [1e-7 deg]; null: no single position")] = None
+    lon: Annotated[int | None, Meta(description="longitude of the event [1e-7 deg]")] = None
+    alt: Annotated[int | None, Meta(description="height of the event above mean sea level [mm]")] = None
 
     @property
     def about(self) -> About:
-        """Return what it is told apart by."""
+        """Return the identity of the alert within its UAV."""
         return self.kind, self.other
 
 
 class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One line of the fleet table."""
+    """One row of the fleet table."""
 
     uav: int
     state: State
@@ -562,15 +570,15 @@ class FleetRow(msgspec.Struct, frozen=True, kw_only=True):
     horizon_s: Annotated[float, Meta(description="confidence horizon of the newest prediction [s]")] = 0.0
     worker: Annotated[str, Meta(description="writer of the accepted results, 16 hex digits")] = ""
     sample_age_s: Annotated[float | None, Meta(description="since the newest sample arrived [s]")] = None
-    prediction_age_s: Annotated[float | None, Meta(description="since the newest prediction was made [s]")] = None
+    prediction_age_s: Annotated[float | None, Meta(description="since the newest prediction [s]")] = None
     t10_s: Annotated[
-        float | None, Meta(description="median time past predictions stayed within 10 % (M1) [s]; null before any")
+        float | None, Meta(description="median time that past predictions stay within 10 % (M1) [s]; null before any")
     ] = None
     t10_censored: Annotated[float | None, Meta(description="share of them still within 10 % at their end, 0..1")] = None
     t10_n: Annotated[int, Meta(description="past predictions behind `t10_s`")] = 0
     epoch: Annotated[int, Meta(description="claim epoch of the writer")] = 0
-    alerts: Annotated[tuple[str, ...], Meta(description="sentences of the alerts in force")] = ()
-    mismatch: Annotated[str, Meta(description="what was found in words, e.g. named thrust_loss; empty: nothing")] = ""
+    alerts: Annotated[tuple[str, ...], Meta(description="texts of the active alerts")] = ()
+    mismatch: Annotated[str, Meta(description="outcome and causes, e.g. named thrust_loss; empty: none")] = ""
 
 
 class FleetState(msgspec.Struct, frozen=True, kw_only=True):
@@ -582,8 +590,8 @@ class FleetState(msgspec.Struct, frozen=True, kw_only=True):
     t: Annotated[float, Meta(description="fleet time of the rows [s since 1970]")]
     rows: tuple[FleetRow, ...] = ()
     sentence: Annotated[str, Meta(description="e.g. compiling the twin's physics, once")] = ""
-    done: Annotated[dict[str, int], Meta(description="heavy work since it began: predict, identify, ensemble")] = {}
-    shed: Annotated[int, Meta(description="messages of aircraft it holds now that it could not keep for them")] = 0
+    done: Annotated[dict[str, int], Meta(description="tasks completed since start: predict, identify, ensemble")] = {}
+    shed: Annotated[int, Meta(description="messages of its current aircraft dropped because a queue was full")] = 0
 
 
 class Predictions(msgspec.Struct, frozen=True, kw_only=True):
@@ -593,16 +601,16 @@ class Predictions(msgspec.Struct, frozen=True, kw_only=True):
     version: ClassVar[int] = 1
 
     t: Annotated[float, Meta(description="fleet time of the answer [s since 1970]")]
-    predictions: Annotated[
-        tuple[msgspec.Raw, ...], Meta(description="each a Prediction; ours unpack it when read")
+    predictions: Annotated[tuple[msgspec.Raw, ...], Meta(description="each a packed Prediction")] = ()
+    epochs: Annotated[
+        tuple[int, ...], Meta(description="claim epoch of each; readers accept the highest per aircraft")
     ] = ()
-    epochs: Annotated[tuple[int, ...], Meta(description="claim of each; readers keep the highest of an aircraft")] = ()
 
 
 class LinkAccount(msgspec.Struct, frozen=True, kw_only=True):
-    """Counters of one link, since the gateway began unless a unit says otherwise."""
+    """Counters of one link since the gateway started; values in Hz and bytes/s are current rates."""
 
-    link: Annotated[str, Meta(description="as it was given")]
+    link: Annotated[str, Meta(description="the link as configured")]
     datagrams: int = 0
     bytes_in: int = 0
     messages: int = 0
@@ -610,19 +618,19 @@ class LinkAccount(msgspec.Struct, frozen=True, kw_only=True):
     bad_frames: Annotated[int, Meta(description="frames with a wrong checksum or an unknown message id")] = 0
     dropped: Annotated[int, Meta(description="datagrams received and dropped because decoding fell behind")] = 0
     overrun: Annotated[
-        int | None, Meta(description="datagrams the system dropped before we received them; null: not told")
+        int | None, Meta(description="datagrams dropped by the operating system; null: not reported")
     ] = None
     sent: Annotated[int, Meta(description="datagrams sent by the gateway itself")] = 0
     bytes_out: int = 0
-    unsent: Annotated[int, Meta(description="messages not sent or forwarded: nobody at the far end, or no room")] = 0
-    bytes_s: Annotated[float, Meta(description="received of late [bytes/s]")] = 0.0
-    messages_hz: Annotated[float, Meta(description="received of late [Hz]")] = 0.0
-    recorded: Annotated[int, Meta(description="bytes of frames written to the .tlog, stamps left out")] = 0
+    unsent: Annotated[int, Meta(description="messages not sent or forwarded: no peer, or the queue was full")] = 0
+    bytes_s: Annotated[float, Meta(description="current receive rate [bytes/s]")] = 0.0
+    messages_hz: Annotated[float, Meta(description="current receive rate [Hz]")] = 0.0
+    recorded: Annotated[int, Meta(description="bytes of frames written to the .tlog, without timestamps")] = 0
     noise: Annotated[int, Meta(description="bytes not recorded because they belong to no frame")] = 0
-    unrecorded: Annotated[int, Meta(description="bytes the disk did not take, or not in time")] = 0
-    unwritten: Annotated[int, Meta(description="bytes that wait for the disk or for the rest of their frame")] = 0
-    share: Annotated[float, Meta(description="asked for of the rates wanted, for the sake of the budget, 0..1")] = 1.0
-    sentence: Annotated[str, Meta(description="what an operator should know, or empty")] = ""
+    unrecorded: Annotated[int, Meta(description="bytes lost because the disk was full or too slow")] = 0
+    unwritten: Annotated[int, Meta(description="bytes waiting for the disk or for the rest of their frame")] = 0
+    share: Annotated[float, Meta(description="requested fraction of the desired message rates, by budget, 0..1")] = 1.0
+    sentence: Annotated[str, Meta(description="note for the operator, or empty")] = ""
 
 
 class Account(msgspec.Struct, frozen=True, kw_only=True):
@@ -639,69 +647,69 @@ class Account(msgspec.Struct, frozen=True, kw_only=True):
     messages: int = 0
     bad_bytes: Annotated[int, Meta(description="bytes that were no MAVLink frame")] = 0
     bad_frames: Annotated[int, Meta(description="frames with a wrong checksum or an unknown message id")] = 0
-    refused: Annotated[dict[str, int], Meta(description="good frames refused, by reason")] = {}
-    published: Annotated[int, Meta(description="messages given to a router that was there")] = 0
+    refused: Annotated[dict[str, int], Meta(description="valid frames rejected, by reason")] = {}
+    published: Annotated[int, Meta(description="messages published while a router was connected")] = 0
     sentence: str = ""
     per_link: tuple[LinkAccount, ...] = ()
-    router: Annotated[bool, Meta(description="a router is there")] = True
-    unsent: Annotated[int, Meta(description="messages nobody got, as no router was there")] = 0
-    unsure: Annotated[int, Meta(description="published in the second before a router was missed")] = 0
+    router: Annotated[bool, Meta(description="a router is connected")] = True
+    unsent: Annotated[int, Meta(description="messages not published because no router was connected")] = 0
+    unsure: Annotated[int, Meta(description="published in the second before the loss of a router was detected")] = 0
     removed: Annotated[int, Meta(description="recordings removed to stay within the budget")] = 0
-    history_bytes: Annotated[int, Meta(description="kept for late joiners")] = 0
-    now: Annotated[float, Meta(description="when it was said, by the gateway's own clock [s since 1970]")] = 0.0
+    history_bytes: Annotated[int, Meta(description="size of the history stored for late joiners")] = 0
+    now: Annotated[float, Meta(description="send time by the gateway's own clock [s since 1970]")] = 0.0
     machine: Annotated[str, Meta(description="name of the machine it runs on")] = ""
     code: Annotated[str, Meta(description="hash of the sources it runs")] = ""
 
 
 class Claim(msgspec.Struct, frozen=True, kw_only=True):
-    """Which aircraft one worker writes for.
+    """Aircraft that one worker writes for.
 
-    Of two claims on one aircraft the higher epoch counts, then the higher writer; one over 5 minutes ahead of the
-    reader's own clock is refused.
+    Of two claims on one aircraft the higher epoch wins, then the higher writer. A claim more than 5 minutes ahead of
+    the reader's own clock is rejected.
     """
 
     topic: ClassVar[str] = "@claim"
     version: ClassVar[int] = 1
 
-    t: Annotated[float, Meta(description="when it was said, by the worker's clock [s since 1970]")]
+    t: Annotated[float, Meta(description="send time by the worker's clock [s since 1970]")]
     worker: Annotated[str, Meta(description="writer, 16 hex digits")]
-    held: Annotated[tuple[tuple[int, int], ...], Meta(description="UAV id and epoch of each aircraft held")] = ()
-    bare: Annotated[tuple[int, ...], Meta(description="of these, whose telemetry of before is not there yet")] = ()
-    leaving: Annotated[bool, Meta(description="true: it hands over everything and goes")] = False
+    held: Annotated[tuple[tuple[int, int], ...], Meta(description="UAV id and epoch of each owned aircraft")] = ()
+    bare: Annotated[tuple[int, ...], Meta(description="owned aircraft whose earlier telemetry is still missing")] = ()
+    leaving: Annotated[bool, Meta(description="true: it hands over all aircraft and stops")] = False
     machine: Annotated[str, Meta(description="name of the machine it runs on")] = ""
     code: Annotated[str, Meta(description="hash of the sources it runs")] = ""
     seen: Annotated[
         tuple[tuple[int, int, str], ...],
-        Meta(description="to queries only: UAV id, epoch and writer of the highest claim it knows of"),
+        Meta(description="in query replies only: UAV id, epoch and writer of the highest known claim"),
     ] = ()
 
 
 class Handover(msgspec.Struct, frozen=True, kw_only=True):
-    """A copy of one aircraft's twin for its new owner; who holds it writes until that does."""
+    """Copy of one aircraft's twin for its new owner; the old owner writes until the new one does."""
 
     topic: ClassVar[str] = "@handover"
     version: ClassVar[int] = 1
 
-    t: Annotated[float, Meta(description="when it was copied, by the worker's clock [s since 1970]")]
+    t: Annotated[float, Meta(description="time of the copy by the worker's clock [s since 1970]")]
     uav: Annotated[int, Meta(description="UAV id")]
-    epoch: Annotated[int, Meta(description="under which it is written for; the new owner's is higher")]
-    code: Annotated[str, Meta(description="hash of the sources that wrote `load`; others must not read it")]
-    load: Annotated[bytes, Meta(description="twin, messages not yet taken in, open conflicts, mismatch")] = b""
+    epoch: Annotated[int, Meta(description="epoch of the old owner; the new owner's is higher")]
+    code: Annotated[str, Meta(description="hash of the sources that wrote `snapshot`; other versions must not read it")]
+    load: Annotated[bytes, Meta(description="twin, unprocessed messages, open conflicts, mismatch")] = b""
 
 
 class Wanted(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Payload of a query on `parauav/@handover/{writer}`: the twins of which aircraft."""
+    """Payload of a query on `parauav/@handover/{writer}`: ids of the requested aircraft."""
 
     uavs: Annotated[tuple[int, ...], Meta(description="UAV ids")] = ()
 
 
 PER_UAV: tuple[type[Message], ...] = (Sample, Status, Mission, Params, History, Model, Prediction, Mismatch, Alert)
 CONTROL: tuple[type, ...] = (FleetState, Predictions, Account, Claim, Handover)
-QUERIES: dict[type, type] = {Prediction: WhatIf, Handover: Wanted}  # what a query on a key may carry
+QUERIES: dict[type, type] = {Prediction: WhatIf, Handover: Wanted}  # optional payload of a query on a key
 TOPICS: dict[str, type] = {c.topic: c for c in (*PER_UAV, *CONTROL)}  # type: ignore[attr-defined]
 
 
 def meaning(hint: Any) -> str:
-    """Read the description, with its unit, off an annotation."""
+    """Return the description, with its unit, of an annotation."""
     metas = [m for m in getattr(hint, "__metadata__", ()) if isinstance(m, msgspec.Meta)]
     return " ".join(m.description for m in metas if m.description)

@@ -1,6 +1,6 @@
 """Frames and letters: NED, FRD, geodetic, quaternions, the wind triangle.
 
-The letters of Beard & McLain, "Small Unmanned Aircraft" (2012), used everywhere in this house:
+Letters of Beard & McLain, "Small Unmanned Aircraft" (2012), used throughout the project:
 
     p_n p_e p_d      position, north-east-down from a named origin (NED)        [m]
     v_n v_e v_d      velocity over ground (NED)                                 [m/s]
@@ -31,7 +31,7 @@ _E2 = 6.69437999014e-3  # WGS-84 first eccentricity squared [-]
 
 
 class Origin(NamedTuple):
-    """Where a local NED frame touches the earth; integers as on the MAVLink wire, so nothing is rounded twice."""
+    """Origin of a local NED frame; integers as in MAVLink, so nothing is rounded twice."""
 
     lat_e7: int  # geodetic latitude [1e-7 deg]
     lon_e7: int  # longitude [1e-7 deg]
@@ -63,18 +63,18 @@ def to_ned(origin: Origin, lat_e7: np.ndarray, lon_e7: np.ndarray, alt_mm: np.nd
     return out
 
 
-@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: as numpy does it
+@nb.njit(cache=True, nogil=True, _nrt=False)  # type: ignore[call-overload]  # no fastmath: same result as numpy
 def _place(at: np.ndarray, lat_e7: float, lon_e7: float, alt_mm: float, radii: tuple[float, float]) -> None:
-    """Put NED of an origin in the place of geodetic positions, (n, 3)."""
+    """Convert geodetic positions, (n, 3), to NED in place."""
     for k in range(len(at)):
-        d_lon = (at[k, 1] - lon_e7 + 1.8e9) % 3.6e9 - 1.8e9  # shortest way round the date line
+        d_lon = (at[k, 1] - lon_e7 + 1.8e9) % 3.6e9 - 1.8e9  # shortest difference across the date line
         at[k, 0] = (at[k, 0] - lat_e7) * 1e-7 * _DEGREE * radii[0]
         at[k, 1] = d_lon * 1e-7 * _DEGREE * radii[1]
         at[k, 2] = (alt_mm - at[k, 2]) * 1e-3
 
 
 def to_geodetic(origin: Origin, ned: np.ndarray) -> np.ndarray:
-    """Map local NED positions back: (n, 3) [m] -> (n, 3) integers [1e-7 deg, 1e-7 deg, mm]."""
+    """Map local NED positions to geodetic: (n, 3) [m] -> (n, 3) integers [1e-7 deg, 1e-7 deg, mm]."""
     m, n = _radii(origin)
     ned = np.asarray(ned, float)
     lat = origin.lat_e7 + np.degrees(ned[..., 0] / m) * 1e7
@@ -98,7 +98,7 @@ def ned_to_body(phi: np.ndarray, theta: np.ndarray, psi: np.ndarray, ned: np.nda
 
 @nb.njit(cache=True, nogil=True)
 def _turn_each(euler: np.ndarray, ned: np.ndarray, out: np.ndarray) -> None:
-    """Fill in NED vectors turned into the body, (n, 3): a whole window at once is most of what laying it takes."""
+    """Rotate NED vectors to the body, (n, 3), into `out`; compiled because it dominates the cost of resampling."""
     for k in range(len(euler)):
         cf, sf, ct, st = cos(euler[k, 0]), sin(euler[k, 0]), cos(euler[k, 1]), sin(euler[k, 1])
         cp, sp = cos(euler[k, 2]), sin(euler[k, 2])

@@ -1,4 +1,4 @@
-"""Counters as Prometheus reads them: plain text over HTTP, on request."""
+"""Serve counters to Prometheus: plain text over HTTP, on request."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -14,14 +14,14 @@ Families = Callable[[], Iterable[Metric]]
 
 
 class Naming(NamedTuple):
-    """How the fields of a message class become metrics.
+    """Mapping of the fields of a message class to metrics.
 
     Attributes:
-        prefix: of their names
-        labels: that tell its messages apart
-        now: fields that go up and down; the other numbers only grow
-        other: names where the field's would mislead
-        left_out: fields that are no metrics
+        prefix: of the metric names
+        labels: names of the labels that distinguish the messages
+        gauges: fields that are gauges; the other numbers are counters
+        renamed: metric names that differ from the field name
+        excluded: fields without a metric
     """
 
     prefix: str
@@ -32,7 +32,7 @@ class Naming(NamedTuple):
 
 
 def families(kind: type, told: list[tuple[tuple[str, ...], Any]], naming: Naming) -> Iterator[Metric]:
-    """Make a metric of every number and flag of a message class; told: (label values, message)."""
+    """Yield a metric for every number and flag of a message class; messages: (label values, message)."""
     for name, hint in get_type_hints(kind, include_extras=True).items():
         values = [(who, _number(getattr(message, name))) for who, message in told]
         known = [(who, value) for who, value in values if value is not None]
@@ -53,7 +53,7 @@ def _number(value: Any) -> float | None:
 
 
 class _Collector:
-    """Read the newest counters whenever Prometheus asks."""
+    """Read the newest counters at every scrape."""
 
     def __init__(self, told: Families) -> None:
         self._told = told
@@ -63,10 +63,10 @@ class _Collector:
 
 
 def address(where: str) -> tuple[str, int]:
-    """Read `HOST:PORT`.
+    """Parse `HOST:PORT`.
 
     Raises:
-        ValueError: when it is none.
+        ValueError: when it is malformed.
     """
     host, _, port = where.rpartition(":")
     if not host or not port.isdecimal() or int(port) > 65_535:
@@ -76,10 +76,10 @@ def address(where: str) -> tuple[str, int]:
 
 @contextmanager
 def served(where: str, told: Families) -> Iterator[str]:
-    """Answer at `HOST:PORT` for as long as the block lasts, this process's own CPU and memory too; gives the address.
+    """Serve the metrics, and CPU and memory of this process, at `HOST:PORT` within the block; yield the URL.
 
     Raises:
-        ValueError: when it is no address.
+        ValueError: when the address is malformed.
         OSError: when it is not free.
     """
     host, port = address(where)

@@ -1,4 +1,4 @@
-"""`Window`: an equally sampled stretch of one flight, with a mask of what was really measured."""
+"""`Window`: an equally sampled section of one flight, with a mask of measured rows."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +13,7 @@ INPUTS = ("delta_a", "delta_e", "delta_r", "delta_t")
 
 @dataclass(frozen=True)
 class Window:
-    """States and inputs of one aircraft on one grid.
+    """States and inputs of one aircraft on one time grid.
 
     Attributes:
         t: fleet time, (n,) [s since 1970]
@@ -21,7 +21,7 @@ class Window:
         u: inputs in the order of `INPUTS`, (n, 4) [-]
         p: position, NED from the twin's origin, (n, 3) [m]
         v: velocity over ground, NED, (n, 3) [m/s]
-        ok: measured or interpolated across a short gap, (n,) bool; where False the row means nothing
+        ok: measured or interpolated across a short gap, (n,) bool; rows with False are invalid
         filled: interpolated across lost samples, (n,) bool
     """
 
@@ -59,15 +59,15 @@ class Window:
         )
 
     def columns(self, names: tuple[str, ...]) -> np.ndarray:
-        """Pick states or inputs by name, (n, k)."""
+        """Select states or inputs by name, (n, k)."""
         if all(name in STATES for name in names):
             return self.x[:, [STATES.index(name) for name in names]]
         phi = np.clip(self.x[:, STATES.index("phi")], -1.3, 1.3)
-        bank = np.tan(phi) * np.sin(phi)  # what a turn asks of pitch rate and lift: q = g / V tan(phi) sin(phi)
+        bank = np.tan(phi) * np.sin(phi)  # pitch rate of a level turn: q = g / V tan(phi) sin(phi)
         both, rows = (*STATES, *INPUTS, "bank"), np.column_stack([self.x, self.u, bank])
         return rows[:, [both.index(name) for name in names]]
 
     def part(self, start: int, stop: int) -> "Window":
-        """Cut rows `start` to `stop`."""
+        """Return rows `start` to `stop` as a window."""
         s = slice(start, stop)
         return Window(self.t[s], self.x[s], self.u[s], self.p[s], self.v[s], self.ok[s], self.filled[s])

@@ -211,7 +211,7 @@ def arguments(path: str, tree: ast.AST, text: str) -> Iterator[str]:
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             continue
         if any(
-            re.search(r"\b(njit|kernel|inlined|bare|making)\b", ast.unparse(decorator))
+            re.search(r"\b(njit|\w*kernel|inlined|bare|making)\b", ast.unparse(decorator))
             for decorator in node.decorator_list
         ):
             continue  # compiled (the other names are njit with options): takes flat numbers and arrays

@@ -302,7 +302,7 @@ def test_the_papers_experiment_asks_the_papers_way_beside_ours(short, tmp_path):
         (["FILE", "--every", "0"], "--every: found 0 s, expected 1..600"),
         (["FILE", "--methods", "cv,magic"], "--methods: found magic, expected some of"),
         (["FILE", "--jobs", "0"], "--jobs: found 0, expected 1..64; change it"),
-        (["FILE", "--json", "nowhere/a.json"], "--json: found no folder 'nowhere', expected one; make it first"),
+        (["FILE", "--json", "nowhere/a.json"], "--json: found no folder 'nowhere', expected one; create it first"),
         (["FILE", "--json", "FILE"], "expected another file; rename it"),
         (["FILE", "--out", "FILE"], "expected a folder; name another"),
         (["TEXT"], "found no recording in it, expected one of"),

@@ -346,7 +346,7 @@ def test_endpoints() -> None:
 def test_reachable_follows_the_router(free_port: int) -> None:
     router = f"tcp/127.0.0.1:{free_port}"
     assert not reachable(router)
-    with pytest.raises(ConnectionError, match=r"nobody answers; start `zenohd` or `fleet up`"):
+    with pytest.raises(ConnectionError, match=r"no response; start `zenohd` or `fleet up`"):
         connect(router)
     with open_router(router):
         assert reachable(router)

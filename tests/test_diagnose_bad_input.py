@@ -174,5 +174,5 @@ def test_folders_that_are_not_there_are_named_before_any_work(
 def test_it_must_be_said_what_to_compare_with() -> None:
     parser = argparse.ArgumentParser()
     verb.arguments(parser)
-    with pytest.raises(ValueError, match="either --model or --against"):
+    with pytest.raises(ValueError, match="exactly one of --model, --against"):
         verb.run(parser.parse_args(["a.tlog"]))

@@ -157,7 +157,7 @@ REFUSED = {  # before anything is begun
 }
 REFUSED_LATER = {
     ("--router", "nowhere"): "--router: found 'nowhere', expected",
-    ("--router", "tcp/192.0.2.1:7447"): "nobody answers and none can be opened here",
+    ("--router", "tcp/192.0.2.1:7447"): "no response, and no router can be opened here",
     ("--link", "ftp:a:1"): "--link: found 'ftp:a:1', expected udpin:HOST:PORT",
 }
 
@@ -185,7 +185,7 @@ def test_a_busy_port_is_refused_in_one_sentence() -> None:
         with process("fleet.cli", "up", *ports, "--mavlink", f"127.0.0.1:{held.getsockname()[1]}") as up:
             code, _, errors = ended(up)
     assert code == 2
-    assert errors.count("\n") == 1 and "is a fleet already up? name another" in errors
+    assert errors.count("\n") == 1 and "stop the other fleet, or name another port" in errors
 
 
 # --- a recording -----------------------------------------------------------------------------------------------------

@@ -97,7 +97,7 @@ def test_with_log_json_even_a_refusal_is_a_line_of_json(module: str) -> None:
     (line,) = done.stderr.splitlines()
     told = json.loads(line)
     assert told["level"] == "error" and told["process"] == module
-    expected = {"gateway": "found 'nonsense'", "viewer": "--port: found 99999", "twin_worker": "nobody answers; start"}
+    expected = {"gateway": "found 'nonsense'", "viewer": "--port: found 99999", "twin_worker": "no response; start"}
     assert expected[module] in told["message"]
 
 

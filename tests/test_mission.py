@@ -138,14 +138,14 @@ BAD = {
     "local frame": ([HOME, waypoint(1, 1, frame=1), waypoint(2, 2)], 1, "item 1: found frame 1"),
     "nan home": ([waypoint(0, 0, alt_m=NAN), waypoint(2, 2)], 1, "item 0"),
     "item lost": ([HOME, waypoint(2, 2)], 1, "found 2 of 3 items"),
-    "jump circle": ([HOME, jump(1, 1, -1), waypoint(2, 2)], 1, "item 1: found a jump circle"),
-    "jump circle of two": ([HOME, jump(1, 2, -1), jump(2, 1, -1), waypoint(3, 2)], 1, "jump circle"),
+    "jump circle": ([HOME, jump(1, 1, -1), waypoint(2, 2)], 1, "item 1: found a jump loop"),
+    "jump circle of two": ([HOME, jump(1, 2, -1), jump(2, 1, -1), waypoint(3, 2)], 1, "jump loop"),
     "jump too far": ([HOME, jump(1, 9, 1), waypoint(2, 2)], 1, "item 1: found jump to 9"),
     "jump home": ([HOME, jump(1, 0, 1), waypoint(2, 2)], 1, "item 1: found jump to 0"),
     "jump to nan": ([HOME, jump(1, NAN, 1), waypoint(2, 2)], 1, "item 1: found jump to nan"),
     "zero length": ([HOME, waypoint(1, 1), waypoint(2, 1), waypoint(3, 2)], 1, "item 2: found a leg of zero length"),
-    "seq too high": ([HOME, waypoint(2, 2)], 77, "found item in force 77"),
-    "seq unknown": ([HOME, waypoint(2, 2)], -1, "found item in force -1"),
+    "seq too high": ([HOME, waypoint(2, 2)], 77, "found current item 77"),
+    "seq unknown": ([HOME, waypoint(2, 2)], -1, "found current item -1"),
     "too many": ([HOME, *(waypoint(i, i * 1e-3) for i in range(1, MAX_ITEMS + 5)), waypoint(2, 2)], 2, "at most"),
 }
 
@@ -204,7 +204,7 @@ def test_without_home_item_0_is_flown_and_jumps_go_to_it():
     assert np.isnan(r.start).all()
     assert seqs(without_home([waypoint(0, 1)], seq=99)) == [0, -1]
     empty = without_home([])
-    assert not len(empty.legs) and "one at least" in empty.sentences[0]
+    assert not len(empty.legs) and "at least one" in empty.sentences[0]
 
 
 def test_without_home_circles_have_a_radius_and_an_exit_of_their_own():

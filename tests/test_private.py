@@ -70,7 +70,7 @@ def test_a_folder_below_one_that_others_may_change_is_refused_where_it_is_not_st
     below = private_files.folder(above / "below", "cache")
     assert below.stat().st_mode & 0o777 == 0o700
     above.chmod(0o777)
-    with pytest.raises(ValueError, match="above above it with mode 0777"):
+    with pytest.raises(ValueError, match="above with mode 0777"):
         private_files.folder(below, "cache")
     above.chmod(0o1777)
     assert private_files.folder(below, "cache") == below

@@ -273,8 +273,8 @@ def test_ctrl_c_ends_a_recording_cleanly(router, tmp_path, number):
 def test_it_ends_by_itself_and_never_overwrites_unasked(router, tmp_path):
     path = tmp_path / "short.parauav"
     for options, code, words in (
-        (["--for", "0.3"], 0, "nothing heard yet"),
-        (["--for", "0.3"], 2, "there already, expected a new name; choose one, or say --overwrite"),
+        (["--for", "0.3"], 0, "no messages yet"),
+        (["--for", "0.3"], 2, "expected a new name; choose one, or add --overwrite"),
         (["--for", "0.3", "--overwrite"], 0, "is complete"),
         (["--for", "-1"], 2, "--for: found -1.0 s"),
     ):

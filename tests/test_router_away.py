@@ -123,5 +123,5 @@ def test_a_gateway_that_records_begins_without_a_router_and_joins_it_later(tmp_p
 
 
 def test_without_a_recording_a_missing_router_stops_the_start():
-    with pytest.raises(ConnectionError, match="nobody answers"):
+    with pytest.raises(ConnectionError, match="no response"):
         connect(f"tcp/127.0.0.1:{unused_port()}")

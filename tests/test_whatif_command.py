@@ -72,4 +72,4 @@ def test_the_path_is_told_in_a_few_lines(holder, monkeypatch, capsys):
 def test_nobody_there_is_said(monkeypatch, capsys):
     monkeypatch.setattr(command, "connect", lambda _: MemoryBus())
     assert command.run(options()) == 1
-    assert "no worker answers" in capsys.readouterr().err
+    assert "found no worker that replies" in capsys.readouterr().err

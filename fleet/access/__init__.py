@@ -1,1 +1,1 @@
-"""Who may join the bus, as what, and how much each may say."""
+"""Access to the bus: credentials, roles, permissions and message size limits."""

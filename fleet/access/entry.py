@@ -1,4 +1,4 @@
-"""Where the router is and what is shown there: certificates, or a name and a password, as Zenoh's configuration."""
+"""Address of the router and credentials (certificates, or role and password) as Zenoh configuration."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,14 +12,14 @@ ROUTER = "tcp/127.0.0.1:7447"
 _TLS = "transport/link/tls"
 _WORDS = "transport/auth/usrpwd"
 _FULL = "transport/link/tx/queue/congestion_control"
-_REFUSED_MS = 10_000  # a router that lets a session in takes less, also on a busy machine
+_REFUSED_MS = 10_000  # an accepted session takes less, also on a busy machine
 
 
 def endpoint(router: str) -> tuple[str, int]:
     """Split `tcp/127.0.0.1:7447` into host and port.
 
     Raises:
-        ValueError: when it is no tcp or tls endpoint.
+        ValueError: when it is not a tcp or tls endpoint.
     """
     kind, _, rest = router.partition("/")
     host, _, port = rest.rpartition(":")
@@ -30,13 +30,13 @@ def endpoint(router: str) -> tuple[str, int]:
 
 @dataclass(frozen=True)
 class Entry:
-    """One process's way onto the bus.
+    """Address of the router and credentials of one process.
 
     Attributes:
-        at: the router's endpoint
+        endpoint: of the router
         role: of this process, one of ROLES
         certificates: folder of `ca.pem` and of the role's `.pem` and `.key`; None: no TLS
-        passwords: file of lines `role:password`; None: none are asked for
+        passwords: file of lines `role:password`; None: no passwords
     """
 
     at: str = ROUTER
@@ -45,10 +45,10 @@ class Entry:
     passwords: Path | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot work.
+        """Validate the combination.
 
         Raises:
-            ValueError: when endpoint and certificates do not go together.
+            ValueError: when endpoint and certificates do not match.
         """
         endpoint(self.at)
         if self.at.startswith("tls/") != (self.certificates is not None):
@@ -60,23 +60,23 @@ class Entry:
 
     @property
     def mutual(self) -> bool:
-        """Return whether a role is known by its certificate."""
+        """Return whether a certificate identifies the role."""
         return self.certificates is not None and self.passwords is None
 
     def papers(self) -> Papers | None:
-        """Find what this role is known by; None where that is no certificate.
+        """Find the certificate of this role; None where the role uses a password or nothing.
 
         Raises:
-            ValueError: when it is missing, expired, or open to others.
+            ValueError: when it is missing, expired, or readable by others.
             OSError: when it cannot be read.
         """
         return papers_of(self.certificates, self.role) if self.certificates and not self.passwords else None
 
     def session(self, *, patient: bool = False) -> dict[str, Any]:
-        """Return a session that joins, by Zenoh's configuration paths; `patient`: it begins without a router, too.
+        """Return the settings of a client session by Zenoh configuration path; `retry`: start without a router, too.
 
         Raises:
-            ValueError: when a file is missing, expired, or open to others.
+            ValueError: when a file is missing, expired, or readable by others.
             OSError: when one cannot be read.
         """
         out = _common("peer" if patient else "client", connect=[self.at], listen=[])  # a client would wait in `open`
@@ -92,11 +92,11 @@ class Entry:
         return out
 
     def router(self, listen: list[str] | None = None, beside: list[str] | None = None) -> dict[str, Any]:
-        """Return the router itself, by Zenoh's configuration paths.
+        """Return the settings of the router by Zenoh configuration path.
 
         Args:
-            listen: endpoints, `at` unless said
-            beside: other routers of the site
+            listen: endpoints; None: `endpoint`
+            peers: other routers of the site
         Raises:
             ValueError: as `session`.
             OSError: as `session`.
@@ -134,8 +134,8 @@ def _common(mode: str, *, connect: list[str], listen: list[str]) -> dict[str, An
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
         "transport/link/tx/lease": 1000,
         "transport/link/tx/keep_alive": 4,
-        "transport/link/tx/queue/size/data_low": 16,  # batches of 64 kB: large answers pass on a busy machine, too
-        f"{_FULL}/drop/max_wait_before_drop_fragments": 500_000,  # of a large answer, in all [us]
+        "transport/link/tx/queue/size/data_low": 16,  # batches of 64 kB: enough for large replies on a busy machine
+        f"{_FULL}/drop/max_wait_before_drop_fragments": 500_000,  # total for a large reply [us]
         "transport/link/rx/max_message_size": MESSAGE_MOST,
-        "transport/shared_memory/enabled": False,  # who is killed leaves its share behind, mapped by all others
+        "transport/shared_memory/enabled": False,  # a killed process would leave its segment mapped by all others
     }

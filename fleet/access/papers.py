@@ -1,4 +1,4 @@
-"""Certificates and passwords on this machine: found, private, and not expired."""
+"""Find the certificates and passwords of this machine and check their permissions and expiry."""
 
 import os
 import stat
@@ -10,7 +10,7 @@ from cryptography import x509
 
 from fleet.access.roles import ROUTER_ROLE
 
-HOW = "make them with deploy/certificates.sh"
+HOW = "create them with deploy/certificates.sh"
 MOST_PASSWORD = 1024
 
 
@@ -25,7 +25,7 @@ def papers_of(folder: Path, role: str) -> Papers:
     """Find the certificate of a role and its key.
 
     Raises:
-        ValueError: when one is missing, has expired, or the key is open to others.
+        ValueError: when one is missing, has expired, or the key is readable by others.
         OSError: when one cannot be read.
     """
     papers = Papers(folder / f"{role}.pem", folder / f"{role}.key")
@@ -39,17 +39,17 @@ def papers_of(folder: Path, role: str) -> Papers:
     if ends < now:
         names = "router FOLDER NAME..." if role == ROUTER_ROLE else f"role FOLDER {role}"
         raise ValueError(
-            f"certificates: found {papers.certificate} expired on {ends:%Y-%m-%d %H:%M} UTC, this clock says "
+            f"certificates: found {papers.certificate} expired on {ends:%Y-%m-%d %H:%M} UTC, the time here is "
             f"{now:%Y-%m-%d %H:%M}; renew it: certificates.sh {names}, and copy it here"
         )
     return papers
 
 
 def ending(certificate: Path) -> datetime:
-    """Tell when the last certificate of a file ceases to be valid: the first is a role's, an authority may have two.
+    """Return the latest expiry of the certificates in a file; a file of authorities may contain two.
 
     Raises:
-        ValueError: when it holds no certificate.
+        ValueError: when it contains no certificate.
         OSError: when it cannot be read.
     """
     try:
@@ -59,38 +59,38 @@ def ending(certificate: Path) -> datetime:
 
 
 def private(path: Path) -> None:
-    """Refuse a secret that everybody may read, or that others may change.
+    """Check that a secret is readable by owner and group only, and writable by its owner only.
 
     Raises:
-        ValueError: when it is so.
-        OSError: when it cannot be looked at.
+        ValueError: when it is not.
+        OSError: when its status cannot be read.
     """
     found = path.stat()
     mode = stat.S_IMODE(found.st_mode)
     if not stat.S_ISREG(found.st_mode) or mode & 0o037:
         raise ValueError(
-            f"certificates: found {path} with mode {mode:04o}, expected it for owner and group alone; chmod 640 {path}"
+            f"certificates: found {path} with mode {mode:04o}, expected owner and group only; chmod 640 {path}"
         )
     if found.st_uid not in (0, os.geteuid()) and os.geteuid() != 0:
         raise ValueError(
-            f"certificates: found {path} with owner {found.st_uid}, expected {os.geteuid()}, who runs this, or root; "
-            f"chown it, or make another"
+            f"certificates: found {path} with owner {found.st_uid}, expected {os.geteuid()}, this user, or root; "
+            f"chown it, or create another"
         )
     if not os.access(path, os.R_OK):
-        raise ValueError(f"certificates: found {path} that this user may not read; chown it to who runs ParaUAV")
+        raise ValueError(f"certificates: found {path} not readable by this user; chown it to the user of ParaUAV")
 
 
 def _unaltered(path: Path) -> None:
-    """Refuse a certificate, or a folder of them, that others may replace.
+    """Check that no other user may replace a certificate or its folder.
 
     Raises:
-        ValueError: when it is so.
-        OSError: when it cannot be looked at.
+        ValueError: when another user may.
+        OSError: when its status cannot be read.
     """
     mode = stat.S_IMODE(path.stat().st_mode)
     if mode & 0o022 and not mode & stat.S_ISVTX:
         raise ValueError(
-            f"certificates: found {path} with mode {mode:04o}, expected that only its owner may change it; "
+            f"certificates: found {path} with mode {mode:04o}, expected write permission for its owner only; "
             f"chmod go-w {path}"
         )
 
@@ -99,7 +99,7 @@ def password_of(path: Path, role: str) -> str:
     """Read a role's password from a file of lines `role:password`.
 
     Raises:
-        ValueError: when it has none, or everybody may read the file.
+        ValueError: when there is none, or the file is readable by others.
         OSError: when it cannot be read.
     """
     private(path)

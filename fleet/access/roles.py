@@ -1,4 +1,4 @@
-"""THE TABLE of who says what on the bus, and how large it may be: the router's rules and every reader follow it."""
+"""Permissions and size limits by topic: the single table behind the router's rules and every reader."""
 
 from typing import NamedTuple
 
@@ -6,20 +6,20 @@ ROOT = "parauav"
 GATEWAY, WORKER, VIEWER, TOOLS = "gateway", "worker", "viewer", "tools"
 ROUTER_ROLE = "router"
 ROLES = (GATEWAY, WORKER, VIEWER, TOOLS)
-"""What a process shows a certificate or a password for; the commands of `fleet` are tools."""
+"""Roles that a certificate or a password proves; the commands of `fleet` have the role `tools`."""
 
 KB, MB = 1 << 10, 1 << 20
-MOST_ASKED = 512 * KB  # payload of a query: another mission of 1,000 items, a thousand ids [bytes]
-LIVE = "@live"  # tokens of processes that are present
+MOST_ASKED = 512 * KB  # payload of a query: a mission of 1,000 items, or 1,000 ids [bytes]
+LIVE = "@live"  # liveliness tokens of processes
 
 
 class Said(NamedTuple):
-    """Who may say a topic, who may ask for it, and the most bytes of one message.
+    """Permissions and size limit of one topic.
 
     Attributes:
-        by: roles that may publish it and answer for it
-        most: largest payload [bytes]
-        asked: roles that may query it
+        publishers: roles that may publish it and reply to queries on it
+        max_bytes: largest payload [bytes]
+        queriers: roles that may query it
     """
 
     by: tuple[str, ...]
@@ -36,15 +36,15 @@ SAID: dict[str, Said] = {
     "model": Said((WORKER,), 256 * KB),
     "prediction": Said((WORKER,), 256 * KB),
     "mismatch": Said((WORKER,), 256 * KB),
-    "alert": Said((GATEWAY, WORKER), 64 * KB),  # of the gateway: a second sender
+    "alert": Said((GATEWAY, WORKER), 64 * KB),  # from the gateway: a second sender
     "@fleet/state": Said((WORKER,), MB),
     "@fleet/prediction": Said((WORKER,), 32 * MB),  # 4 KB for each of its aircraft
     "@gateway": Said((GATEWAY,), MB),
     "@claim": Said((WORKER,), MB),
-    "@handover": Said((WORKER,), 32 * MB, asked=(WORKER,)),  # all that is known of an aircraft
+    "@handover": Said((WORKER,), 32 * MB, asked=(WORKER,)),  # the complete twin of an aircraft
 }
 MOST = max(said.most for said in SAID.values())
-MESSAGE_MOST = MOST + MB  # what a session puts together from fragments before anything looks at it [bytes]
+MESSAGE_MOST = MOST + MB  # largest message that a session reassembles from fragments [bytes]
 
 
 def keys(topic: str) -> str:

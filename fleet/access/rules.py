@@ -1,8 +1,7 @@
-"""The router's side of the table: access control by role and limits on message size, as Zenoh's configuration.
+"""Access control by role and limits on message size, generated from the permission table as Zenoh configuration.
 
-Everything not named is denied. What comes in is what a role may say, ask and listen to; what goes out is what any role
-may know, which is everything but the twins that workers hand to each other. `**` never matches a chunk that begins with
-`@`, so these are named one by one.
+Everything not listed is denied. Ingress: what a role may publish, query and subscribe to. Egress: everything except the
+twins exchanged between workers. `**` never matches a chunk that begins with `@`, so those keys are listed one by one.
 """
 
 from itertools import groupby
@@ -10,7 +9,7 @@ from typing import Any
 
 from fleet.access.roles import LIVE, MOST_ASKED, ROLES, ROOT, ROUTER_ROLE, SAID, WORKER, keys
 
-CERTIFICATE, PASSWORD = "cert_common_names", "usernames"  # what tells a role, by the words of the configuration
+CERTIFICATE, PASSWORD = "cert_common_names", "usernames"  # proof of a role, named as in Zenoh's configuration
 _STAMP = 16  # attachment of a result [bytes]
 _SAY = ("put", "reply", "declare_queryable")
 _ALL = (*_SAY, "query", "declare_subscriber", "liveliness_token", "liveliness_query", "declare_liveliness_subscriber")
@@ -19,24 +18,26 @@ _LIVE = f"{ROOT}/{LIVE}/**"
 
 
 def access_control(known_by: str = CERTIFICATE) -> dict[str, Any]:
-    """Return `access_control`; `known_by`: what tells the router a role, CERTIFICATE or PASSWORD."""
+    """Return `access_control`; `identified_by`: proof of a role, CERTIFICATE or PASSWORD."""
     control = [topic for topic in SAID if topic.startswith("@")]
     common = [_EVERY, *(keys(topic) for topic in control if SAID[topic].asked == ROLES)]
     rules = [
-        _rule("hear", ("declare_subscriber", "query"), "ingress", common),
-        _rule("attend", ("liveliness_query", "declare_liveliness_subscriber"), "ingress", [_LIVE]),
-        _rule("know", _ALL, "egress", [*common, _LIVE]),
-        _rule("live", ("liveliness_token",), "ingress", [f"{ROOT}/{LIVE}/{WORKER}/**"]),
+        _rule("subscribe", ("declare_subscriber", "query"), "ingress", common),
+        _rule("watch liveliness", ("liveliness_query", "declare_liveliness_subscriber"), "ingress", [_LIVE]),
+        _rule("receive", _ALL, "egress", [*common, _LIVE]),
+        _rule("declare liveliness", ("liveliness_token",), "ingress", [f"{ROOT}/{LIVE}/{WORKER}/**"]),
         _rule("route", (*_ALL, "delete"), "", [_EVERY, *map(keys, control), _LIVE]),
     ]
-    held = {role: ["hear", "attend", "know"] for role in ROLES} | {ROUTER_ROLE: ["route"]}
-    held[WORKER].append("live")
+    held = {role: ["subscribe", "watch liveliness", "receive"] for role in ROLES} | {ROUTER_ROLE: ["route"]}
+    held[WORKER].append("declare liveliness")
     for role in ROLES:
         hidden = [keys(topic) for topic, said in SAID.items() if role in said.asked != ROLES]
         own = [
-            _rule(f"{role} says", _SAY, "ingress", [keys(topic) for topic, said in SAID.items() if role in said.by]),
-            _rule(f"{role} asks", ("query",), "ingress", hidden),
-            _rule(f"{role} knows", _ALL, "egress", hidden),
+            _rule(
+                f"{role} publishes", _SAY, "ingress", [keys(topic) for topic, said in SAID.items() if role in said.by]
+            ),
+            _rule(f"{role} queries", ("query",), "ingress", hidden),
+            _rule(f"{role} receives", _ALL, "egress", hidden),
         ]
         rules += (own := [rule for rule in own if rule["key_exprs"]])
         held[role] += [rule["id"] for rule in own]
@@ -50,7 +51,7 @@ def access_control(known_by: str = CERTIFICATE) -> dict[str, Any]:
 
 
 def limits() -> dict[str, Any]:
-    """Return what keeps large messages out, by Zenoh's configuration paths."""
+    """Return the size limits of messages by Zenoh configuration path."""
     by_size = sorted(SAID, key=lambda topic: SAID[topic].most)
     filters = [
         _filter(("put", "reply"), [keys(topic) for topic in topics], most + _STAMP)

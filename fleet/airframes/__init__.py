@@ -1,4 +1,4 @@
-"""Airframes: what is known of an aircraft before it flies, one TOML file each, and the derivatives that follow.
+"""Airframes: prior data of an aircraft type, one TOML file each, and the derivatives computed from them.
 
 Source: Beard & McLain 2012, section 5.5 (dimensional derivatives) and eq. 3.13 (products of inertia).
 """
@@ -12,7 +12,7 @@ from fleet.frames import G
 
 RHO = 1.225  # air at sea level [kg/m3]
 GENERIC = "small_fixed_wing"
-_FADE = 2.5  # thrust a fixed-pitch propeller loses as it flies faster, -(V / T) dT/dV at 0.7 of its zero-thrust J [-]
+_FADE = 2.5  # thrust lapse of a fixed-pitch propeller, -(V / T) dT/dV at 0.7 of its zero-thrust J [-]
 _HERE = Path(__file__).parent
 _NUMBERS = ("mass", "J_x", "J_y", "J_z", "J_xz", "S", "b", "c", "speed", "thrust", "doubt")
 _POSITIVE = ("mass", "J_x", "J_y", "J_z", "S", "b", "c", "speed", "doubt")
@@ -30,12 +30,12 @@ class Airframe:
     """One aircraft type.
 
     Attributes:
-        name, source: who it is, and where the numbers come from
+        name, source: of the airframe, and of its numbers
         value: mass [kg], J_x J_y J_z J_xz [kg m2], S [m2], b c [m], speed [m/s], thrust [m/s2], doubt [-]
-        throw: deflection at full command, with the book's sign [rad]
+        throw: deflection at full command, signs of Beard & McLain [rad]
         coefficient: per rad or per normalised rate [-]
-        scale: the numbers are of a class, to be scaled to the aircraft at hand
-        span: of that aircraft, where it is known [m]
+        scale: True: the numbers describe a class and are scaled to the actual aircraft
+        span: of the actual aircraft, where known [m]
     """
 
     name: str
@@ -48,21 +48,21 @@ class Airframe:
 
 
 def load(which: str) -> Airframe:
-    """Read an airframe by the name of a file that comes with ParaUAV, or by a path.
+    """Read an airframe by the name of a file shipped with ParaUAV, or by a path.
 
     Raises:
-        ValueError: when it is no airframe; the sentence names the field to mend.
+        ValueError: when it is not an airframe; the text names the field to correct.
         OSError: when there is no such file.
     """
     path = _HERE / f"{which}.toml"
     path = path if "/" not in which and path.exists() else Path(which)
     if not path.exists():
         known = ", ".join(sorted(found.stem for found in _HERE.glob("*.toml")))
-        raise OSError(f"{which}: found no such airframe, expected a TOML file or one of {known}; check the path")
+        raise OSError(f"{which}: found no airframe, expected a TOML file or one of {known}; check the path")
     try:
         read = tomllib.loads(path.read_text())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path.name}: found no TOML ({error}), expected an airframe; correct it") from None
+        raise ValueError(f"{path.name}: found invalid TOML ({error}), expected an airframe; correct it") from None
     value = _numbers(path.name, read, _NUMBERS)
     for name in _POSITIVE:
         if value[name] <= 0:
@@ -89,8 +89,8 @@ def _numbers(file: str, table: object, names: tuple[str, ...]) -> dict[str, floa
 def derivatives(of: Airframe, V: float) -> dict[str, float]:
     """Return the dimensional derivatives at airspeed V in level flight, by their names in `fleet.physics.wrench`.
 
-    Specific force [m/s2] and angular acceleration [rad/s2] per m/s, rad/s and full command; offsets are left out.
-    Body axes at a small angle of attack: lift along -z, drag and what speed takes from thrust along -x.
+    Specific force [m/s2] and angular acceleration [rad/s2] per m/s, rad/s and full command; without offsets.
+    Body axes at a small angle of attack: lift along -z, drag and thrust lapse along -x.
     """
     a, k, t = of.value, of.coefficient, of.throw
     pressure = 0.5 * RHO * V * V * a["S"]
@@ -99,7 +99,7 @@ def derivatives(of: Airframe, V: float) -> dict[str, float]:
     force, span, chord = pressure / a["mass"], a["b"] / (2 * V), a["c"] / (2 * V)
     pitch = pressure * a["c"] / a["J_y"]
     out = {
-        "X_u": -(2 + _FADE) * force * drag / V,  # thrust is drag in level flight
+        "X_u": -(2 + _FADE) * force * drag / V,  # thrust equals drag in level flight
         "X_w": force * (lift - 2 * k["C_D_k"] * lift * k["C_L_alpha"]) / V,
         "X_de": 0.0,
         "X_dt": a["thrust"],

@@ -1,4 +1,4 @@
-"""What the autopilot's parameters say of the aircraft: which servo moves which surface."""
+"""Servo map from the autopilot's parameters: the surface or motor of each servo."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 _FUNCTION = {4: "delta_a", 19: "delta_e", 21: "delta_r", 70: "delta_t", 77: "delta_e+a", 78: "delta_e-a"}
-_MIXES = {  # share of each servo's deflection that goes into each input
+_MIXES = {  # contribution of each servo's deflection to each input
     "delta_a": {"delta_a": 1.0},
     "delta_e": {"delta_e": 1.0},
     "delta_r": {"delta_r": 1.0},
@@ -20,17 +20,17 @@ _INPUTS = ("delta_a", "delta_e", "delta_r", "delta_t")
 _SERVOS = 8
 _PX4_MOTORS, _PX4_SURFACES = 101, 201  # PWM_MAIN_FUNCn of the first motor, of the first control surface
 _PX4_TYPES = {1: "delta_a", 2: "delta_a", 3: "delta_e", 4: "delta_r", 5: "delta_e+a", 6: "delta_e-a"}  # CA_SV_CSn_TYPE
-_PX4_LEFT = 1  # a left aileron: up for what is right roll
+_PX4_LEFT = 1  # a left aileron: up in a roll to the right
 
 
 @dataclass(frozen=True)
 class ServoMap:
-    """Pulse widths to inputs: `u = (pulse - trim) @ gain`.
+    """Map of pulse widths to inputs: `u = (pulse - trim) @ gain`.
 
     Attributes:
         trim: pulse width at zero deflection, (8,) [us]
-        gain: inputs per pulse, upper and lower side of the throw, each (8, 4) [1/us]
-        sentence: what was assumed, or empty
+        gain_up, gain_down: inputs per pulse above and below trim, each (8, 4) [1/us]
+        sentence: assumptions, or empty
     """
 
     trim: np.ndarray
@@ -39,12 +39,12 @@ class ServoMap:
     sentence: str
 
     def same(self, other: "ServoMap") -> bool:
-        """Return whether another turns pulses into the same inputs."""
+        """Return whether another map converts pulses to the same inputs."""
         pairs = ((self.trim, other.trim), (self.gain_up, other.gain_up), (self.gain_down, other.gain_down))
         return self is other or all(np.array_equal(one, another) for one, another in pairs)
 
     def inputs(self, pulses: np.ndarray) -> np.ndarray:
-        """Turn pulse widths (n, 8) [us] into inputs (n, 4) in the order of `fleet.window.INPUTS` [-]."""
+        """Convert pulse widths (n, 8) [us] to inputs (n, 4) in the order of `fleet.window.INPUTS` [-]."""
         out = np.empty((len(pulses), len(_INPUTS)))
         _inputs_each(np.ascontiguousarray(pulses, float), self.trim, self.gain_up, self.gain_down, out)
         return out
@@ -52,7 +52,7 @@ class ServoMap:
 
 @nb.njit(cache=True, nogil=True)
 def _inputs_each(pulses: np.ndarray, trim: np.ndarray, up: np.ndarray, down: np.ndarray, out: np.ndarray) -> None:
-    """Fill in the inputs of every row, within 1.2 of their throw; throttle never below idle."""
+    """Write the inputs of every row to `out`, limited to 1.2 of full throw; throttle not below idle."""
     for k in range(len(out)):
         out[k] = 0.0
         for i in range(_SERVOS):
@@ -61,15 +61,15 @@ def _inputs_each(pulses: np.ndarray, trim: np.ndarray, up: np.ndarray, down: np.
                 out[k, j] += off * (up[i, j] if off > 0.0 else down[i, j])
         for j in range(4):
             low = 0.0 if j == 3 else -1.2
-            if out[k, j] > 1.2 or out[k, j] < low:  # nan stays
+            if out[k, j] > 1.2 or out[k, j] < low:  # nan is preserved
                 out[k, j] = 1.2 if out[k, j] > 1.2 else low
 
 
 def servo_map(params: Mapping[str, float]) -> ServoMap:
     """Read SERVOn_FUNCTION, _MIN, _MAX, _TRIM, _REVERSED; without them assume aileron, elevator, throttle, rudder.
 
-    Source: ArduPilot, "Servo functions" (4 aileron, 19 elevator, 21 rudder, 70 throttle, 77 and 78 elevons); PX4's
-    PWM_MAIN_* and CA_SV_CSn_TYPE say the same in other words.
+    Source: ArduPilot, "Servo functions" (4 aileron, 19 elevator, 21 rudder, 70 throttle, 77 and 78 elevons); PX4:
+    PWM_MAIN_* and CA_SV_CSn_TYPE.
     """
     params = {name: value for name, value in params.items() if isfinite(value)}
     params = {**_as_ardupilot(params), **params}
@@ -96,7 +96,7 @@ def servo_map(params: Mapping[str, float]) -> ServoMap:
 
 
 def _as_ardupilot(params: Mapping[str, float]) -> dict[str, float]:
-    """Say what PX4's outputs drive in ArduPilot's words; empty where PX4 says nothing."""
+    """Convert PX4's output parameters to ArduPilot's; empty without PX4 parameters."""
     numbers = {name: number for number, name in reversed(_FUNCTION.items())}
     found: dict[str, float] = {}
     for n in range(1, _SERVOS + 1):

@@ -1,4 +1,4 @@
-"""What a bus is: its keys, what can be done on it, and which of two answers is believed."""
+"""Interface of a bus: keys, publish, subscribe, queries, liveliness, and the selection among several replies."""
 
 from collections.abc import Callable, Container, Iterable, Iterator
 from contextlib import AbstractContextManager
@@ -13,7 +13,7 @@ M = TypeVar("M")
 Heard = Callable[[Any, Stamp | None], None]
 Overheard = Callable[[bytes, str, Stamp | None], None]
 Letter = tuple[int | None, bytes, str, Stamp | None]
-"""The UAV its key names, the payload, its encoding and its claim."""
+"""UAV id of the key, payload, encoding, stamp."""
 Collected = Callable[[list[Letter]], None]
 Answers = Iterable[tuple[Any, Stamp | None]]
 Answer = Callable[[int | None, dict[str, str], bytes], Answers]
@@ -22,108 +22,108 @@ Wants = Callable[[int], bool]
 
 
 def key(kind: type, who: int | str) -> str:
-    """Return the key of one message class: `parauav/7/sample`, `parauav/@fleet/state/{writer}`; who may be `*`."""
+    """Return the key of a message class: `parauav/7/sample`, `parauav/@fleet/state/{writer}`; `target` may be `*`."""
     topic: str = kind.topic  # type: ignore[attr-defined]
     return f"{ROOT}/{who}/{topic}" if kind in PER_UAV else f"{ROOT}/{topic}/{who}"
 
 
 @lru_cache(maxsize=16_384)
 def uav_in(name: str) -> int | None:
-    """Read the UAV id out of a key; None where the chunk is a wildcard or no number."""
+    """Parse the UAV id of a key; None where the chunk is a wildcard or not a number."""
     chunk = name.split("/")[1] if name.count("/") >= 2 else ""
     return int(chunk) if chunk.isdecimal() and len(chunk) <= 9 else None
 
 
 class Bus(AbstractContextManager, Protocol):
-    """What every process talks through."""
+    """Interface of the bus of one process."""
 
     writer: int  # random id of this process on the bus
-    bad: int  # messages heard that do not fit the contract
+    bad: int  # received messages that do not decode
 
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
-        """Send one message to whoever listens."""
+        """Publish one message."""
 
     def put(self, wire: Wire, stamp: Stamp | None = None) -> None:
-        """Send one message that is packed already."""
+        """Publish one encoded message."""
 
     @property
     def router(self) -> str:
-        """Name who is there to pass on what is published; empty: nobody, and it is looked for again and again."""
+        """Return the id of the connected router; empty while none is connected (the bus keeps retrying)."""
 
     def subscribe(self, kind: type, heard: Heard, wants: Wants | None = None) -> None:
-        """Call `heard(message, stamp)` for every message of a class; undecodable ones are counted, not raised.
+        """Call `callback(message, stamp)` for every message of a class; undecodable messages are counted only.
 
         Args:
-            kind: of the contract
-            heard: called on a thread of the bus
-            wants: tells by UAV id which messages are worth decoding; None: all
+            kind: message class of the contract
+            callback: called on a thread of the bus
+            accepts: filter by UAV id, applied before decoding; None: all
         """
 
     def overhear(self, kind: type, heard: Overheard) -> None:
-        """Call `heard(payload, encoding, stamp)` for every message of a class, as it came and whatever is in it."""
+        """Call `callback(payload, encoding, stamp)` for every message of a class, without decoding it."""
 
     def collect(self, kind: type, heard: Collected) -> None:
-        """Put every message of a class aside until `hand_out`: it costs no thread and no turn of one.
+        """Buffer every message of a class until `dispatch`; needs no thread.
 
         Args:
-            kind: of the contract
-            heard: called with all of them in the order they came, whatever is in them
+            kind: message class of the contract
+            callback: called with all buffered messages in order of arrival, undecoded
         """
 
     def hand_out(self, newest: Container[type] = ()) -> None:
-        """Give out what was put aside, on this thread; call it often, for only so much is kept: the newest.
+        """Pass the buffered messages to their callbacks on this thread; a full buffer drops its oldest messages.
 
         Args:
-            newest: classes of which the newest message of each sender is enough: those it replaces are not unpacked
+            latest_only: classes of which only the newest message of each key is passed on
         """
 
     def answer(self, kind: type, reply: Answer) -> None:
-        """Declare one wildcard queryable for a class: `reply(uav or None, parameters, payload)`."""
+        """Declare one wildcard queryable for a class: `handler(uav or None, parameters, payload)`."""
 
     def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
-        """Ask everyone for a class, for at most `timeout_s` [s]; the highest epoch per aircraft is kept.
+        """Query all writers of a class for at most `timeout_s` [s]; return the reply of highest epoch per aircraft.
 
         Raises:
             ConnectionError: when the session is closed; join the router again.
         """
 
     def inquire(self, kind: type[M], who: int, payload: bytes, timeout_s: float = 5.0) -> tuple[M, Stamp | None] | None:
-        """Ask about one aircraft with a payload; None where nobody answers.
+        """Query one aircraft with a payload; None without a reply.
 
         Raises:
-            ValueError: when every answer is a refusal; in the words of the one who refused.
+            ValueError: when every reply is an error; with the text of the first.
             ConnectionError: when the session is closed; join the router again.
         """
 
     def gather(self, kind: type[M], who: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
-        """Ask with a payload and return every answer as it comes, for at most `timeout_s` [s]; refusals are left out.
+        """Query with a payload and yield every reply on arrival, for at most `timeout_s` [s]; omits error replies.
 
         Raises:
             ConnectionError: when the session is closed; join the router again.
         """
 
     def fetch(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
-        """Ask and give the bytes of every answer as it comes, for at most `timeout_s` [s]; other versions are left out.
+        """Query and yield the payload of every reply on arrival, for at most `timeout_s` [s]; skip other versions.
 
         Raises:
             ConnectionError: when the session is closed; join the router again.
         """
 
     def present(self, name: str) -> None:
-        """Say that this process lives, until it does not: a liveliness token at `parauav/@live/{name}`."""
+        """Declare the liveliness token `parauav/@live/{name}` for the lifetime of this process."""
 
     def attend(self, told: Token) -> None:
-        """Call `told(name, lives)` for every process that is present, comes or goes; those there now at once."""
+        """Call `callback(name, alive)` for every liveliness token now, and on every later change."""
 
     def recount(self, told: Token) -> None:
-        """Call `told(name, True)` for every process that is present now."""
+        """Call `callback(name, True)` for every current liveliness token."""
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Close the connection to the bus."""
 
 
 def newest(found: list[tuple[M, Stamp | None]]) -> list[tuple[M, Stamp | None]]:
-    """Keep the reply with the highest timely claim, then the newest, per UAV (and alert); without a UAV all stay."""
+    """Select the reply of highest plausible epoch, then the newest, per UAV (and alert); keep all without a UAV."""
     best: dict[tuple[int, str], tuple[M, Stamp | None]] = {}
     rest = []
     for message, stamp in found:
@@ -145,5 +145,5 @@ def _rank(message: Any, stamp: Stamp | None) -> tuple[Stamp, float]:
 
 
 def asked_for(uav: int | None, answers: Answers) -> Answers:
-    """Keep the answers about the aircraft asked for, each as soon as it is there; None keeps all."""
+    """Filter replies lazily by UAV id; None keeps all."""
     return ((m, stamp) for m, stamp in answers if uav is None or getattr(m, "uav", uav) == uav)

@@ -1,4 +1,4 @@
-"""Messages to bytes and back: msgpack maps, a version in the encoding, an attachment of epoch and writer."""
+"""Encode and decode messages: msgpack maps, a version in the encoding, an attachment of epoch and writer."""
 
 import math
 import struct
@@ -11,7 +11,7 @@ from fleet.access.roles import SAID
 from fleet.contract import PER_UAV, TOPICS
 
 M = TypeVar("M")
-EPOCH_AHEAD_MS = 300_000  # an epoch further ahead of one's own clock is forged, or of a clock that is wrong
+EPOCH_AHEAD_MS = 300_000  # an epoch further ahead of the local clock is forged or of a wrong clock
 _STAMP = struct.Struct("<QQ")
 _PACK = msgspec.msgpack.Encoder()
 _UNPACK: dict[str, Any] = {topic: msgspec.msgpack.Decoder(kind) for topic, kind in TOPICS.items()}
@@ -23,54 +23,54 @@ _NAMED = {
 
 
 class Stamp(NamedTuple):
-    """Who wrote a worker result, and under which claim; the highest timely epoch per UAV wins."""
+    """Writer of a worker result and the epoch of its claim; the highest plausible epoch per UAV wins."""
 
     epoch: int
     writer: int
 
 
 def timely(epoch: int, wall_s: float | None = None) -> bool:
-    """Return whether an epoch may be believed: it is a time [ms since 1970], and no claim is from the future.
+    """Return whether an epoch is plausible: a time [ms since 1970], at most 5 minutes ahead of the reader's clock.
 
     Args:
         epoch: of a claim
-        wall_s: the reader's own clock, now unless said [s since 1970]
+        wall_s: the reader's clock; None: now [s since 1970]
     """
     return 0 <= epoch <= (time.time() if wall_s is None else wall_s) * 1e3 + EPOCH_AHEAD_MS
 
 
 class Wire(NamedTuple):
-    """A message that is packed already."""
+    """An encoded message."""
 
     kind: type  # from `fleet.contract`
     uav: int
     payload: bytes
-    t: float = math.nan  # what the message says of it, where that is known [s since 1970]
+    t: float = math.nan  # time of the message, where known [s since 1970]
 
     def message(self) -> Any:
-        """Unpack it."""
+        """Decode it."""
         return decode(self.kind, self.payload)
 
 
 def encode(message: Any) -> bytes:
-    """Pack one message as a msgpack map; what is packed already stays as it is."""
+    """Encode one message as a msgpack map; return the payload of an encoded message unchanged."""
     return message.payload if isinstance(message, Wire) else _PACK.encode(message)
 
 
 def encoding(kind: type) -> str:
-    """Name the Zenoh encoding of a message class, e.g. `application/msgpack;parauav.sample.1`."""
+    """Return the Zenoh encoding of a message class, e.g. `application/msgpack;parauav.sample.1`."""
     return _NAMED[kind]
 
 
 def decode(kind: type[M], payload: bytes, named: str = "") -> M:
-    """Unpack one message of class `kind`.
+    """Decode one message of class `kind`.
 
     Args:
         kind: class from `fleet.contract`
         payload: msgpack bytes
-        named: the Zenoh encoding it came with; empty skips the version check
+        encoding_name: received Zenoh encoding; empty skips the version check
     Raises:
-        ValueError: when the version is another, or the bytes are too many or do not fit; upgrade the older side.
+        ValueError: when the version differs, or the payload is too large or invalid; upgrade the older side.
     """
     expected = encoding(kind)
     if named and named != expected:
@@ -87,10 +87,10 @@ def decode(kind: type[M], payload: bytes, named: str = "") -> M:
 
 
 def decode_from(kind: type[M], uav: int | None, payload: bytes, named: str = "") -> M:
-    """Unpack one message that came under the key of a UAV, as `decode`.
+    """Decode one message received under the key of a UAV, as `decode`.
 
     Raises:
-        ValueError: also where it is of another: who may write about one aircraft must not write about another, or none.
+        ValueError: as `decode`, and when the message is of another UAV: permission for one key covers no other.
     """
     message: Any = decode(kind, payload, named)
     if kind in PER_UAV and message.uav != uav:
@@ -99,7 +99,7 @@ def decode_from(kind: type[M], uav: int | None, payload: bytes, named: str = "")
 
 
 def _short(text: str) -> str:
-    """Leave out the middle of what may be a stranger's text of any length."""
+    """Shorten untrusted text of any length by omitting its middle."""
     return text if len(text) <= 200 else f"{text[:80]} … {text[-80:]}"
 
 
@@ -109,7 +109,7 @@ def pack_stamp(stamp: Stamp) -> bytes:
 
 
 def unpack_stamp(attachment: bytes | None) -> Stamp | None:
-    """Unpack the attachment; None where there is none or it is not 16 bytes."""
+    """Unpack the attachment; None where it is missing or not 16 bytes."""
     if attachment is None or len(attachment) != _STAMP.size:
         return None
     return Stamp(*_STAMP.unpack(attachment))

@@ -1,4 +1,4 @@
-"""Of all who write for one aircraft the highest claim is believed: a reader's side of the claims."""
+"""Fencing by epoch on the reader's side: accept only the writer with the highest claim on an aircraft."""
 
 import time
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from fleet.bus.codec import Stamp, timely
 
-GIVE_UP_S = 10.0  # a writer silent for so long has lost its claim: a lower one (a restarted fleet) may speak [s]
+GIVE_UP_S = 10.0  # a writer silent for this long loses its claim: a lower one (a restarted fleet) is accepted [s]
 
 
 class _Believed(NamedTuple):
@@ -15,10 +15,10 @@ class _Believed(NamedTuple):
 
 
 class Fence:
-    """Who is believed, by UAV id; brief double writing during a handover is normal, seeing it is not.
+    """Accepted writer by UAV id; hides the brief double writing during a handover.
 
     Args:
-        clock: any clock that only goes forward [s]
+        clock: any monotonic clock [s]
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -26,7 +26,7 @@ class Fence:
         self._by_uav: dict[int, _Believed] = {}
 
     def believes(self, uav: int, stamp: Stamp | None) -> bool:
-        """Return whether a worker may speak for an aircraft: nobody with a higher timely claim has spoken lately."""
+        """Return whether a result is accepted: no writer with a higher plausible claim wrote recently."""
         rank, now = stamp or Stamp(0, 0), self._clock()
         if not timely(rank.epoch):
             return False

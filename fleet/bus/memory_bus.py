@@ -1,4 +1,4 @@
-"""The bus within one process, for tests and for what needs no router."""
+"""In-memory bus within one process, for tests and for uses without a router."""
 
 import secrets
 from collections.abc import Container, Iterator
@@ -15,7 +15,7 @@ M = TypeVar("M")
 
 
 class MemoryBus(AbstractContextManager):
-    """The bus within one process, synchronous; every message still goes through its bytes."""
+    """Synchronous bus within one process; every message is encoded and decoded."""
 
     router = "this process"
 
@@ -29,15 +29,15 @@ class MemoryBus(AbstractContextManager):
         self.bad = 0
 
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
-        """Send one message to whoever listens."""
+        """Publish one message."""
         self.deliver(type(message), encode(message), encoding(type(message)), stamp)
 
     def put(self, wire: Wire, stamp: Stamp | None = None) -> None:
-        """Send one message that is packed already."""
+        """Publish one encoded message."""
         self.deliver(wire.kind, wire.payload, encoding(wire.kind), stamp)
 
     def deliver(self, kind: type, payload: bytes, named: str, stamp: Stamp | None = None) -> None:
-        """Hand bytes to the listeners as if they had come over a wire; count what does not decode."""
+        """Pass a payload to the subscribers as if received; count payloads that do not decode."""
         for overheard in self._overheard.get(kind, []):
             overheard(payload, named, stamp)
         for heard in self._heard.get(kind, []):
@@ -49,46 +49,46 @@ class MemoryBus(AbstractContextManager):
             heard(message, stamp)
 
     def subscribe(self, kind: type, heard: Heard, wants: Wants | None = None) -> None:
-        """Call `heard(message, stamp)` for every message of a class, or those it wants."""
+        """Call `callback(message, stamp)` for every message of a class that `accepts` admits."""
         if wants is not None:
             heard = partial(_wanted, heard, wants)
         self._heard.setdefault(kind, []).append(heard)
 
     def overhear(self, kind: type, heard: Overheard) -> None:
-        """Call `heard(payload, encoding, stamp)` for every message of a class, as it came."""
+        """Call `callback(payload, encoding, stamp)` for every message of a class, undecoded."""
         self._overheard.setdefault(kind, []).append(heard)
 
     def collect(self, kind: type, heard: Collected) -> None:
-        """Call `heard` with every message of a class, at once."""
+        """Call `callback` with every message of a class immediately."""
         self.overhear(kind, lambda payload, *rest: heard([(_whose(payload), payload, *rest)]))
 
     def hand_out(self, newest: Container[type] = ()) -> None:
-        """Do nothing: nothing waits here."""
+        """Do nothing: this bus has no buffer."""
 
     def answer(self, kind: type, reply: Answer) -> None:
         """Declare one wildcard queryable for a class."""
         self._reply.setdefault(kind, []).append(reply)
 
     def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
-        """Ask everyone for a class; the highest epoch per aircraft is kept."""
+        """Query all handlers of a class; return the reply of highest epoch per aircraft."""
         uav = who if isinstance(who, int) else None
         found: list[tuple[M, Stamp | None]] = []
         for reply in self._reply.get(kind, []):
             try:
                 answers = list(asked_for(uav, reply(uav, {}, b"")))
             except ValueError:
-                continue  # a refusal; on Zenoh it travels as an error reply, which `ask` leaves out
+                continue  # on Zenoh this is an error reply, which `get` omits
             found += [(decode(kind, encode(message), encoding(kind)), stamp) for message, stamp in answers]
         return newest(found)
 
     def inquire(self, kind: type[M], who: int, payload: bytes, timeout_s: float = 5.0) -> tuple[M, Stamp | None] | None:
-        """Ask about one aircraft with a payload; a refusal is raised as it is."""
+        """Query one aircraft with a payload; errors of the handler propagate."""
         answers = [pair for reply in self._reply.get(kind, []) for pair in asked_for(who, reply(who, {}, payload))]
         found = newest([(decode(kind, encode(message), encoding(kind)), stamp) for message, stamp in answers])
         return found[0] if found else None
 
     def gather(self, kind: type[M], who: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
-        """Ask with a payload and return every answer as it comes."""
+        """Query with a payload and yield every reply."""
         uav = who if isinstance(who, int) else None
         for reply in self._reply.get(kind, []):
             with suppress(ValueError):
@@ -96,27 +96,27 @@ class MemoryBus(AbstractContextManager):
                     yield decode(kind, encode(message), encoding(kind))
 
     def fetch(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
-        """Ask and return the bytes of every answer as it comes."""
+        """Query and yield the payload of every reply."""
         return map(encode, self.gather(kind, who, b"", timeout_s))
 
     def present(self, name: str) -> None:
-        """Say that this process lives."""
+        """Declare a liveliness token."""
         self._present.append(name)
         for told in self._attends:
             told(name, True)
 
     def attend(self, told: Token) -> None:
-        """Call `told(name, lives)` for every process that is present or comes."""
+        """Call `callback(name, alive)` for every current and later liveliness token."""
         self._attends.append(told)
         self.recount(told)
 
     def recount(self, told: Token) -> None:
-        """Call `told(name, True)` for every process that is present now."""
+        """Call `callback(name, True)` for every current liveliness token."""
         for name in self._present:
             told(name, True)
 
     def close(self) -> None:
-        """Forget everyone."""
+        """Remove all subscribers and query handlers."""
         self._heard.clear()
         self._overheard.clear()
         self._reply.clear()
@@ -126,13 +126,13 @@ class MemoryBus(AbstractContextManager):
 
 
 class _Whose(msgspec.Struct):
-    """Of a message only whose it is."""
+    """The UAV id of a message, without its other fields."""
 
     uav: int | None = None
 
 
 def _whose(payload: bytes) -> int | None:
-    """Read the UAV that on a wire the key would name; None where there is none."""
+    """Read the UAV id from a payload (on Zenoh it is part of the key); None where there is none."""
     try:
         return msgspec.msgpack.decode(payload, type=_Whose).uav
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):

@@ -1,4 +1,4 @@
-"""The token by which a worker is known to live: `worker/{id}/{low}-{high}/{born}`."""
+"""Liveliness token of a worker: `worker/{id}/{low}-{high}/{started_ms}`."""
 
 import re
 from typing import NamedTuple
@@ -7,12 +7,12 @@ _FORM = re.compile(r"worker/([0-9a-f]{16})/(\d{1,9})-(\d{1,9})/(\d{1,18})", re.A
 
 
 class Present(NamedTuple):
-    """A worker that lives.
+    """Parsed liveliness token of a worker.
 
     Attributes:
         worker: its id on the bus, 16 hex digits
-        ids: what it may hold
-        born: when it came, which tells it from one of before [ms since 1970]
+        ids: UAV ids it may own
+        started_ms: start time, distinguishes it from an earlier incarnation [ms since 1970]
     """
 
     worker: str
@@ -21,12 +21,12 @@ class Present(NamedTuple):
 
     @property
     def token(self) -> str:
-        """Return its token."""
+        """Return the text of the token."""
         return f"worker/{self.worker}/{self.ids.start}-{self.ids.stop - 1}/{self.born}"
 
 
 def read(token: str) -> Present | None:
-    """Read a token; None where it is no worker's."""
+    """Parse a token; None where it is not a worker's."""
     found = _FORM.fullmatch(token)
     if found is None:
         return None

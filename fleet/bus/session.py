@@ -1,10 +1,10 @@
-"""Publish, subscribe, ask and answer on Zenoh. The only file that imports zenoh.
+"""Publish, subscribe and query on Zenoh. The only file that imports zenoh.
 
-Nobody may make the router wait. A message that must not be dropped on a full way (CongestionControl.BLOCK) stops the
-router's reading thread for up to 5 s where its receiver does not read; everything else that comes in on that thread,
-and every declaration, waits meanwhile. So what is received is put aside at once, whatever Python does with it, the
-oldest dropped where too much waits; large answers are sent one by one, to be dropped on a full way and asked for again;
-short answers have a queue that no telemetry fills.
+A client must never block the router. A message that must not be dropped on congestion (CongestionControl.BLOCK) stops
+the router's reading thread for up to 5 s where its receiver does not read; all other traffic of that thread, and every
+declaration, waits. Therefore received messages are buffered immediately, independent of Python, and the oldest are
+dropped when the buffer is full; large replies are sent one by one, dropped on congestion and queried again; small
+replies have a queue of their own, which telemetry cannot fill.
 """
 
 import json
@@ -40,21 +40,21 @@ from fleet.contract import PER_UAV, Claim
 
 M = TypeVar("M")
 _log = logging.getLogger(__name__)
-_WAITED_FOR = (Claim,)  # seldom and needed: the sender waits where the way is full, everything else is dropped there
+_WAITED_FOR = (Claim,)  # rare and essential: the sender blocks on congestion; all other messages are dropped
 _LIVE = f"{ROOT}/@live/"
-_PUT_ASIDE = 20_000  # messages of a class that wait until they are handed out
-_UNHEARD = 4096  # messages of one subscription, or queries of one queryable, that wait for Python; the oldest go first
-_ANSWERS = 4096  # that may wait to be read
-_SHORT = {"priority": zenoh.Priority.DATA_HIGH}  # questions and answers of kilobytes: telemetry does not fill their way
-_LARGE = {  # answers of megabytes: telemetry and predictions overtake them, and nobody waits for who does not read them
+_PUT_ASIDE = 20_000  # messages of a class buffered until `dispatch`
+_UNHEARD = 4096  # messages of a subscription, or queries of a queryable, waiting for Python; the oldest are dropped
+_ANSWERS = 4096  # replies waiting to be read
+_SHORT = {"priority": zenoh.Priority.DATA_HIGH}  # queries and replies of kilobytes: a queue separate from telemetry
+_LARGE = {  # replies of megabytes: telemetry and predictions overtake them, and a slow reader blocks no one else
     "priority": zenoh.Priority.DATA_LOW,
     "congestion_control": zenoh.CongestionControl.DROP,
 }
-_TOKENS = 4096  # asked for at once; with the usual channel more than 256 would block for ever
+_TOKENS = 4096  # tokens in one query; with the default channel more than 256 block for ever
 
 
 class ZenohBus(AbstractContextManager):
-    """The bus between processes. Use it in a `with` statement: an unclosed session can hang at exit."""
+    """Bus between processes. Use it in a `with` statement: an unclosed session can block at exit."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.writer = secrets.randbits(63)
@@ -67,12 +67,12 @@ class ZenohBus(AbstractContextManager):
         self._handing = threading.Lock()
 
     def publish(self, message: Any, stamp: Stamp | None = None) -> None:
-        """Send one message to whoever listens."""
+        """Publish one message."""
         kind = type(message)
         self.put(Wire(kind, message.uav if kind in PER_UAV else -1, encode(message)), stamp)
 
     def put(self, wire: Wire, stamp: Stamp | None = None) -> None:
-        """Send one message that is packed already."""
+        """Publish one encoded message."""
         publisher = self._publishers.get((wire.kind, wire.uav))
         if publisher is None:
             with self._lock:
@@ -84,11 +84,11 @@ class ZenohBus(AbstractContextManager):
 
     @property
     def router(self) -> str:
-        """Name the router by its id, which is another after a restart; empty: none is there."""
+        """Return the id of the connected router, which changes with a restart; empty while none is connected."""
         return " ".join(map(str, self._session.info.routers_zid()))
 
     def subscribe(self, kind: type, heard: Heard, wants: Wants | None = None) -> None:
-        """Call `heard(message, stamp)` for every message of a class, on a thread of the session."""
+        """Call `callback(message, stamp)` for every message of a class, on a thread of the session."""
 
         def on_sample(sample: zenoh.Sample) -> None:
             if wants is not None and ((uav := uav_in(str(sample.key_expr))) is None or not wants(uav)):
@@ -100,7 +100,7 @@ class ZenohBus(AbstractContextManager):
         self._receive(kind, on_sample, _UNHEARD)
 
     def overhear(self, kind: type, heard: Overheard) -> None:
-        """Call `heard(payload, encoding, stamp)` for every message of a class, as it came, on a session's thread."""
+        """Call `callback(payload, encoding, stamp)` for every message of a class, undecoded, on a session's thread."""
 
         def on_sample(sample: zenoh.Sample) -> None:
             heard(sample.payload.to_bytes(), str(sample.encoding), _stamp(sample))
@@ -108,14 +108,14 @@ class ZenohBus(AbstractContextManager):
         self._receive(kind, on_sample, _PUT_ASIDE)
 
     def _receive(self, kind: type, act: Callable[[zenoh.Sample], None], most: int) -> None:
-        """Do something with every message of a class, on a thread of its own; at most so many wait for it."""
+        """Call `handle` for every message of a class on a thread of its own; queue at most `queue_size` messages."""
         subscriber = self._session.declare_subscriber(key(kind, "*"), zenoh.handlers.RingChannel(most))
         self._declared.append(subscriber)
         self._work_off(subscriber.handler, act, key(kind, "*"))
 
     @staticmethod
     def _work_off(waiting: "zenoh.Handler[Any]", act: Callable[[Any], None], name: str) -> None:
-        """Do something with everything that comes, one by one, until the session is closed."""
+        """Call `handle` for every item of a channel in order, until the session is closed."""
 
         def run() -> None:
             while True:
@@ -125,21 +125,21 @@ class ZenohBus(AbstractContextManager):
                     return
                 try:
                     act(one)
-                except Exception:  # a defect met by one message must not stop the others
-                    _log.exception("bus: what came on %s met a defect; report it", name)
+                except Exception:  # a defect in one message must not stop the others
+                    _log.exception("bus: a message on %s caused an internal error; report it", name)
 
         threading.Thread(target=run, name=f"bus {name}", daemon=True).start()
 
     def collect(self, kind: type, heard: Collected) -> None:
-        """Put every message of a class aside until `hand_out`; where nobody takes them out the oldest go first."""
+        """Buffer every message of a class until `dispatch`; a full buffer drops its oldest messages."""
         subscriber = self._session.declare_subscriber(key(kind, "*"), zenoh.handlers.RingChannel(_PUT_ASIDE))
         self._declared.append(subscriber)
         self._collected.append((kind, subscriber.handler, heard))
 
     def hand_out(self, newest: Container[type] = ()) -> None:
-        """Give out what was put aside, class by class, each in the order it came; of some the newest of each key."""
+        """Pass the buffered messages to their callbacks in order of arrival, or only the newest of each key."""
         if not self._handing.acquire(blocking=False):
-            return  # somebody does it already
+            return  # another thread is dispatching
         try:
             for kind, handler, heard in self._collected:
                 waiting: Iterable[zenoh.Sample] = islice(iter(handler.try_recv, None), _PUT_ASIDE)
@@ -151,7 +151,7 @@ class ZenohBus(AbstractContextManager):
             self._handing.release()
 
     def answer(self, kind: type, reply: Answer) -> None:
-        """Declare one wildcard queryable for a class; it replies on a thread of the session."""
+        """Declare one wildcard queryable for a class; the handler runs on a thread of the session."""
 
         def on_query(query: zenoh.Query) -> None:
             with query:
@@ -161,7 +161,7 @@ class ZenohBus(AbstractContextManager):
                     for message, stamp in asked_for(uav, reply(uav, _parameters(query), payload)):
                         name = key(kind, message.uav if kind in PER_UAV else f"{self.writer:016x}")
                         if not query.key_expr.intersects(name):
-                            continue  # a stranger's key, such as parauav/1$*/status
+                            continue  # a key expression outside the contract, such as parauav/1$*/status
                         query.reply(
                             name,
                             encode(message),
@@ -177,11 +177,11 @@ class ZenohBus(AbstractContextManager):
         self._work_off(queryable.handler, on_query, name)
 
     def ask(self, kind: type[M], who: int | str = "*", timeout_s: float = 1.0) -> list[tuple[M, Stamp | None]]:
-        """Ask everyone for a class; the highest epoch per aircraft is kept."""
+        """Query all writers of a class; return the reply of highest epoch per aircraft."""
         return self._answers(kind, self._replies(key(kind, who), timeout_s))
 
     def inquire(self, kind: type[M], who: int, payload: bytes, timeout_s: float = 5.0) -> tuple[M, Stamp | None] | None:
-        """Ask about one aircraft with a payload; a refusal that nobody contradicts is raised."""
+        """Query one aircraft with a payload; raise the error of an error reply where no other reply arrives."""
         replies = self._replies(key(kind, who), timeout_s, payload)
         found = self._answers(kind, replies)
         refused = [reply.err.payload.to_bytes().decode(errors="replace") for reply in replies if reply.err is not None]
@@ -190,13 +190,13 @@ class ZenohBus(AbstractContextManager):
         return found[0] if found else None
 
     def gather(self, kind: type[M], who: int | str, payload: bytes, timeout_s: float) -> Iterator[M]:
-        """Ask with a payload and return every answer as it comes."""
+        """Query with a payload and yield every reply on arrival."""
         for reply in self._coming(key(kind, who), timeout_s, payload, _LARGE):
             if (found := reply.ok) is not None and (pair := self._read(kind, found)) is not None:
                 yield pair[0]
 
     def fetch(self, kind: type, who: int | str, timeout_s: float) -> Iterator[bytes]:
-        """Ask and return the bytes of every answer as it comes; other versions are left out."""
+        """Query and yield the payload of every reply on arrival; skip other versions."""
         for reply in self._coming(key(kind, who), timeout_s, care=_LARGE):
             if (found := reply.ok) is not None and str(found.encoding) == encoding(kind):
                 yield found.payload.to_bytes()
@@ -219,7 +219,7 @@ class ZenohBus(AbstractContextManager):
             )
         except zenoh.ZError as error:
             raise ConnectionError(
-                f"bus: asking on {name} failed ({error}), expected an open session; join the router again"
+                f"bus: the query on {name} failed ({error}), expected an open session; connect to the router again"
             ) from None
 
     def _answers(self, kind: type[M], replies: list[zenoh.Reply]) -> list[tuple[M, Stamp | None]]:
@@ -236,11 +236,11 @@ class ZenohBus(AbstractContextManager):
         return message, _stamp(sample)
 
     def present(self, name: str) -> None:
-        """Declare the liveliness token `parauav/@live/{name}`; it goes with the session."""
+        """Declare the liveliness token `parauav/@live/{name}` for the lifetime of the session."""
         self._declared.append(self._session.liveliness().declare_token(_LIVE + name))
 
     def attend(self, told: Token) -> None:
-        """Call `told(name, lives)` for every process that is present, comes or goes; those there now at once."""
+        """Call `callback(name, alive)` for every liveliness token now, and on every later change."""
 
         def on_token(sample: zenoh.Sample) -> None:
             told(str(sample.key_expr).removeprefix(_LIVE), sample.kind == zenoh.SampleKind.PUT)
@@ -249,7 +249,7 @@ class ZenohBus(AbstractContextManager):
         self.recount(told)
 
     def recount(self, told: Token) -> None:
-        """Call `told(name, True)` for every process that is present now."""
+        """Call `callback(name, True)` for every current liveliness token."""
         for reply in self._session.liveliness().get(_LIVE + "**", zenoh.handlers.FifoChannel(_TOKENS), timeout=1.0):
             if reply.ok is not None:
                 told(str(reply.ok.key_expr).removeprefix(_LIVE), True)
@@ -263,7 +263,7 @@ class ZenohBus(AbstractContextManager):
 
 
 def _care(kind: type) -> dict[str, Any]:
-    """Return how the messages of a class are sent."""
+    """Return the quality of service of a message class."""
     if kind not in _WAITED_FOR:
         return {}
     return {"congestion_control": zenoh.CongestionControl.BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH}
@@ -278,7 +278,7 @@ def _letter(one: zenoh.Sample) -> Letter:
 
 
 def _parameters(query: zenoh.Query) -> dict[str, str]:
-    """Read `?horizon=30;step=0.5`."""
+    """Parse the parameters of a query: `?horizon=30;step=0.5`."""
     pairs = (part.partition("=") for part in str(query.parameters).split(";") if part)
     return {name: value for name, _, value in pairs}
 
@@ -295,40 +295,40 @@ def _entry(router: str | Entry) -> Entry:
 
 
 def connect(router: str | Entry = ROUTER, *, patient: bool = False) -> ZenohBus:
-    """Join the bus through a router; `patient` begins also without one and joins it when it comes.
+    """Connect to the bus through a router; with `retry` also without one, and join when it starts.
 
     Raises:
-        ConnectionError: when nobody answers there, or it refuses us; start `zenohd` or `fleet up`.
-        ValueError: when what we show is missing, expired or open to others.
+        ConnectionError: when no router responds or it rejects the client; start `zenohd` or `fleet up`.
+        ValueError: when a credential is missing, expired or readable by others.
     """
     entry = _entry(router)
     if answers(entry):
         try:
             return ZenohBus(zenoh.open(_config(entry.session())))
         except zenoh.ZError:
-            words = f"the password of {entry.role}" if entry.passwords else "a Zenoh router that asks for no password"
+            words = (
+                f"it to accept the password of {entry.role}" if entry.passwords else "a Zenoh router without password"
+            )
             raise ConnectionError(
-                f"router {entry.at}: found no way in, expected {words} to do; look at it with `fleet doctor`"
+                f"router {entry.at}: found the connection rejected, expected {words}; check it with `fleet doctor`"
             ) from None
     if not patient:
-        raise ConnectionError(
-            f"router {entry.at}: nobody answers; start `zenohd` or `fleet up`, or name another --router"
-        )
+        raise ConnectionError(f"router {entry.at}: no response; start `zenohd` or `fleet up`, or name another --router")
     return ZenohBus(zenoh.open(_config(entry.session(patient=True))))
 
 
 def open_router(router: str | Entry = ROUTER) -> zenoh.Session:
-    """Be the router: a Zenoh session in router mode that listens at `router`; close it when done.
+    """Open a Zenoh session in router mode that listens at `router`; close it when done.
 
     Raises:
-        ConnectionError: when `router` is not an address of this machine, or taken; Zenoh itself would try for ever.
-        ValueError: when its certificate is missing, expired or open to others.
+        ConnectionError: when `router` is not a free address of this machine; Zenoh itself would retry for ever.
+        ValueError: when its certificate is missing, expired or readable by others.
     """
     entry = _entry(router)
     family = socket.AF_INET6 if ":" in endpoint(entry.at)[0] else socket.AF_INET
     try:
         socket.create_server(endpoint(entry.at), family=family).close()
     except OSError as error:
-        reason = f"nobody answers and none can be opened here ({error.strerror or error})"
+        reason = f"no response, and no router can be opened here ({error.strerror or error})"
         raise ConnectionError(f"router {entry.at}: {reason}; start `zenohd` there or name another --router") from None
     return zenoh.open(_config(entry.router()))

@@ -1,1 +1,1 @@
-"""The verbs of the `fleet` command, one a file."""
+"""Verbs of the `fleet` command, one per file."""

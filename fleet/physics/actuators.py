@@ -1,4 +1,4 @@
-"""Servos and engine: first-order lags between what is commanded and what acts.
+"""Servos and engine: first-order lags between command and actuator state.
 
 delta' = (delta_c - delta) / tau
 """
@@ -12,10 +12,10 @@ TAU = np.array([0.05, 0.05, 0.05, 0.25])  # delta_a delta_e delta_r delta_t of a
 
 @kernel
 def lagged(commands: np.ndarray, dt: float, tau: np.ndarray) -> np.ndarray:
-    """Return what acts on average in each interval, (n, 4), from the commands at its start, (n, 4).
+    """Return the mean actuator state in each interval, (n, 4), from the commands at its start, (n, 4).
 
     Args:
-        commands: delta_a delta_e delta_r delta_t, held over each interval [-]
+        commands: delta_a delta_e delta_r delta_t, constant over each interval [-]
         dt: sample time [s]
         tau: time constants, (4,) [s]
     """

@@ -1,13 +1,13 @@
-"""Rigid body over a flat earth: kinematics and gravity exact, aerodynamics from THE wrench, in a steady wind.
+"""Rigid body over a flat earth: exact kinematics and gravity, aerodynamics from `fleet.physics.wrench`, steady wind.
 
     u' = r v - q w - g sin(theta) + X            phi'   = p + (q sin(phi) + r cos(phi)) tan(theta)
     v' = p w - r u + g cos(theta) sin(phi) + Y   theta' = q cos(phi) - r sin(phi)
     w' = q u - p v + g cos(theta) cos(phi) + Z   psi'   = (q sin(phi) + r cos(phi)) / cos(theta)
-    p' = L   q' = M   r' = N                     (u v w over the ground; the wrench sees them less the wind)
+    p' = L   q' = M   r' = N                     (u v w over the ground; the wrench uses them minus the wind)
 
 State x = u v w p q r phi theta psi as in `fleet.window`; delta = delta_a delta_e delta_r delta_t.
 
-Source: Beard & McLain 2012, eq. 3.14-3.17; products of inertia and gyroscopic terms are left to the derivatives.
+Source: Beard & McLain 2012, eq. 3.14-3.17; products of inertia and gyroscopic terms are part of the derivatives.
 """
 
 from math import cos, sin
@@ -19,13 +19,13 @@ from fleet.physics.kernel import bare, kernel
 from fleet.physics.wrench import WIND, slopes, terms, wrench
 
 N_X = 9
-STEEP = 1.5  # pitch beyond is not integrated: cos(theta) is kept from zero [rad]
-LOST = 1e4  # a state beyond has left every envelope
+STEEP = 1.5  # pitch limit of the integration, keeps cos(theta) away from zero [rad]
+LOST = 1e4  # magnitude of a state beyond any flight envelope
 
 
 @bare
 def lost(x: np.ndarray) -> bool:
-    """Return whether a state, (9,), has left every envelope, or is nan."""
+    """Return whether a state, (9,), is beyond any flight envelope, or nan."""
     far = False
     for i in range(N_X):
         far |= not abs(x[i]) < LOST
@@ -34,7 +34,7 @@ def lost(x: np.ndarray) -> bool:
 
 @bare
 def rates_of_change(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, out: np.ndarray) -> None:
-    """Fill in x', (9,)."""
+    """Compute x', (9,), into `out`."""
     u, v, w, p, q, r = x[0], x[1], x[2], x[3], x[4], x[5]
     phi, theta, psi = x[6], min(max(x[7], -STEEP), STEEP), x[8]
     cf, sf, ct, st, cp, sp = cos(phi), sin(phi), cos(theta), sin(theta), cos(psi), sin(psi)
@@ -53,13 +53,13 @@ def rates_of_change(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.nd
 
 @bare
 def step(x: np.ndarray, delta: np.ndarray, par: np.ndarray, at: np.ndarray, dt: float, work: np.ndarray) -> None:
-    """Advance x by dt with delta held: Runge-Kutta of order four.
+    """Advance x by dt with constant delta: Runge-Kutta of order four.
 
     Args:
         x: state, changed in place, (9,)
-        delta: inputs as they act, (4,)
+        delta: actuator state, (4,)
         par: parameters, (37,)
-        at: U0, W0, (2,) [m/s]
+        trim: U0, W0, (2,) [m/s]
         dt: step [s]
         work: scratch, (3, 9)
     """
@@ -89,16 +89,16 @@ def free_runs(
     dt: float,
     out: np.ndarray,
 ) -> None:
-    """Fly from each start with recorded inputs; rows no run reaches, or after it left every envelope, become nan.
+    """Simulate from each start with recorded inputs; rows outside every run, or after divergence, become nan.
 
     Args:
         starts: state of each run at its first row, (m, 9)
         begins: first row of each, (m,)
-        length: most rows of a run; it ends with `out`
-        delta: inputs as they act in each interval, (n, 4)
-        par, at: as in `step`
+        length: maximum rows of a run; it ends with `out`
+        delta: actuator state in each interval, (n, 4)
+        par, trim: as in `step`
         dt: sample time [s]
-        out: states, filled in, (n, 9)
+        out: states, output, (n, 9)
     """
     x, work = np.empty(N_X), np.empty((3, N_X))
     out[:] = np.nan
@@ -122,7 +122,7 @@ def jacobian(
     by_wind: np.ndarray,
     term: np.ndarray,
 ) -> None:
-    """Fill in F = d x' / d x (9, 9), d x' / d (w_n, w_e) (9, 2), and the terms of the derivatives (35,)."""
+    """Compute F = d x' / d x (9, 9), d x' / d (w_n, w_e) (9, 2), and the terms of the derivatives (35,)."""
     u, v, w, p, q, r, phi, psi = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[8]
     theta = min(max(x[7], -STEEP), STEEP)
     cf, sf, ct, st, cp, sp = cos(phi), sin(phi), cos(theta), sin(theta), cos(psi), sin(psi)
@@ -139,7 +139,7 @@ def jacobian(
     terms(u - wu, v - wv, w - ww, x[3:6], delta, at, term)
     by_air, by_rate = np.empty((6, 3)), np.empty((6, 3))
     slopes(par, np.array((u - wu, v - wv, w - ww)), x[3:6], delta, at, by_air, by_rate)
-    turn = np.array(  # d(u_a v_a w_a) / d(phi theta psi): minus the turned wind
+    turn = np.array(  # d(u_a v_a w_a) / d(phi theta psi): minus the rotated wind
         (
             (0.0, st * along, -ct * across),
             (-ww, -sf * ct * along, -(sf * st * across - cf * along)),

@@ -1,12 +1,14 @@
-"""How the twin's physics is compiled: cached, reordered freely, and honest about nan: what is lost must be seen.
+"""Compile the twin's physics: cached, with free reordering of operations, but with correct nan, to detect divergence.
 
-What makes no array is `bare`: nobody counts then who holds which, inside a loop half of the time.
+Functions that create no array use `no_alloc_kernel`: reference counting would take half of the time of a loop.
 """
 
 import numba as nb
 
-_FREE = {"contract", "reassoc", "arcp", "afn", "nsz"}  # all of fastmath but the promise that nothing is nan or inf
+_FREE = {"contract", "reassoc", "arcp", "afn", "nsz"}  # all of fastmath except nnan and ninf
 
-kernel = nb.njit(cache=True, fastmath=_FREE, error_model="numpy", nogil=True)  # one thread learns, another predicts
+kernel = nb.njit(
+    cache=True, fastmath=_FREE, error_model="numpy", nogil=True
+)  # identification and prediction run in parallel threads
 bare = nb.njit(cache=True, fastmath=_FREE, error_model="numpy", nogil=True, _nrt=False)  # type: ignore[call-overload]
 inlined = nb.njit(cache=True, fastmath=_FREE, error_model="numpy", inline="always")

@@ -1,4 +1,4 @@
-"""An aircraft in the large: lags behind the autopilot's commands, and a mass point with energy, for minutes ahead.
+"""Point-mass model with attitude lags and an energy balance, for predictions of minutes.
 
     phi'' = wn^2 (phi_c + b - phi) - 2 zeta wn phi'                             theta'' likewise
     gamma' = (theta - alpha - gamma) / 0.6 s,      alpha = a_0 + a_n (n (V_0 / V)^2 - 1),      n = 1 / cos phi
@@ -6,7 +6,7 @@
     psi' = k g tan phi / V + b_psi
     p' = V e(gamma, psi + d_psi) + w (h / h_0)^(1/7) + drift + rest,      both first-order Gauss-Markov
 
-Guidance and TECS are the autopilot's own; only what lies below them is replaced by what was identified.
+Guidance and TECS are the autopilot's own laws; the loops below them are replaced by identified lags.
 Source: Beard & McLain 2012, chapter 9 (guidance models); Stengel 2004, section 2.6 (energy height).
 """
 
@@ -18,34 +18,34 @@ from fleet.autopilots.laws import guide
 from fleet.frames import G, wrap
 from fleet.physics.kernel import inlined, kernel
 
-STEP = 0.1  # of guidance and of a flight [s]
-COARSE = 0.25  # the same where many fly at once [s]
-GAMMA_S = 0.6  # the path follows the nose in [s]
-_INNER = 4  # steps of the lags within
-_THROTTLE_S = 0.3  # the motor takes from idle to full [s]
+STEP = 0.1  # of guidance and integration [s]
+COARSE = 0.25  # the same for ensembles [s]
+GAMMA_S = 0.6  # time constant of the flight-path angle [s]
+_INNER = 4  # substeps of the lags per step
+_THROTTLE_S = 0.3  # of the motor from idle to full [s]
 _SHEAR = 1 / 7  # wind over height, open ground [-]
-_LOWEST = 5.0  # height the wind's power law begins at [m]
-_STEEPEST = 1.3  # bank beyond which nothing is level flight [rad]
+_LOWEST = 5.0  # minimum height of the wind's power law [m]
+_STEEPEST = 1.3  # maximum bank; the model diverges beyond [rad]
 
-# columns of `body`: what was identified
+# columns of `parameters`: identified
 WN_PHI, ZETA_PHI, B_PHI = 0, 1, 2  # [rad/s, -, rad]
 WN_THETA, ZETA_THETA, B_THETA = 3, 4, 5
 K_PSI, B_PSI = 6, 7  # [-, rad/s]
 A_0, A_N = 8, 9  # [rad]
 C_0, C_T, C_V, C_N = 10, 11, 12, 13  # [m/s2, m/s2, 1/s, m/s2]
-T_0, V_0 = 14, 15  # means they are about: throttle, true airspeed [-, m/s]
+T_0, V_0 = 14, 15  # reference throttle and true airspeed [-, m/s]
 N_BODY = 16
 
 # columns of `air`
 W_N, W_E = 0, 1  # mean wind at height H_0 [m/s]
-DRIFT_N, DRIFT_E, REST_N, REST_E = 2, 3, 4, 5  # its slow drift, and what is left: gusts [m/s]
+DRIFT_N, DRIFT_E, REST_N, REST_E = 2, 3, 4, 5  # slow drift of the wind, and the rest: gusts [m/s]
 SCALE, D_PSI = 6, 7  # true over reported airspeed, direction through the air minus heading [-, rad]
-H_0, GROUND = 8, 9  # height above ground the mean belongs to, 0: the same everywhere; p_d of the ground [m]
-DRIFT, DRIFT_S, REST, REST_S = 10, 11, 12, 13  # standard deviation and time of drift and rest [m/s, s]
+H_0, GROUND = 8, 9  # height above ground of the mean wind, 0: no shear; p_d of the ground [m]
+DRIFT, DRIFT_S, REST, REST_S = 10, 11, 12, 13  # standard deviation and time constant of drift and rest [m/s, s]
 N_AIR = 14
 
 # columns of `start`
-V, PSI, PHI, P_RATE, THETA, Q_RATE, GAMMA, THR = range(3, 11)  # behind p_n p_e p_d
+V, PSI, PHI, P_RATE, THETA, Q_RATE, GAMMA, THR = range(3, 11)  # after p_n p_e p_d
 N_START = 11
 
 
@@ -61,18 +61,18 @@ def fly(
     dt: float,
     out: np.ndarray,
 ) -> int:
-    """Fly the route ahead.
+    """Simulate the flight along the route.
 
     Args:
-        ctl, par, legs: controller state (changed), parameters, route
-        body: identified numbers, (N_BODY,)
+        ctl, par, legs: controller state (changed in place), controller parameters, route
+        parameters: identified model parameters, (N_PARAMETERS,)
         air: wind and sensor biases, (N_AIR,)
         start: (N_START,): p NED [m], V [m/s], psi, phi [rad], p [rad/s], theta [rad], q [rad/s], gamma [rad], throttle
-        chance: standard normal draws each second: drift north, east, rest north, east, (seconds, 4); empty: none
-        dt: step, a whole part of a second [s]
-        out: positions, filled in, NED, (k, 3) [m]; out[0] is the start
+        draws: standard normal draws of each second: drift north, east, rest north, east, (seconds, 4); empty: none
+        dt: step, an integer fraction of a second [s]
+        out: positions, output, NED, (k, 3) [m]; out[0] is the start
     Returns:
-        rows of `out` that are good; fewer than len(out) where it left its envelope
+        number of valid rows of `out`; fewer than len(out) after divergence
     """
     p, v, euler, wind = start[:3].copy(), np.zeros(3), np.zeros(3), air[DRIFT_N : REST_E + 1].copy()
     speed, psi, phi, p_rate = start[V], start[PSI], start[PHI], start[P_RATE]
@@ -98,7 +98,9 @@ def fly(
                 z = chance[k // each]
                 wind[0], wind[1] = wind[0] + kick_d * z[0], wind[1] + kick_d * z[1]
                 wind[2], wind[3] = wind[2] + kick_r * z[2], wind[3] + kick_r * z[3]
-        speed -= level * ((wind[0] + wind[2]) * c + (wind[1] + wind[3]) * s - was)  # the ground does not feel a gust
+        speed -= level * (
+            (wind[0] + wind[2]) * c + (wind[1] + wind[3]) * s - was
+        )  # a gust does not change the ground velocity
         v[0] = speed * level * c + air[W_N] * higher + wind[0] + wind[2]
         v[1] = speed * level * s + air[W_E] * higher + wind[1] + wind[3]
         v[2] = -speed * sin(gamma)
@@ -140,13 +142,13 @@ def bundle(
     at: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Fly many members in steps of `COARSE`; arguments as for `fly`, one row a member.
+    """Simulate the members of an ensemble in steps of `COARSE_STEP`; arguments of `simulate_route`, one row per member.
 
     Args:
         control: controller state (unchanged), parameters, route
-        body, air, start, chance: (m, N_BODY), (m, N_AIR), (m, N_START), (m, seconds, 4)
-        at: look-ahead of each kept position, in steps of `COARSE`, rising, (k,)
-        out: positions, filled in, nan from where a member left its envelope, (m, k, 3) [m]
+        parameters, air, start, draws: (m, N_PARAMETERS), (m, N_AIR), (m, N_START), (m, seconds, 4)
+        steps: look-ahead of each stored position, in steps of `COARSE_STEP`, increasing, (k,)
+        out: positions, output, nan after a member diverged, (m, k, 3) [m]
     """
     flown = np.empty((at[-1] + 1, 3))
     out[:] = nan

@@ -1,4 +1,4 @@
-"""The only loop of the twin: route -> autopilot -> surfaces -> the aircraft's model -> position."""
+"""Closed-loop simulation of the twin: route -> autopilot -> surfaces -> aircraft model -> position."""
 
 from math import cos, exp, sin, sqrt
 
@@ -11,7 +11,7 @@ from fleet.physics.actuators import TAU
 from fleet.physics.dynamics import N_X, step
 from fleet.physics.wrench import WIND
 
-GUST_S = 4.0  # time in which a gust fades [s]
+GUST_S = 4.0  # decay time of a gust [s]
 GUIDE_EVERY = 2  # model steps between guidance steps; 0.08 s on the 0.04 s grid
 N_STATE = 12  # p_n p_e p_d, u v w, p q r, phi theta psi
 
@@ -28,7 +28,7 @@ def _body_to_ned(u: float, v: float, w: float, phi: float, theta: float, psi: fl
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)
 def _linear_axis(D: np.ndarray, at: np.ndarray, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Advance x' = at + A (x - at) + B (u - at) + c, D = [A B c], at = [x_mean u_mean]."""
+    """Return the next state x' = x_mean + A (x - x_mean) + B (u - u_mean) + c; D = [A B c], mean = [x_mean u_mean]."""
     n, m = len(x), len(u)
     out = np.empty(n)
     for i in range(n):
@@ -65,30 +65,30 @@ def simulate(
     dt: float,
     out: np.ndarray,
 ) -> int:
-    """Fly the twin ahead: the autopilot closes the loop around the aircraft's model, on the route, in the mean wind.
+    """Simulate the flight along the route: the autopilot closes the loop around the aircraft model, in the mean wind.
 
     x(k+1) = f(x(k), u(k)), u(k) from the controller.  Source: Huang 2021, eq. 23-26 and figure 3.
 
     Args:
         ctl: controller state, changed in place, (N_CTL,)
-        par: controller parameters; its last slot tells the law, see `fleet.autopilots.laws`
+        par: controller parameters; the last element selects the law, see `fleet.autopilots.laws`
         legs: route, (n, 9), see `fleet.mission`
-        plant: as `linear_plant` or `coupled_plant` make it
+        plant: from `linear_plant` or `coupled_plant`
         state: start, (12,): p NED [m], u v w air-relative FRD [m/s], p q r [rad/s], phi theta psi [rad]
-        command: phi_c, theta_c [rad], delta_a, delta_e, delta_r, delta_t in force at the start, (6,)
-        air: w_n, w_e wind [m/s], true over reported airspeed [-], gust: airspeed beyond what the mean wind explains,
-            fading with `GUST_S` [m/s], (4,)
+        command: phi_c, theta_c [rad], delta_a, delta_e, delta_r, delta_t at the start, (6,)
+        air: w_n, w_e wind [m/s], true over reported airspeed [-], gust: airspeed not explained by the mean wind,
+            decaying with `GUST_S` [m/s], (4,)
         dt: step [s]
-        out: states along the flight, filled in, (n, 12); out[0] is the start
+        out: states along the flight, output, (n, 12); out[0] is the start
     Returns:
-        rows of `out` that are good; fewer than len(out) where the twin left its envelope (diverged)
+        number of valid rows of `out`; fewer than len(out) after divergence
     """
     lon, lon_at, lat, lat_at, aero, at, tau = plant
     coupled = len(aero) > 0
     p, x = state[:3].copy(), state[3:].copy()
     phi_c, theta_c = command[0], command[1]
     delta, acting, share = command[2:].copy(), command[2:].copy(), 1.0 - np.exp(-dt / tau)
-    change, middle = np.empty(4), np.empty(4)  # a flight makes no array on its way
+    change, middle = np.empty(4), np.empty(4)  # the loop allocates no array
     work, v, euler = np.empty((3, N_X)), np.empty(3), np.empty(3)
     Va_last, Va_dot = (sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2) + air[3]) / air[2], 0.0
     fade, left = exp(-dt / GUST_S), 1.0
@@ -128,18 +128,18 @@ def simulate(
 
 
 def linear_plant(lon: np.ndarray, lon_at: np.ndarray, lat: np.ndarray, lat_at: np.ndarray) -> tuple:
-    """Make a plant of two linear axes.
+    """Create a plant of two linear axes.
 
     Args:
         lon: [A B c] of u w q theta | delta_e delta_t bank, unscaled deviations, (4, 8)
-        lon_at: means the deviations are from, states then inputs, (7,)
-        lat, lat_at: the same of phi psi p r v | delta_a delta_r, (5, 8) and (7,)
+        lon_mean: reference of the deviations, states then inputs, (7,)
+        lat, lat_mean: the same of phi psi p r v | delta_a delta_r, (5, 8) and (7,)
     """
     return lon, lon_at, lat, lat_at, np.empty(0), lon_at[:2].copy(), TAU
 
 
 def coupled_plant(par: np.ndarray, at: np.ndarray) -> tuple:
-    """Make a plant of derivatives in `fleet.physics.wrench`, (37,), at U0 W0, (2,) [m/s]; air-relative, so windless."""
+    """Create a plant of derivatives, (37,), see `fleet.physics.wrench`, at U0 W0, (2,) [m/s]; air-relative, no wind."""
     windless = par.copy()
     windless[WIND:] = 0.0
     nothing = np.empty((0, 0))

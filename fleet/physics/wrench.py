@@ -1,4 +1,4 @@
-"""THE wrench: specific force and angular acceleration of a fixed wing, affine in its derivatives.
+"""Wrench of a fixed wing: specific force and angular acceleration, affine in the derivatives.
 
     s = u_a / U0 within 0.4..2,   du = u_a - U0,   dw = w_a - W0 s         (air-relative velocity u_a v_a w_a)
 
@@ -6,8 +6,8 @@
     Z = Z_0 s2 + Z_u du + Z_w dw s + Z_q q s + Z_de delta_e s2          M as Z, + M_dt delta_t
     Y = Y_v v_a s + Y_p p s + Y_r r s + Y_da delta_a s2 + Y_dr delta_r s2 + Y_0         L, N as Y
 
-Derivatives are dimensional, at airspeed U0: unit mass and geometry, for an aircraft without a card. The mean wind over
-the ground belongs to the same vector, for it is identified with them.
+Derivatives are dimensional, at airspeed U0: unit mass and geometry, so no airframe card is needed. The same vector
+contains the mean wind over the ground, because it is identified together with them.
 
 Source: Beard & McLain 2012, section 5.5 (dimensional derivatives); Klein & Morelli 2006, chapter 3.
 """
@@ -29,10 +29,10 @@ NAMES = (
 
 N_PAR = len(NAMES)
 N_AERO = N_PAR - 2  # without the wind
-X, Z, M, Y, L, N, WIND = 0, 6, 11, 17, 23, 29, 35  # where each row begins
+X, Z, M, Y, L, N, WIND = 0, 6, 11, 17, 23, 29, 35  # index of the first term of each row
 OFFSETS = tuple(NAMES.index(name) for name in ("X_0", "Z_0", "M_0", "Y_0", "L_0", "N_0"))
 ROW = np.array([0] * 6 + [2] * 5 + [4] * 6 + [1] * 6 + [3] * 6 + [5] * 6)  # state whose rate each derivative drives
-SLOW, FAST = 0.4, 2.0  # limits of u_a / U0: beyond, the derivatives grow no further [-]
+SLOW, FAST = 0.4, 2.0  # limits of u_a / U0; the derivatives are constant beyond [-]
 
 
 @inlined
@@ -43,8 +43,8 @@ def wrench(par, u_a, v_a, w_a, p, q, r, delta, at):  # type: ignore[no-untyped-d
         par: derivatives in the order of `NAMES`, (37,)
         u_a, v_a, w_a: air-relative velocity, FRD [m/s]
         p, q, r: body rates, FRD [rad/s]
-        delta: delta_a delta_e delta_r delta_t as they act, behind their lags, (4,)
-        at: U0, W0 the derivatives belong to, (2,) [m/s]
+        delta: actuator state delta_a delta_e delta_r delta_t, (4,)
+        trim: U0, W0 of the derivatives, (2,) [m/s]
     """
     s = min(max(u_a / at[0], SLOW), FAST)
     s2 = s * s
@@ -63,7 +63,7 @@ def wrench(par, u_a, v_a, w_a, p, q, r, delta, at):  # type: ignore[no-untyped-d
 
 @bare
 def terms(u_a: float, v_a: float, w_a: float, rates: np.ndarray, delta: np.ndarray, at: np.ndarray, out: np.ndarray):  # type: ignore[no-untyped-def]
-    """Fill in what each derivative is multiplied by, (35,) in the order of `NAMES`; arguments as for `wrench`."""
+    """Compute the factor of each derivative, (35,), in the order of `NAMES`; arguments as for `wrench`."""
     s = min(max(u_a / at[0], SLOW), FAST)
     s2 = s * s
     du, dw = u_a - at[0], w_a - at[1] * s
@@ -86,7 +86,7 @@ def slopes(
     by_air: np.ndarray,
     by_rate: np.ndarray,
 ) -> None:
-    """Fill in how the wrench changes with air-relative velocity and with body rates, each (6, 3)."""
+    """Compute the derivative of the wrench by air-relative velocity and by body rates, each (6, 3)."""
     s = min(max(air[0] / at[0], SLOW), FAST)
     ds = 1.0 / at[0] if SLOW < air[0] / at[0] < FAST else 0.0
     dw = air[2] - at[1] * s

@@ -1,1 +1,1 @@
-"""What every process needs: Ctrl-C, children, logs, private files, memory given back, untrusted text."""
+"""Functions of every process: Ctrl-C, child processes, logs, private files, return of freed memory, untrusted text."""

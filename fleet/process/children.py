@@ -1,4 +1,4 @@
-"""Child processes that end with their parent: start by module name, keep their last words, stop cleanly."""
+"""Child processes that end with their parent: start by module name, store their last lines of output, stop in order."""
 
 import os
 import signal
@@ -13,8 +13,8 @@ from fleet.process.interrupt import PARENT, deferred
 from fleet.process.logs import untimed
 from fleet.process.sanitise import plain
 
-_PATIENCE_S = 8.0  # between the request to stop and the end of patience [s]
-_ALONE_S = 10.0  # the same for a child that is all its parent waits for [s]
+_PATIENCE_S = 8.0  # between SIGTERM and SIGKILL [s]
+_ALONE_S = 10.0  # longest wait for a single child after SIGTERM [s]
 
 
 def run_until(stop: threading.Event, module: str, *options: str) -> int:
@@ -34,7 +34,7 @@ def run_to_end(module: str, *options: str) -> tuple[int, str]:
     """Run `python -m module options…` to its end and return its exit code and standard error; Ctrl-C ends it too."""
     child = None
     try:
-        with deferred():  # otherwise it could be started without being known here
+        with deferred():  # otherwise Ctrl-C could leave it running
             command = [sys.executable, "-m", module, *options]
             child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         _, errors = child.communicate()
@@ -55,7 +55,7 @@ class Children(AbstractContextManager):
         self._ears: dict[str, threading.Thread] = {}
 
     def start(self, name: str, module: str, *options: str) -> None:
-        """Start `python -m module options…`; what it prints becomes its last words."""
+        """Start `python -m module options…` and store its last lines of output."""
         child = subprocess.Popen(
             [sys.executable, "-m", module, *options],
             stdin=subprocess.DEVNULL,
@@ -63,7 +63,7 @@ class Children(AbstractContextManager):
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            start_new_session=True,  # Ctrl-C reaches the parent alone, which then ends the children in order
+            start_new_session=True,  # Ctrl-C reaches the parent only, which then stops the children in order
             env=os.environ | {"PYTHONUNBUFFERED": "1", PARENT: str(os.getpid())},
         )
         self._running[name] = child
@@ -76,34 +76,34 @@ class Children(AbstractContextManager):
         with child.stdout:
             for line in child.stdout:
                 if line.strip():
-                    self._words[name].append(untimed(plain(line.rstrip())))  # who says them again says when
+                    self._words[name].append(untimed(plain(line.rstrip())))  # the parent adds its own time
 
     def words(self) -> list[str]:
         """Return each child's last line."""
         return [words[-1] for words in self._words.values() if words]
 
     def done(self) -> list[str]:
-        """Name the children that ended well."""
+        """Return the names of the children that ended with exit code 0."""
         return [name for name, child in self._running.items() if child.poll() == 0]
 
     def dead(self) -> list[str]:
-        """Name the children that failed."""
+        """Return the names of the children that failed."""
         return [name for name, child in self._running.items() if child.poll()]
 
     def failed(self) -> list[tuple[int, str]]:
-        """Return exit code and sentence of the children that failed; a refusal (2) is the child's own sentence."""
+        """Return exit code and message of the failed children; exit code 2 uses the child's own message."""
         found = []
         for name, child in self._running.items():
             if code := child.poll():
-                self._ears[name].join(timeout=1.0)  # its last words may still be on the way
+                self._ears[name].join(timeout=1.0)  # its last lines may still be in the pipe
                 words = self._words[name]
                 refused = code == 2 and words
                 died = f"{name}: found it ended with exit code {code}, expected it to run until stopped; "
-                found.append((code, words[-1] if refused else died + f"its last words: {' | '.join(words) or 'none'}"))
+                found.append((code, words[-1] if refused else died + f"last output: {' | '.join(words) or 'none'}"))
         return found
 
     def stop(self) -> None:
-        """Ask all to stop, newest first, then insist."""
+        """Send SIGTERM to all, newest first, then SIGKILL to those still running."""
         for child in reversed(self._running.values()):
             if child.poll() is None:
                 child.send_signal(signal.SIGTERM)

@@ -1,9 +1,9 @@
-"""Ctrl-C: a command ends with exit code 130 and one line, whatever it is doing, from its first import to its exit.
+"""Ctrl-C: a command ends with exit code 130 and one line at any time from its first import to its exit.
 
 While the work of a command runs, Ctrl-C raises KeyboardInterrupt in the main thread, once, so that files, terminals
 and child processes are cleaned up. Before and after there is nothing to clean up, and the process ends at once.
-Once its work is done a process does not tear down the interpreter: threads of foreign libraries that ask for it in that
-moment are ended inside Rust or C++ code, which aborts the process ("FATAL: exception not rethrown", exit code 134).
+After its work a process does not tear down the interpreter: threads of foreign libraries that need the interpreter
+during teardown end inside Rust or C++ code, which aborts the process ("FATAL: exception not rethrown", exit code 134).
 The package `fleet` imports this module before anything else. The handler is installed only where the program is one of
 `COMMANDS`; a program that uses ParaUAV as a library keeps its own.
 """
@@ -21,11 +21,11 @@ from typing import Any
 INTERRUPTED = 130  # exit code: 128 + SIGINT
 COMMANDS = ("fleet", "gateway", "twin_worker", "viewer")  # console scripts, and packages whose modules are run with -m
 PARENT = "PARAUAV_PARENT"  # process id of the parent that started this process as its child
-_AGAIN_S = 0.02  # before a KeyboardInterrupt that was dropped is raised anew [s]
+_AGAIN_S = 0.02  # before a dropped KeyboardInterrupt is raised again [s]
 
 
 class _State:
-    """Which phase the process is in, and whether SIGINT has arrived."""
+    """Phase of the process, and whether SIGINT arrived."""
 
     working = False  # the work of a command runs: KeyboardInterrupt is raised
     deferring = False
@@ -40,7 +40,7 @@ _now = _State()
 def interruptible(work: Callable[[], int]) -> int:
     """Run the work of a command and return its exit code, or 130 after Ctrl-C.
 
-    Exceptions that a library made of the KeyboardInterrupt count as that; others propagate.
+    An exception into which a library converted the KeyboardInterrupt counts as Ctrl-C; others propagate.
     """
     _now.arrived = _now.raised = False
     try:
@@ -59,14 +59,14 @@ def interruptible(work: Callable[[], int]) -> int:
 
 
 def exits_with(code: int) -> int:
-    """Note the exit code that the process is about to end with, and return it."""
+    """Store the exit code with which the process will end, and return it."""
     _now.code = code
     return code
 
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Let Ctrl-C wait until the block is over, for steps that must not be left half done; they must be short."""
+    """Defer Ctrl-C until the end of the block, for short steps that must be completed."""
     _now.deferring = True
     try:
         yield
@@ -78,7 +78,7 @@ def deferred() -> Iterator[None]:
 
 
 def install() -> None:
-    """Install the handler, unless whoever started the process lets it ignore Ctrl-C (as nohup does)."""
+    """Install the handler, unless the process was started with SIGINT ignored (as by nohup)."""
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return
     signal.signal(signal.SIGINT, _on_sigint)
@@ -90,14 +90,14 @@ def _on_sigint(*_: object) -> None:
     _now.arrived = True
     if _now.working and _now.deferring:
         return
-    if not _now.working or _now.raised:  # nothing to clean up, or Ctrl-C came again during the cleaning up
+    if not _now.working or _now.raised:  # nothing to clean up, or a second Ctrl-C during cleanup
         _end()
     _now.raised = True
     raise KeyboardInterrupt
 
 
 def _on_unraisable(what: Any) -> None:
-    """Raise KeyboardInterrupt anew where the interpreter had to drop it: in callbacks from C and in `__del__`."""
+    """Raise KeyboardInterrupt again where the interpreter dropped it: in callbacks from C and in `__del__`."""
     if not issubclass(what.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(what)
     elif _now.working:
@@ -112,14 +112,14 @@ def _insist() -> None:
 
 
 def _end() -> None:
-    if not os.environ.get(PARENT):  # which says so itself
-        cursor = "\x1b[?25h" if os.isatty(2) else ""  # a progress bar hides it
+    if not os.environ.get(PARENT):  # otherwise the parent reports it
+        cursor = "\x1b[?25h" if os.isatty(2) else ""  # a progress bar hides the cursor
         os.write(2, f"{cursor}{_PROGRAM}: interrupted\n".encode())
     os._exit(INTERRUPTED)
 
 
 def _exit() -> None:
-    """End the process with its exit code, without tearing down the interpreter; from here on Ctrl-C is ignored."""
+    """End the process with its exit code without tearing down the interpreter; ignore Ctrl-C from here on."""
     if signal.getsignal(signal.SIGINT) is _on_sigint:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     if _now.code is None:
@@ -127,15 +127,15 @@ def _exit() -> None:
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
-        except (OSError, ValueError):  # closed, or a pipe that nobody reads; the interpreter reports that
+        except (OSError, ValueError):  # closed, or a pipe without reader; the interpreter reports it
             return
     os._exit(_now.code)
 
 
 def _program() -> str:
-    """Name the command this process runs; empty for any other program."""
+    """Return the name of the command this process runs; empty for any other program."""
     name = sys.argv[0] if sys.argv else ""
-    if name == "-m":  # so it reads until the module is found
+    if name == "-m":  # its value until the module is located
         module = sys.orig_argv[-len(sys.argv)]
         return module.removesuffix(".cli") if module.partition(".")[0] in COMMANDS else ""
     name = os.path.basename(name)

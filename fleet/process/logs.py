@@ -1,7 +1,7 @@
-"""What a process says of itself: sentences for people, or with `--log-json` a line of JSON each for machines.
+"""Log output: text lines for people, or with `--log-json` one line of JSON per message for machines.
 
-Every line of a log begins with its time (RFC 3339, UTC). What a command was asked for (a table, JSON, the reason why a
-command that logs nothing refuses its arguments) is an answer and no log line.
+Every log line begins with its time (RFC 3339, UTC). The result of a command (a table, JSON, the reason for which a
+command without log rejects its arguments) is not a log line.
 """
 
 import argparse
@@ -14,36 +14,36 @@ from datetime import UTC, datetime
 
 from fleet.process.sanitise import plain
 
-SAID = "parauav"  # the logger of what a command says as a matter of course
+SAID = "parauav"  # logger of the regular status messages of a command
 _TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z ")
 
 
 def log_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare `--log-json`."""
-    parser.add_argument("--log-json", action="store_true", help="say everything as lines of JSON, on standard error")
+    parser.add_argument("--log-json", action="store_true", help="write all messages as lines of JSON to standard error")
 
 
 def begin(process: str, *, as_json: bool = False) -> None:
-    """Say from now on what is logged, warnings and worse to people, everything to machines."""
+    """Configure logging: warnings and above as text, or everything as JSON."""
     handler = logging.StreamHandler()
     handler.setFormatter(Lines(process) if as_json else Words(process))
     logging.basicConfig(level=logging.INFO if as_json else logging.WARNING, handlers=[handler])
 
 
 def timed(line: str, t: float | None = None) -> str:
-    """Put a time before a line of a log; `t` is the time of day, None: now [s since 1970]."""
+    """Prefix a log line with its time; `t`: None means now [s since 1970]."""
     at = datetime.fromtimestamp(time.time() if t is None else t, UTC)
     return f"{at.isoformat(timespec='milliseconds').removesuffix('+00:00')}Z {line}"
 
 
 def untimed(line: str) -> str:
-    """Take the time off a line of a log, where there is one."""
+    """Remove the time prefix of a log line, if any."""
     found = _TIME.match(line)
     return line if found is None else line[found.end() :]
 
 
 def say(process: str, sentence: str) -> None:
-    """Say what a command says as a matter of course."""
+    """Report a regular status message of a command on standard output, or as JSON."""
     if logging.getLogger().isEnabledFor(logging.INFO):
         logging.getLogger(SAID).info("%s", sentence)
     else:
@@ -51,17 +51,17 @@ def say(process: str, sentence: str) -> None:
 
 
 def tell(process: str, sentence: str) -> None:
-    """Say on standard error how the work of a command goes on: standard output is for its answer."""
+    """Report the progress of a command on standard error; standard output is for its result."""
     print(timed(f"{process}: {plain(sentence)}"), file=sys.stderr, flush=True)
 
 
 def fail(process: str, sentence: str, *, logged: bool = True) -> None:
-    """Say why a command ends.
+    """Report the reason for which a command fails.
 
     Args:
-        process: its name
+        process: name of the command
         sentence: the reason
-        logged: it is one that logs; else the reason is its answer
+        logged: True: write a log line with time; False: write the reason alone
     """
     if logging.getLogger().isEnabledFor(logging.INFO):
         logging.getLogger(SAID).error("%s", sentence)
@@ -71,27 +71,27 @@ def fail(process: str, sentence: str, *, logged: bool = True) -> None:
 
 
 class Words(logging.Formatter):
-    """Write sentences with their time: what strangers wrote in them must not steer a terminal."""
+    """Format messages as text with time; escape control characters, because messages can contain untrusted text."""
 
     def __init__(self, process: str) -> None:
         super().__init__()
         self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return one sentence, and how a defect was met."""
+        """Return the message, followed by the traceback of an exception."""
         words = timed(f"{self._process}: {plain(record.getMessage())}", record.created)
         return f"{words}\n{self.formatException(record.exc_info)}" if record.exc_info else words
 
 
 class Lines(logging.Formatter):
-    """Write JSON: t (RFC 3339), level, process, from (module), message, and defect where one was met."""
+    """Format messages as JSON: t (RFC 3339), level, process, from (module), message, and defect (traceback)."""
 
     def __init__(self, process: str) -> None:
         super().__init__()
         self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return one line."""
+        """Return one line of JSON."""
         line = {
             "t": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),

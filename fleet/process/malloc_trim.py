@@ -1,23 +1,23 @@
-"""The heap of a process that lives for days: what is free goes back to the system."""
+"""Return freed memory to the operating system, for processes that run for days."""
 
 import ctypes
 import platform
 import threading
 
 _M_MMAP_THRESHOLD, _M_MMAP_MAX = -3, -4  # of mallopt(3)
-_MOST = 32_768  # blocks of their own; Linux gives a process 65,530 mappings, and threads and files need some, too
+_MOST = 32_768  # mapped blocks; Linux allows 65,530 mappings per process, also for threads and files
 _EVERY_S = 20.0
 
 
 def give_back(large: int) -> None:
-    """Return what is freed back to the system, where the C library is glibc; elsewhere nothing is done.
+    """Configure glibc to return freed memory to the operating system; do nothing with another C library.
 
-    Left alone, glibc learns from every large block that is freed: blocks up to that size then lie among the small ones
-    and leave holes, and twice that size may lie free at the end of the heap of every thread. What is set is not learnt;
-    whole free pages between blocks in use go back a few times a minute, on a thread of its own.
+    By default glibc raises its mmap threshold with every large block freed: later blocks up to that size lie on the
+    heap and fragment it, and twice that size may stay free at the end of the heap of every thread. A fixed threshold
+    prevents this; a thread trims free pages between used blocks a few times a minute.
 
     Args:
-        large: from how many bytes on a block is one of its own, which goes back when it is freed [bytes]
+        mmap_threshold: size from which a block is mapped separately and unmapped when freed [bytes]
     Source: mallopt(3), M_MMAP_THRESHOLD and M_MMAP_MAX; malloc_trim(3).
     """
     if platform.libc_ver()[0] != "glibc":

@@ -1,4 +1,4 @@
-"""Folders and files that only their owner may change: checked before anything in them is believed or run."""
+"""Check that folders and files are writable by their owner only, before their content is read or executed."""
 
 import os
 import stat
@@ -8,31 +8,36 @@ _WRITABLE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def trouble(path: Path) -> str:
-    """Say why another local user could have changed what is at a path, or can; empty: nobody can.
+    """Return the reason for which another local user could change the content of a path; empty: none could.
 
-    The path itself must be ours; each folder above it ours or root's, and writable by others only where it is sticky.
+    The current user must own the path. The current user or root must own each parent folder, and others may write to
+    a parent only where it is sticky.
 
     Raises:
-        OSError: when it cannot be looked at.
+        OSError: when its status cannot be read.
     """
     real = path.resolve(strict=True)
     found = real.stat()
     if found.st_uid != os.geteuid():
-        return f"owner {found.st_uid}, expected {os.geteuid()}, who runs this; name one of your own"
+        return f"owner {found.st_uid}, expected {os.geteuid()}, the current user; name a folder of your own"
     if found.st_mode & _WRITABLE:
-        return f"mode {stat.S_IMODE(found.st_mode):04o}, expected none but its owner to write there; chmod go-w {real}"
+        return (
+            f"mode {stat.S_IMODE(found.st_mode):04o}, expected write permission for its owner only; chmod go-w {real}"
+        )
     for above in real.parents:
         found = above.stat()
         mode = stat.S_IMODE(found.st_mode)
         if found.st_uid not in (0, os.geteuid()):
-            return f"{above} above it with owner {found.st_uid}, expected root or {os.geteuid()}; name another folder"
+            return f"parent {above} with owner {found.st_uid}, expected root or {os.geteuid()}; name another folder"
         if mode & _WRITABLE and not mode & stat.S_ISVTX:
-            return f"{above} above it with mode {mode:04o}, expected that only its owner may write; chmod go-w {above}"
+            return (
+                f"parent {above} with mode {mode:04o}, expected write permission for its owner only; chmod go-w {above}"
+            )
     return ""
 
 
 def cache_folder() -> Path:
-    """Name this user's cache folder of ParaUAV.
+    """Return this user's cache folder of ParaUAV.
 
     Raises:
         RuntimeError: when the user has no home.
@@ -40,12 +45,12 @@ def cache_folder() -> Path:
     base = os.environ.get("XDG_CACHE_HOME", "")
     found = Path(base) if os.path.isabs(base) else Path.home() / ".cache"
     if not found.is_absolute():
-        raise RuntimeError(f"found HOME {str(found.parent)!r}, expected a whole path")
+        raise RuntimeError(f"found HOME {str(found.parent)!r}, expected an absolute path")
     return found / "parauav"
 
 
 def onboard_folder() -> Path:
-    """Name the folder of what aircraft told before: in this user's cache, or what PARAUAV_ONBOARD says.
+    """Return the folder of cached onboard data of aircraft: PARAUAV_ONBOARD, or a folder in this user's cache.
 
     Raises:
         RuntimeError: when the user has no home.
@@ -55,14 +60,14 @@ def onboard_folder() -> Path:
 
 
 def folder(path: Path, what: str) -> Path:
-    """Make a folder for its owner alone, or accept the one there.
+    """Create a folder with access for its owner only, or check the existing one.
 
     Args:
         path: of the folder
-        what: it is for, in sentences
+        label: its purpose, for error messages
     Raises:
-        ValueError: when others could have put something there, or can.
-        OSError: when it cannot be made or looked at.
+        ValueError: when another user can write to it.
+        OSError: when it cannot be created or its status cannot be read.
     """
     missing = [one for one in (path, *path.parents) if not one.exists()]
     for one in reversed(missing):
@@ -73,23 +78,23 @@ def folder(path: Path, what: str) -> Path:
 
 
 def close(path: Path) -> None:
-    """Let nobody but its owner look into a folder of ours.
+    """Remove the permissions of group and others from a folder.
 
     Raises:
-        OSError: when it cannot be done.
+        OSError: when the mode cannot be changed.
     """
     if stat.S_IMODE(path.stat().st_mode) & 0o077:
         path.chmod(0o700)
 
 
 def strangers(path: Path) -> list[Path]:
-    """Return what a folder holds that belongs to another user; root's is believed."""
+    """Return the content of a folder that belongs to a user other than the current one and root."""
     owners = (0, os.geteuid())
     return [one for one in sorted(path.rglob("*")) if one.lstat().st_uid not in owners]
 
 
 def write(path: Path, data: bytes) -> None:
-    """Write a secret into a new file that only its owner may read, in place of what is there.
+    """Write a secret atomically to a file readable by its owner only.
 
     Raises:
         OSError: when it cannot be written.

@@ -1,7 +1,7 @@
-"""Check this machine, the way onto the bus, and the fleet behind it: a line each, a cure where one is needed.
+"""Check this machine, the connection to the bus, and the fleet: one line per check, with a remedy where needed.
 
-One line each: `ok`, `note` (something optional is missing) or `BAD` (exit code 1). With a router there: certificates,
-clocks and sources of all machines, who writes for which aircraft, which have no writer or two.
+Each line is `ok`, `note` (something optional is missing) or `BAD` (exit code 1). With a router: certificates, clocks
+and sources of all machines, the writer of each aircraft, aircraft without writer or with two.
 """
 
 import argparse
@@ -33,7 +33,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print every finding; exit code 1 when one of them is BAD."""
+    """Print every finding; return exit code 1 if one of them is BAD."""
     found = []
     for finding in _looked(entry(args)):
         found.append(finding)

@@ -1,4 +1,4 @@
-"""Fly pretend aircraft: fixed-wing UAVs on JSBSim that speak MAVLink 2 over UDP, or into a recording."""
+"""Fly simulated aircraft: fixed-wing UAVs on JSBSim that send MAVLink 2 over UDP, or into a recording."""
 
 import argparse
 from collections.abc import Sequence
@@ -28,44 +28,44 @@ _RECORDED_S = 300.0  # length of a recording when --for is not given [s]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the options."""
+    """Declare the options."""
     parser.add_argument("--uavs", type=id_range, default=range(8), metavar="A-B", help="aircraft ids (0-7)")
-    parser.add_argument("--to", default="127.0.0.1:14550", metavar="HOST:PORT", help="where the frames go")
+    parser.add_argument("--to", default="127.0.0.1:14550", metavar="HOST:PORT", help="destination of the frames")
     parser.add_argument(
-        "--autopilot", choices=AUTOPILOTS, default="ardupilot", help="whose law and MAVLink (ardupilot)"
+        "--autopilot", choices=AUTOPILOTS, default="ardupilot", help="autopilot law and MAVLink dialect (ardupilot)"
     )
     parser.add_argument("--aircraft", choices=AIRCRAFT, default="small", help="11 kg electric or a Cessna 172 (small)")
-    parser.add_argument("--seed", type=int, default=1, help="draws aircraft, missions, weather and noise (1)")
+    parser.add_argument("--seed", type=int, default=1, help="random seed of aircraft, missions, weather and noise (1)")
     parser.add_argument("--wind", type=float, default=4.0, metavar="M/S", help="mean wind at 100 m (4)")
     parser.add_argument(
         "--turbulence",
         default="2",
         metavar="LEVEL",
-        help="MIL-F-8785C: none, light (3), moderate (4), severe (6) or 0..7 (2: what goes with a wind of 4 m/s)",
+        help="MIL-F-8785C: none, light (3), moderate (4), severe (6) or 0..7 (2, typical of a wind of 4 m/s)",
     )
     parser.add_argument("--loss", type=float, default=0.02, metavar="SHARE", help="share of frames lost (0.02)")
-    parser.add_argument("--for", dest="seconds", type=float, metavar="S", help="how long (for ever; 300 with --tlog)")
+    parser.add_argument("--for", dest="seconds", type=float, metavar="S", help="duration (unlimited; 300 with --tlog)")
     fault_arguments(parser)
-    parser.add_argument("--tlog", type=Path, metavar="FILE", help="fly as fast as possible into this .tlog instead")
+    parser.add_argument("--tlog", type=Path, metavar="FILE", help="write this .tlog as fast as possible instead")
 
 
 def fault_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what may be wrong with one of the aircraft."""
+    """Declare the options for the faults of one aircraft."""
     parser.add_argument(
         "--fault",
         action="append",
         default=[],
         metavar="NAME[:OF],KEY=VALUE,...[,at=S]",
-        help="what is wrong with one aircraft, from S seconds on; may be given again",
+        help="fault of one aircraft, from S seconds on; repeatable",
     )
-    parser.add_argument("--fault-uav", type=int, metavar="ID", help="which one (the first)")
+    parser.add_argument("--fault-uav", type=int, metavar="ID", help="aircraft with the faults (the first)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fly until told to stop, or for the given time.
+    """Fly until stopped, or for the given time.
 
     Raises:
-        ValueError: when an option makes no sense; the sentence says which.
+        ValueError: when an option is invalid; the text names it.
     """
     from fleet.simulator.flight import drive  # loads JSBSim and the compiler: not for --help
     from fleet.simulator.flight.uav import PretendUav
@@ -80,59 +80,59 @@ def run(args: argparse.Namespace) -> int:
     uavs = [
         PretendUav(i, args.seed, wind=args.wind, turbulence=level, **kind, faults=faulty.get(i, ())) for i in args.uavs
     ]
-    say("fly", "compiling the autopilot, once")
+    say("fly", "compiling the autopilot, first start only")
     PretendUav(args.uavs[0], args.seed).step(0.2)
     if args.tlog is not None:
         _record(uavs, args, stop)
         return 0
-    say("fly", f"{len(uavs)} aircraft in the air, talking to {host}:{port}")
+    say("fly", f"{len(uavs)} aircraft in the air, sending to {host}:{port}")
     worst = drive.to_udp(uavs, (host, port), seconds=args.seconds, loss=args.loss, seed=args.seed, stop=stop)
-    say("fly", f"stopped; at worst {worst * 1e3:.0f} ms behind real time")
+    say("fly", f"stopped; at most {worst * 1e3:.0f} ms behind real time")
     return 0
 
 
 def faults_of(args: argparse.Namespace, uavs: range) -> "dict[int, tuple[Fault, ...]]":
-    """Return the faults of the one aircraft that has any.
+    """Return the faults by id of the one aircraft that has any.
 
     Raises:
-        ValueError: when a fault is none that such an aircraft can carry, or the aircraft is none of them.
+        ValueError: when a fault is not applicable to the aircraft type, or the id is not simulated.
     """
     from fleet.simulator.faults.kinds import read
 
     which = uavs[0] if args.fault_uav is None else args.fault_uav
     if args.fault_uav is not None and not args.fault:
-        raise ValueError(f"fault-uav: found {which} but no fault, expected one; add --fault")
+        raise ValueError(f"--fault-uav: found {which} without a fault, expected one; add --fault")
     if which not in uavs:
-        raise ValueError(f"fault-uav: found {which}, expected one of {uavs[0]}-{uavs[-1]}; change --fault-uav")
+        raise ValueError(f"--fault-uav: found {which}, expected one of {uavs[0]}-{uavs[-1]}; change --fault-uav")
     faults = tuple(read(text, args.aircraft) for text in args.fault)
     return {which: faults} if faults else {}
 
 
 def _check(args: argparse.Namespace) -> None:
     if not 0 <= args.wind <= 15:
-        raise ValueError(f"wind: found {args.wind} m/s, expected 0..15 (cruise is 23 m/s); lower --wind")
+        raise ValueError(f"--wind: found {args.wind} m/s, expected 0..15 (cruise is 23 m/s); lower --wind")
     if not 0 <= args.loss < 1:
-        raise ValueError(f"loss: found {args.loss}, expected a share from 0 to below 1; write e.g. 0.02")
+        raise ValueError(f"--loss: found {args.loss}, expected a share from 0 to below 1; write e.g. 0.02")
     if args.seed < 0:
-        raise ValueError(f"seed: found {args.seed}, expected a whole number from 0; change --seed")
+        raise ValueError(f"--seed: found {args.seed}, expected an integer from 0; change --seed")
     if args.seconds is not None and not args.seconds > 0:
-        raise ValueError(f"for: found {args.seconds} s, expected more than 0; change --for")
+        raise ValueError(f"--for: found {args.seconds} s, expected more than 0; change --for")
 
 
 def _address(text: str) -> tuple[str, int]:
-    """Read HOST:PORT.
+    """Parse HOST:PORT.
 
     Raises:
-        ValueError: when it is not one.
+        ValueError: when it is malformed.
     """
     host, colon, port = text.rpartition(":")
     if not colon or not host or not port.isdecimal() or not 0 < int(port) < 65_536:
-        raise ValueError(f"to: found {text!r}, expected HOST:PORT such as 127.0.0.1:14550; correct --to")
+        raise ValueError(f"--to: found {text!r}, expected HOST:PORT such as 127.0.0.1:14550; correct --to")
     return host, int(port)
 
 
 def _record(uavs: "Sequence[PretendUav]", args: argparse.Namespace, stop: Event) -> None:
-    """Write the recording under a progress bar."""
+    """Write the recording and show a progress bar."""
     from rich.progress import Progress
 
     from fleet.simulator.flight import drive

@@ -1,4 +1,4 @@
-"""Record everything a running fleet says into a file that `fleet replay` takes back."""
+"""Record all messages of a running fleet into a file for `fleet replay`."""
 
 import argparse
 import math
@@ -29,20 +29,20 @@ EXAMPLES = """
 """
 SUFFIX = ".parauav"
 MOST = 64 << 20  # bytes waiting for the disk; beyond, messages are dropped and counted
-WRITE_S = 0.25  # between two writes: what a crash may cost [s]
-_PLAIN_S = 10.0  # between progress lines where the output is no terminal [s]
+WRITE_S = 0.25  # between two writes: maximum loss in a crash [s]
+_PLAIN_S = 10.0  # between progress lines where the output is not a terminal [s]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("file", type=Path, metavar="FILE", help=f"recording to write, {SUFFIX}")
-    parser.add_argument("--for", dest="seconds", type=float, default=0.0, metavar="S", help="how long (until Ctrl-C)")
+    parser.add_argument("--for", dest="seconds", type=float, default=0.0, metavar="S", help="duration (until Ctrl-C)")
     parser.add_argument("--overwrite", action="store_true", help="replace FILE where it exists")
     router_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Record until told to stop; exit code 1 where messages had to be dropped."""
+    """Record until stopped; return exit code 1 if messages were dropped."""
     _check(args)
     stop = stop_on_signal()
     with connect(entry(args)) as bus, _opened(args.file, args.overwrite) as file:
@@ -51,15 +51,15 @@ def run(args: argparse.Namespace) -> int:
         _record(recorder, args, stop)
     tell("fleet record", f"{recorder.words()}; {args.file} is complete")
     if recorder.dropped:
-        tell("fleet record", f"{recorder.dropped} messages dropped, the disk could not follow")
+        tell("fleet record", f"{recorder.dropped} messages dropped, the disk was too slow")
     return 1 if recorder.dropped else 0
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse wrong use before anything is opened.
+    """Validate the options before anything is opened.
 
     Raises:
-        ValueError: when an option makes no sense; the sentence says which.
+        ValueError: when an option is invalid; the text names it.
     """
     if not 0 <= args.seconds < math.inf:
         raise ValueError(f"--for: found {args.seconds} s, expected 0 (until Ctrl-C) or more; change it")
@@ -72,17 +72,17 @@ def _opened(path: Path, overwrite: bool) -> IO[bytes]:
         return path.open("wb" if overwrite else "xb", buffering=0)
     except FileExistsError:
         raise ValueError(
-            f"FILE: found {str(path)!r} there already, expected a new name; choose one, or say --overwrite"
+            f"FILE: found an existing file {str(path)!r}, expected a new name; choose one, or add --overwrite"
         ) from None
     except OSError as error:
         raise OSError(f"FILE: {str(path)!r} cannot be written ({error.strerror}); choose another place") from None
 
 
 class Recorder:
-    """Pack what is heard on the bus's threads, write it on the caller's.
+    """Pack received messages on threads of the bus, write them on the caller's thread.
 
     Args:
-        bus: what is listened to
+        bus: source of the messages
         file: unbuffered
     """
 
@@ -91,14 +91,14 @@ class Recorder:
         self.counts: Counter[str] = Counter()  # messages written, by topic
         self.size = 0  # bytes written
         self._begun = time.monotonic()
-        self._zero = time.time() - self._begun  # a system clock that is set later does not show
+        self._zero = time.time() - self._begun  # independent of later changes of the system clock
         self._bus, self._file = bus, file
         self._lock = threading.Lock()
         self._waiting = bytearray()
         self._waiting_counts: Counter[str] = Counter()
 
     def listen(self) -> None:
-        """Ask for what is said seldom, so that a recording begun in flight knows the missions; then listen."""
+        """Query rarely published messages, so that a recording started in flight has the missions; then subscribe."""
         for kind in TOPICS.values():
             if kind is not Sample:
                 found: list[tuple[Any, Stamp | None]] = self._bus.ask(kind)
@@ -117,10 +117,10 @@ class Recorder:
                 self._waiting_counts[kind.topic] += 1  # type: ignore[attr-defined]
 
     def write(self) -> None:
-        """Write what waits.
+        """Write the buffered messages.
 
         Raises:
-            OSError: when the disk is full or gone; the file is good up to its last whole record.
+            OSError: when the disk is full or removed; the file is valid up to its last complete record.
         """
         with self._lock:
             data, self._waiting = self._waiting, bytearray()
@@ -133,18 +133,18 @@ class Recorder:
 
     @property
     def seconds(self) -> float:
-        """Tell for how long it has recorded [s]."""
+        """Return the duration of the recording [s]."""
         return time.monotonic() - self._begun
 
     def words(self) -> str:
-        """Say how much has been written."""
+        """Describe the recorded amount."""
         kinds = ", ".join(f"{n:,} {topic.lstrip('@')}" for topic, n in self.counts.most_common())
         said = f"{self.seconds:.0f} s, {self.counts.total():,} messages, {self.size / 1e6:.1f} MB"
-        return f"{said} ({kinds or 'nothing heard yet: is a gateway running?'})"
+        return f"{said} ({kinds or 'no messages yet: is a gateway running?'})"
 
 
 def _record(recorder: Recorder, args: argparse.Namespace, stop: threading.Event) -> None:
-    """Write and show it until told to stop or the time is over."""
+    """Write and show progress until stopped or the duration has elapsed."""
     console = Console(stderr=True)
     due = _PLAIN_S
     with Live(console=console, auto_refresh=False, transient=True) as live:

@@ -1,4 +1,4 @@
-"""Play recordings into a running fleet, as if they were flown now."""
+"""Replay recordings into a running fleet as live telemetry."""
 
 import argparse
 import threading
@@ -19,7 +19,7 @@ EXAMPLES = """
   fleet replay flight.tlog
   fleet replay flight.tlog.xz log7.bin --speed 4
   fleet replay one.tlog two.ulg --speed max --router tcp/127.0.0.1:7447
-  fleet replay monday.parauav --results                        what the twins said then, not what they say now
+  fleet replay monday.parauav --results                        recorded results, not new ones
   fleet replay flight.tlog --copies 50                         fifty aircraft, 500 m apart
   fleet replay flight.tlog --copies 50 --to 127.0.0.1:14550    the same as MAVLink over UDP
   fleet replay flight.tlog --copies 500 --to 127.0.0.1:14550 --to 127.0.0.1:14551    250 aircraft a link
@@ -29,22 +29,24 @@ EXAMPLES = """
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `fleet replay`."""
     parser.add_argument("file", nargs="+", metavar="FILE", help="recordings of any kind, also compressed")
-    parser.add_argument("--speed", default="1", metavar="N|max", help="times real time, or max (1)")
+    parser.add_argument("--speed", default="1", metavar="N|max", help="factor of real time, or max (1)")
     parser.add_argument("--copies", type=int, default=1, metavar="N", help="aircraft for each recorded one (1)")
-    parser.add_argument("--results", action="store_true", help="play also the models, predictions and alerts recorded")
+    parser.add_argument(
+        "--results", action="store_true", help="replay also the recorded models, predictions and alerts"
+    )
     parser.add_argument(
         "--to",
         action="append",
         metavar="HOST:PORT",
-        help="send a .tlog as MAVLink over UDP there, on this machine; "
-        f"repeatable: the copies are shared out, at most {MOST_ON_A_LINK} aircraft each",
+        help="send a .tlog as MAVLink over UDP to this address of this machine; "
+        f"repeatable: the copies are distributed, at most {MOST_ON_A_LINK} aircraft each",
     )
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
     router_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Start a gateway that plays the files; its exit code is ours. Or send them as datagrams."""
+    """Start a gateway that replays the files and return its exit code; or send the files as datagrams."""
     check(args)
     if args.to:
         return _send(args)
@@ -54,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _send(args: argparse.Namespace) -> int:
-    """Send every file in a thread of its own; exit code 1 where one could not be sent to its end."""
+    """Send every file in a thread of its own; return exit code 1 if one was not sent completely."""
     airings, places = [], []
     for to, numbers in zip(map(address, args.to), shared(args.copies, len(args.to)), strict=True):
         ids = Ids(1, MOST_ON_A_LINK)
@@ -75,19 +77,19 @@ def _send(args: argparse.Namespace) -> int:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Refuse wrong use before anything is opened.
+    """Validate the options before anything is opened.
 
     Raises:
-        ValueError: when an option makes no sense; the sentence says which.
+        ValueError: when an option is invalid; the text names it.
     """
     read_speed(args.speed)
     if not 1 <= args.copies <= 10_000:
         raise ValueError(f"--copies: found {args.copies}, expected 1 to 10,000; change it")
     if args.results and args.copies > 1:
-        raise ValueError("--results: found --copies too, expected one of them; results are of the aircraft recorded")
+        raise ValueError("--results: found --copies too, expected only one; recorded results have no copies, drop one")
 
 
 def link(name: str, args: argparse.Namespace) -> str:
-    """Return the gateway's `--link` for one recording, by its name and --speed, --copies and --results."""
+    """Return the gateway's `--link` for one recording, from its name and --speed, --copies and --results."""
     path = quote(str(Path(name).resolve()), safe="/ ")
     return f"replay:{path}?speed={args.speed}&copies={args.copies}&results={int(args.results)}"

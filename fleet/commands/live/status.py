@@ -1,4 +1,4 @@
-"""Show every UAV of a running fleet (state, fit, horizon, alerts, verdict), and which machine does what."""
+"""Show every UAV of a running fleet (state, fit, horizon, alerts, verdict) and the processes of each machine."""
 
 import argparse
 import json
@@ -31,7 +31,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Ask the fleet once and print it; exit code 1 where no UAV is known."""
+    """Query the fleet once and print it; return exit code 1 if no UAV is known."""
     with connect(entry(args)) as bus:
         rows = fleet_rows(bus)
         on = [] if args.json else processes(bus)
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def fleet_rows(bus: Bus) -> list[FleetRow]:
-    """Ask every worker for its rows and add what no worker holds as unclaimed."""
+    """Query the rows of every worker and add aircraft without a worker as unclaimed."""
     best: dict[int, FleetRow] = {}
     for state, _ in bus.ask(FleetState):
         for row in state.rows:
@@ -57,13 +57,13 @@ def fleet_rows(bus: Bus) -> list[FleetRow]:
             if held is None or (row.epoch, row.worker) > (held.epoch, held.worker):
                 best[row.uav] = row
     for status, _ in bus.ask(Status):
-        sentence = "no worker holds this id: start `twin_worker` with a wider --uavs"
+        sentence = "no worker owns this id: start `twin_worker` with a wider --uavs"
         best.setdefault(status.uav, FleetRow(uav=status.uav, state=State.UNCLAIMED, verdict=sentence))
     return [best[uav] for uav in sorted(best)]
 
 
 def processes(bus: Bus) -> list[tuple[str, str, str, str]]:
-    """Ask every gateway and worker where it runs and what it does: (machine, what, aircraft, words)."""
+    """Query every gateway and worker and return rows of machine, process, aircraft, details."""
     found = []
     for account, _ in bus.ask(Account):
         words = [f"{sum(link.messages_hz for link in account.per_link):.0f} messages/s", account.sentence]
@@ -78,8 +78,8 @@ def processes(bus: Bus) -> list[tuple[str, str, str, str]]:
 
 
 def machines(found: list[tuple[str, str, str, str]]) -> Table:
-    """Lay out who runs where."""
-    out = Table("machine", "process", "aircraft", "says", box=None, pad_edge=False)
+    """Format the processes as a table."""
+    out = Table("machine", "process", "aircraft", "status", box=None, pad_edge=False)
     for line in found:
         out.add_row(*(escape(plain(word)) or "-" for word in line))
     return out
@@ -91,7 +91,7 @@ def as_objects(rows: list[FleetRow]) -> list[dict[str, object]]:
 
 
 def table(rows: list[FleetRow]) -> Table:
-    """Lay the rows out as a table for people."""
+    """Format the rows of the fleet as a table."""
     out = Table(box=None, pad_edge=False)
     for heading, justify in (("UAV", "right"), ("state", "left"), ("fit %", "right"), ("horizon s", "right")):
         out.add_column(heading, justify=justify)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Start a whole fleet on this machine: router, aircraft, gateway, worker, viewer."""
+"""Start a complete fleet on this machine: router, aircraft, gateway, worker, viewer."""
 
 import argparse
 import json
@@ -29,39 +29,41 @@ from fleet.process.sanitise import plain
 EXAMPLES = """
   fleet up --uavs 8
   fleet up --uavs 4 --autopilot px4 --aircraft c172p
-  fleet up --uavs 4 --fault drag_increase,dCD=0.04,at=120 --fault-uav 2      and see whether its twin finds out
+  fleet up --uavs 4 --fault drag_increase,dCD=0.04,at=120 --fault-uav 2      its twin should diagnose the fault
   fleet up --link udpin:0.0.0.0:14550
-  fleet up --link serial:/dev/ttyUSB0:57600 --forward udpin:127.0.0.1:14551      QGroundControl beside us, at 14551
+  fleet up --link serial:/dev/ttyUSB0:57600 --forward udpin:127.0.0.1:14551      QGroundControl in addition, at 14551
   fleet up --replay flight.tlog.xz log7.bin --speed 4
   fleet up --replay monday.parauav --results
   fleet up --uavs 8 --for 240 --no-viewer --summary summary.json
-  fleet up --router tcp/127.0.0.1:7448 --mavlink 127.0.0.1:14551 --port 8081      a second fleet beside the first
+  fleet up --router tcp/127.0.0.1:7448 --mavlink 127.0.0.1:14551 --port 8081      a second fleet
 """
 _MAVLINK = "127.0.0.1:14550"
-_PLAIN_S = 10.0  # between progress lines where the output is no terminal [s]
+_PLAIN_S = 10.0  # between progress lines where the output is not a terminal [s]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--uavs", type=int, default=8, metavar="N", help="simulated aircraft, ids 0 to N-1 (8)")
-    parser.add_argument("--autopilot", choices=AUTOPILOTS, default="ardupilot", help="theirs (ardupilot)")
-    parser.add_argument("--aircraft", choices=AIRCRAFT, default="small", help="their type (small)")
+    parser.add_argument("--autopilot", choices=AUTOPILOTS, default="ardupilot", help="simulated autopilot (ardupilot)")
+    parser.add_argument("--aircraft", choices=AIRCRAFT, default="small", help="simulated aircraft type (small)")
     fault_arguments(parser)
-    parser.add_argument("--mavlink", default=_MAVLINK, metavar="HOST:PORT", help=f"where they send UDP ({_MAVLINK})")
+    parser.add_argument(
+        "--mavlink", default=_MAVLINK, metavar="HOST:PORT", help=f"UDP address they send to ({_MAVLINK})"
+    )
     parser.add_argument("--link", action="append", default=[], help="real aircraft instead, e.g. udpin:0.0.0.0:14550")
     parser.add_argument("--forward", action="append", default=[], help="another ground station, as in gateway --help")
-    parser.add_argument("--keys", metavar="FILE", help="keys of links that are signed, as in gateway --help")
+    parser.add_argument("--keys", metavar="FILE", help="keys of signed links, as in gateway --help")
     parser.add_argument(
         "--replay", action="extend", nargs="+", default=[], metavar="FILE", help="recordings of any kind instead"
     )
     parser.add_argument("--speed", default="1", help="replay speed, a number or max (1)")
     parser.add_argument("--copies", type=int, default=1, metavar="N", help="aircraft for each recorded one (1)")
-    parser.add_argument("--results", action="store_true", help="show the results recorded, compute none")
+    parser.add_argument("--results", action="store_true", help="show the recorded results, compute none")
     parser.add_argument("--for", dest="seconds", type=float, default=0.0, help="stop this long after the first sample")
     parser.add_argument("--no-viewer", action="store_true", help="without the web page")
     parser.add_argument("--port", type=int, default=8080, help="port of the web page (8080)")
-    parser.add_argument("--terrain", metavar="FILE", help="heights of the ground for the page, as in viewer --help")
-    parser.add_argument("--imagery", metavar="FILE", help="picture of the ground for the page, as in viewer --help")
+    parser.add_argument("--terrain", metavar="FILE", help="terrain heights for the page, as in viewer --help")
+    parser.add_argument("--imagery", metavar="FILE", help="ground imagery for the page, as in viewer --help")
     parser.add_argument("--seed", type=int, default=1, help="seed of the simulated aircraft (1)")
     router_arguments(parser)
     parser.add_argument(
@@ -69,13 +71,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="[ID=]MODEL",
-        help="find mismatches against this model, of one aircraft or of all (each one's own first flight)",
+        help="reference model for mismatches, of one aircraft or of all (each aircraft's own first flight)",
     )
     parser.add_argument("--summary", type=Path, metavar="FILE", help="write the last state of every UAV as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Start everything, show it, stop it; exit code 1 where a part died, 2 where it refused what it was told."""
+    """Start, show and stop all processes; return exit code 1 if one failed, 2 if one rejected its options."""
     _check(args)
     stop = stop_on_signal()
     at = entry(args)
@@ -90,10 +92,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse at once what could only fail later.
+    """Validate the options before anything is started.
 
     Raises:
-        ValueError: when an option makes no sense; the sentence says which.
+        ValueError: when an option is invalid; the text names it.
     """
     if not 1 <= args.uavs <= 250:
         raise ValueError(f"--uavs: found {args.uavs}, expected 1 to 250 aircraft; start several fleets for more")
@@ -101,7 +103,7 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"--for: found {args.seconds} s, expected 0 (until Ctrl-C) or more; change it")
     check_playing(args)
     if args.fault and (args.link or args.replay):
-        raise ValueError("--fault: found --link or --replay, expected simulated aircraft to carry it; leave one out")
+        raise ValueError("--fault: found --link or --replay, expected simulated aircraft; leave one out")
     faults_of(args, range(args.uavs))
     if args.results and not args.replay:
         raise ValueError("--results: found no --replay, expected a recording made by `fleet record`; name one")
@@ -109,7 +111,7 @@ def _check(args: argparse.Namespace) -> None:
         if not Path(name).is_file():
             raise ValueError(f"--replay: found no recording {name!r}, expected a file; check the path")
     if args.summary and not args.summary.absolute().parent.is_dir():
-        raise ValueError(f"--summary: found no folder {str(args.summary.parent)!r}, expected one; make it first")
+        raise ValueError(f"--summary: found no folder {str(args.summary.parent)!r}, expected one; create it first")
     if not (args.link or args.replay):
         _check_free(args.mavlink)
 
@@ -123,7 +125,7 @@ def _check_free(mavlink: str) -> None:
             trial.bind((host, int(port)))
         except OSError as error:
             reason = f"UDP {mavlink} not free ({error.strerror or error}), expected a port for the simulated aircraft"
-            raise ValueError(f"--mavlink: found {reason}; is a fleet already up? name another") from None
+            raise ValueError(f"--mavlink: found {reason}; stop the other fleet, or name another port") from None
 
 
 def _start(children: Children, args: argparse.Namespace) -> None:
@@ -150,8 +152,8 @@ def _start(children: Children, args: argparse.Namespace) -> None:
 
 
 def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threading.Event) -> int:
-    """Show the fleet once a second until told to stop, a part dies or the time is over."""
-    said: list[str] = [""]  # by the worker, the newest last; none is lost between two looks
+    """Show the fleet once a second until stopped, a process fails or the duration has elapsed."""
+    said: list[str] = [""]  # texts of the worker, the newest last; none is lost between two polls
     bus.subscribe(
         FleetState, lambda state, _: said.append(plain(state.sentence)) if plain(state.sentence) != said[-1] else None
     )
@@ -178,7 +180,7 @@ def _watch(bus: Bus, children: Children, args: argparse.Namespace, stop: threadi
 
 
 class _Show:
-    """The display: a live table on a terminal, elsewhere a line whenever there is news."""
+    """Display: a live table on a terminal, otherwise a line for every new text."""
 
     def __init__(self, console: Console) -> None:
         self.console = console
@@ -208,7 +210,7 @@ def _lines(
     lines += [sentence] if sentence else []
     lines += children.words()
     if args.replay and "gateway" in children.done():
-        lines.append("the recording has ended; the twins fly on alone until Ctrl-C")
+        lines.append("the recording has ended; the twins predict without telemetry until Ctrl-C")
     if not args.no_viewer:
         lines.append(f"viewer: http://127.0.0.1:{args.port}   (Ctrl-C stops everything)")
     return lines

@@ -1,4 +1,4 @@
-"""Ask where an aircraft would fly with another mission, speed, place, wind or parameters; nothing is sent to it."""
+"""Predict an aircraft with another mission, speed, position, wind or parameters; nothing is sent to the aircraft."""
 
 import argparse
 import json
@@ -31,27 +31,27 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("uav", type=int, help="UAV id")
     parser.add_argument("--items", type=Path, metavar="FILE", help="another mission, a QGC WPL 110 file")
     parser.add_argument("--seq", type=int, metavar="N", help="item to fly to first")
-    parser.add_argument("--speed", type=float, metavar="M/S", help="another airspeed; of what hovers, over ground")
+    parser.add_argument("--speed", type=float, metavar="M/S", help="another airspeed; of a multirotor, ground speed")
     parser.add_argument(
-        "--start", type=_numbers, metavar="LAT,LON,ALT[,DEG[,M/S]]", help="another place; --start=-33,… if south"
+        "--start", type=_numbers, metavar="LAT,LON,ALT[,DEG[,M/S]]", help="another position; --start=-33,… if south"
     )
-    parser.add_argument("--wind", type=_numbers, metavar="N,E", help="another wind, where it blows to [m/s]")
-    parser.add_argument("--param", action="append", default=[], metavar="NAME=VALUE", help="another parameter; repeat")
-    parser.add_argument("--json", action="store_true", help="the whole prediction, in degrees and metres")
+    parser.add_argument("--wind", type=_numbers, metavar="N,E", help="another wind, the direction it blows to [m/s]")
+    parser.add_argument("--param", action="append", default=[], metavar="NAME=VALUE", help="a parameter; repeatable")
+    parser.add_argument("--json", action="store_true", help="the complete prediction, in degrees and metres")
     router_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Ask, and print the path in short beside the one predicted as things are; exit code 1 where nobody answers.
+    """Query the what-if and print its path compared with the current prediction; exit code 1 without a reply.
 
     Raises:
-        ValueError: when the question makes no sense, or is refused; the sentence says why.
+        ValueError: when an option is invalid, or the worker rejects the request; with the reason.
     """
     asked = question(args)
     with connect(entry(args)) as bus:
         made, usual = ask(bus, args.uav, asked), next((p for p, _ in bus.ask(Prediction, args.uav)), None)
     if made is None:
-        print(f"uav {args.uav}: no worker answers; is it flying? See `fleet status`", file=sys.stderr)
+        print(f"uav {args.uav}: found no worker that replies, expected one; see `fleet status`", file=sys.stderr)
         return 1
     if args.json:
         json.dump(as_object(made), sys.stdout, indent=1)
@@ -65,14 +65,14 @@ def _numbers(words: str) -> tuple[float, ...]:
     try:
         return tuple(float(word) for word in words.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"found {words!r}, expected numbers with commas between them") from None
+        raise argparse.ArgumentTypeError(f"found {words!r}, expected numbers separated by commas") from None
 
 
 def question(args: argparse.Namespace) -> WhatIf:
-    """Put the question together.
+    """Build the request from the options.
 
     Raises:
-        ValueError: when an option makes no sense; the sentence says which.
+        ValueError: when an option is invalid; the text names it.
     """
     if args.wind is not None and len(args.wind) != 2:
         raise ValueError(f"--wind: found {len(args.wind)} numbers, expected north and east; write e.g. --wind=6,-2")
@@ -95,7 +95,7 @@ def question(args: argparse.Namespace) -> WhatIf:
 
 def _start(numbers: tuple[float, ...]) -> WhatIfStart:
     if not 3 <= len(numbers) <= 5 or not np.isfinite(numbers).all() or np.abs(numbers).max() > 1e6:
-        raise ValueError(f"--start: found {numbers}, expected LAT,LON,ALT and maybe heading and airspeed; correct it")
+        raise ValueError(f"--start: found {numbers}, expected LAT,LON,ALT[,DEG[,M/S]]; correct it")
     lat, lon, alt, *more = numbers
     heading, speed = (*more, None, None)[:2]
     return WhatIfStart(
@@ -108,13 +108,13 @@ def _start(numbers: tuple[float, ...]) -> WhatIfStart:
 
 
 def ask(bus: Bus, uav: int, asked: WhatIf) -> Prediction | None:
-    """Send the question; None where nobody answers."""
+    """Send the request; None without a reply."""
     found = bus.inquire(Prediction, uav, msgspec.msgpack.encode(asked))
     return found[0] if found else None
 
 
 def as_object(made: Prediction) -> dict[str, object]:
-    """Return a prediction for JSON: places instead of arrays."""
+    """Return a prediction for JSON: lists instead of packed arrays, and geodetic positions."""
     out = msgspec.to_builtins(made, builtin_types=(bytes,))
     places = to_geodetic(made.ned_origin(), made.path.numpy())
     for name in ("ahead", "path", "tube"):
@@ -125,13 +125,13 @@ def as_object(made: Prediction) -> dict[str, object]:
 
 
 def text(made: Prediction, usual: Prediction | None) -> str:
-    """Tell the path in a few lines, and how far from the usual one it leads."""
+    """Format the path as a table, with the deviation from the reference prediction."""
     ahead, path, tube = (a.numpy().astype(float) for a in (made.ahead, made.path, made.tube))
     places = to_geodetic(made.ned_origin(), path)
     flown = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     off = _apart(made, usual)
     lines = [plain(made.sentence), f"{plain(made.method)} · {plain(made.law)} · horizon {made.horizon_s:.0f} s"]
-    lines.append("   in s    latitude   longitude  alt m   flown m  tube m  from usual m")
+    lines.append("   in s    latitude   longitude  alt m  length m  tube m   deviation m")
     for at in (s for s in _SHOWN_S if s <= ahead[-1]):
         k = int(np.argmin(np.abs(ahead - at)))
         lat, lon, alt = places[k] * [1e-7, 1e-7, 1e-3]
@@ -141,7 +141,7 @@ def text(made: Prediction, usual: Prediction | None) -> str:
 
 
 def _apart(made: Prediction, usual: Prediction | None) -> np.ndarray | None:
-    """Return the distance to the usual prediction at the same times, (n,) [m]; nan where that does not reach."""
+    """Return the distance to the reference prediction at the same times, (n,) [m]; nan beyond its end."""
     if usual is None or not usual.path.shape[0]:
         return None
     t = made.t + made.ahead.numpy().astype(float)

@@ -1,4 +1,4 @@
-"""Fly recordings through the twins as if live, and score every prediction against what then happened."""
+"""Replay recordings through the twins as if live, and score every prediction against the recorded flight."""
 
 import argparse
 from pathlib import Path
@@ -11,7 +11,7 @@ from fleet.process.logs import tell
 EXAMPLES = """
   fleet assess flight.tlog
   fleet assess monday/*.tlog.xz --out monday --json monday.json --jobs 2
-  fleet assess flight.tlog --methods route_wind --without-params     ours against one, autopilot parameters withheld
+  fleet assess flight.tlog --methods route_wind --without-params     without autopilot parameters
 """
 OWN = ("auto", "dynamics", "hybrid", "paper")
 METHODS = ("cv", "ct", "imm", "route", "route_wind", "paper", "dynamics")
@@ -20,12 +20,14 @@ METHODS = ("cv", "ct", "imm", "route", "route_wind", "paper", "dynamics")
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options; `python -m twin_worker.evaluation` takes the same."""
     parser.add_argument("file", nargs="+", type=Path, metavar="FILE", help="recordings of any kind, also compressed")
-    parser.add_argument("--every", type=float, default=5.0, metavar="S", help="between starts (5)")
-    parser.add_argument("--method", default=OWN[0], choices=OWN, help="of our twin (auto: the best it has)")
+    parser.add_argument("--every", type=float, default=5.0, metavar="S", help="interval between starts (5)")
+    parser.add_argument("--method", default=OWN[0], choices=OWN, help="method of the twin (auto: the best available)")
     parser.add_argument(
         "--methods", default=",".join(METHODS), metavar="A,B", help=f"compare with these ({','.join(METHODS)})"
     )
-    parser.add_argument("--without-params", action="store_true", help="keep the autopilot's parameters from the twins")
+    parser.add_argument(
+        "--without-params", action="store_true", help="withhold the autopilot's parameters from the twins"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="draw figures and write predictions.npz into DIR")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that share the aircraft (1)")
@@ -33,10 +35,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Refuse wrong use before anything is read.
+    """Validate the options before anything is read.
 
     Raises:
-        ValueError: when an option makes no sense; the sentence says which.
+        ValueError: when an option is invalid; the text names it.
     """
     if not 1.0 <= args.every <= 600.0:
         raise ValueError(f"--every: found {args.every:g} s, expected 1..600; a twin predicts once a second")
@@ -49,7 +51,7 @@ def check(args: argparse.Namespace) -> None:
         if not path.is_file():
             raise ValueError(f"FILE: found no recording {str(path)!r}, expected a file; check the path")
     if args.json and not args.json.absolute().parent.is_dir():
-        raise ValueError(f"--json: found no folder {str(args.json.parent)!r}, expected one; make it first")
+        raise ValueError(f"--json: found no folder {str(args.json.parent)!r}, expected one; create it first")
     if args.json and any(args.json.exists() and path.samefile(args.json) for path in args.file):
         raise ValueError(f"--json: found the recording {str(args.json)!r} itself, expected another file; rename it")
     if args.out and args.out.exists() and not args.out.is_dir():
@@ -57,12 +59,12 @@ def check(args: argparse.Namespace) -> None:
 
 
 def chosen(methods: str) -> tuple[str, ...]:
-    """Read the names of methods, ours left out."""
+    """Parse the names of methods, without `ours`."""
     return tuple(name for name in dict.fromkeys(methods.split(",")) if name and name != "ours")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Start the assessment; its exit code is ours."""
+    """Start the assessment and return its exit code."""
     check(args)
     stop = stop_on_signal()
     options = [f"--{name}={getattr(args, name)}" for name in ("every", "method", "methods", "jobs", "offset")]
@@ -70,6 +72,6 @@ def run(args: argparse.Namespace) -> int:
     options += ["--without-params"] if args.without_params else []
     code = run_until(stop, "twin_worker.evaluation", *options, "--", *map(str, args.file))
     if stop.is_set():
-        tell("assess", "stopped; what was not finished is not written")
+        tell("assess", "stopped; unfinished results are not written")
         return INTERRUPTED
     return code

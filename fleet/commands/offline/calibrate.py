@@ -10,8 +10,8 @@ from fleet.process.logs import tell
 
 EXAMPLES = """
   fleet calibrate monday/*.tlog --airframe skywalker --out skywalker.json
-  fleet calibrate calm.tlog windy.tlog --out plane.json         without a card: a unit body, derivatives dimensional
-  fleet calibrate today.tlog --until 120 --out today.json       what a flight did itself in its first two minutes
+  fleet calibrate calm.tlog windy.tlog --out plane.json         without a card: unit mass, dimensional derivatives
+  fleet calibrate today.tlog --until 120 --out today.json       on the first two minutes of a flight itself
   fleet calibrate cal_*.tlog --airframe card.json --out c172.json --json figures.json
 """
 
@@ -19,18 +19,18 @@ EXAMPLES = """
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options; `python -m twin_worker.diagnosis.learn` takes the same."""
     parser.add_argument(
-        "file", nargs="+", type=Path, metavar="NOMINAL", help="recordings without a fault, the livelier the better"
+        "file", nargs="+", type=Path, metavar="NOMINAL", help="recordings without a fault, with much manoeuvring"
     )
     parser.add_argument("--airframe", type=Path, metavar="CARD", help="airframe TOML, its name, or a JSON card (none)")
     parser.add_argument(
-        "--until", type=float, metavar="SECONDS", help="trust only what came before SECONDS on each flight's clock"
+        "--until", type=float, metavar="SECONDS", help="use only the data before SECONDS on each flight's clock"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="MODEL", help="write the simulation to MODEL")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write what was reached to FILE")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the fit achieved to FILE")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Start the calibration; its exit code is ours."""
+    """Start the calibration and return its exit code."""
     stop = stop_on_signal()
     options = [
         f"--{name}={getattr(args, name)}" for name in ("airframe", "until", "out", "json") if getattr(args, name)

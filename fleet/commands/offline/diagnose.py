@@ -1,4 +1,4 @@
-"""Find where a flight and its simulation part ways, what physics was left out, and prove it on data held out."""
+"""Locate deviations between a flight and its simulation, name the missing physics, and verify it on held-out data."""
 
 import argparse
 from pathlib import Path
@@ -13,34 +13,34 @@ _LONGEST_S = 1e6
 EXAMPLES = """
   fleet diagnose flight.tlog --model skywalker.json
   fleet diagnose friday/*.tlog.xz --model skywalker.json --json friday.json --report friday
-  fleet diagnose flight.tlog --against-own-past 120     no other flight: its first two minutes are trusted
-  fleet diagnose flight.tlog --model skywalker.json --conceal airspeed       what is found without being told
-  fleet diagnose real.tlog --against simulated.tlog --airframe skywalker     your own simulator is what gets corrected
+  fleet diagnose flight.tlog --against-own-past 120     reference: its own first two minutes
+  fleet diagnose flight.tlog --model skywalker.json --conceal airspeed       without the airspeed measurements
+  fleet diagnose real.tlog --against simulated.tlog --airframe skywalker     corrections for your own simulator
 """
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options; `python -m twin_worker.diagnosis` takes the same."""
     parser.add_argument("file", nargs="+", type=Path, metavar="FLIGHT", help="recordings of any kind, also compressed")
-    parser.add_argument("--model", type=Path, metavar="MODEL", help="what `fleet calibrate` wrote")
+    parser.add_argument("--model", type=Path, metavar="MODEL", help="output of `fleet calibrate`")
     parser.add_argument(
-        "--against", type=Path, nargs="+", metavar="SIMULATED", help="or recordings of a simulator flying such missions"
+        "--against", type=Path, nargs="+", metavar="SIMULATED", help="or recordings of a simulator on similar missions"
     )
     parser.add_argument(
         "--against-own-past",
         type=float,
         metavar="SECONDS",
-        help="or what each flight did itself before SECONDS on its clock; no corrected models are written then",
+        help="or each flight's own data before SECONDS on its clock; writes no corrected models",
     )
     parser.add_argument("--airframe", type=Path, metavar="CARD", help="without --model: the aircraft, as for calibrate")
     parser.add_argument(
         "--conceal",
         default="",
         metavar="A,B",
-        help="do not look at these in the flights to diagnose: airspeed, wind, battery, imu, pressure, gnss, "
+        help="ignore these in the flights to diagnose: airspeed, wind, battery, imu, pressure, gnss, "
         "throttle, aileron, elevator, rudder",
     )
-    parser.add_argument("--json", type=Path, metavar="OUT", help="write verdicts to OUT, predictions beside it")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write verdicts to OUT, predictions next to it")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes that share the recordings (1)")
     parser.add_argument(
         "--report", type=Path, metavar="DIR", help="write figures, a page and corrected models into DIR"
@@ -48,26 +48,26 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Refuse wrong use before anything is read.
+    """Validate the options before anything is read.
 
     Raises:
-        ValueError: when an option makes no sense; the sentence says which.
+        ValueError: when an option is invalid; the text names it.
     """
     if not 1 <= args.jobs <= 64:
         raise ValueError(f"--jobs: found {args.jobs}, expected 1..64; change it")
     if sum(map(bool, (args.model, args.against, args.against_own_past))) != 1:
         raise ValueError(
-            "expected either --model or --against or --against-own-past; name one thing to compare the flights with"
+            "expected exactly one of --model, --against, --against-own-past; name one reference for the flights"
         )
     if args.against_own_past is not None and not 0 < args.against_own_past < _LONGEST_S:
-        raise ValueError(f"--against-own-past: found {args.against_own_past:g}, expected seconds above 0; change it")
+        raise ValueError(f"--against-own-past: found {args.against_own_past:g} s, expected more than 0; change it")
     for option, path in (("--json", args.json), ("--report", args.report)):
         if path and not path.absolute().parent.is_dir():
-            raise ValueError(f"{option}: found no folder {str(path.parent)!r}, expected one; make it first")
+            raise ValueError(f"{option}: found no folder {str(path.parent)!r}, expected one; create it first")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Start the diagnosis; its exit code is ours."""
+    """Start the diagnosis and return its exit code."""
     check(args)
     stop = stop_on_signal()
     given = {
@@ -78,6 +78,6 @@ def run(args: argparse.Namespace) -> int:
     simulated = ["--against", *map(str, args.against)] if args.against else []
     code = run_until(stop, "twin_worker.diagnosis", *options, *simulated, "--", *map(str, args.file))
     if stop.is_set():
-        tell("diagnose", "stopped; what was not finished is not written")
+        tell("diagnose", "stopped; unfinished results are not written")
         return INTERRUPTED
     return code

@@ -1,4 +1,4 @@
-"""List the physics a simulation may lack: every effect, its parameters and equation, and what it is confused with."""
+"""List the effects that a simulation may lack, with parameters, equation and effects they are confusable with."""
 
 import argparse
 import difflib
@@ -13,10 +13,10 @@ import numpy as np
 from fleet.effects import FOLDERS, Body, Effect, Parameter, catalogue
 
 EXAMPLES = """
-  fleet effects                       all of them in one table
-  fleet effects icing                 one of them: source, meaning, bounds, what it is confused with
-  fleet effects icing --json          the same for a machine
-  PARAUAV_EFFECTS=mine fleet effects  with those of a folder of your own
+  fleet effects                       table of all effects
+  fleet effects icing                 one effect: source, meaning, bounds, confusable effects
+  fleet effects icing --json          the same as JSON
+  PARAUAV_EFFECTS=mine fleet effects  with the effects of your own folder
 """
 
 TITLES = ("name", "where", "parameters", "equation")
@@ -25,15 +25,15 @@ WIDTHS = (28, 19, 28, 43)
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("name", nargs="?", metavar="NAME", help="one effect, and everything about it")
-    parser.add_argument("--json", action="store_true", help="everything as JSON")
+    parser.add_argument("name", nargs="?", metavar="NAME", help="effect to describe")
+    parser.add_argument("--json", action="store_true", help="all details as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Print one effect, or the table of all.
 
     Raises:
-        ValueError: when there is no such effect, or a file of a folder of effects is broken.
+        ValueError: when there is no such effect, or a file of effects is invalid.
     """
     known = catalogue()
     chosen = [_found(known, args.name)] if args.name else list(known.values())
@@ -71,22 +71,22 @@ def _columns(row: tuple[str, ...]) -> str:
 
 
 def as_text(effect: Effect) -> str:
-    """Describe one effect for a reader."""
+    """Describe one effect as text."""
     facts = {
         "equation": effect.equation,
         "source": effect.source,
-        "where": f"{effect.stage}, {effect.channel}" + (", seen in the scatter alone" if effect.variance else ""),
-        "may befall": ", ".join(effect.of) or "the aircraft",
-        "comes as": ", ".join(effect.onsets),
-        "told as": ", ".join(told_names(effect)),
+        "where": f"{effect.stage}, {effect.channel}" + (", visible in the variance only" if effect.variance else ""),
+        "may affect": ", ".join(effect.of) or "the aircraft",
+        "onset": ", ".join(effect.onsets),
+        "reported as": ", ".join(told_names(effect)),
         "examples": "; ".join(", ".join(f"{x:g}" for x in example) for example in effect.examples),
         "search from": "; ".join(", ".join(f"{x:g}" for x in start) for start in effect.starts) or "zero",
     }
     lines = [*_wrapped(f"{effect.name}   ", summary(effect)), ""]
     lines += [row for name, fact in facts.items() for row in _wrapped(f"  {name:12} ", fact)]
-    lines += ["", "  parameters, all zero when there is nothing:", *map(_parameter, effect.parameters)]
+    lines += ["", "  parameters, all zero without the effect:", *map(_parameter, effect.parameters)]
     if effect.confused:
-        lines += ["", "  confused with, and told apart by:"]
+        lines += ["", "  confusable with, and distinguished by:"]
     lines += [row for rival, how in effect.confused.items() for row in _wrapped(f"    {rival:27} ", how)]
     return "\n".join(lines)
 
@@ -100,19 +100,19 @@ def _wrapped(head: str, text: str) -> list[str]:
 
 
 def summary(effect: Effect) -> str:
-    """Return the first sentence of the effect's file."""
+    """Return the first line of the docstring of the effect's module."""
     own = [m for name, m in list(sys.modules.items()) if name.endswith(effect.name)]
     said = next((m.__doc__ for m in own if getattr(m, "EFFECT", None) is effect), None)
     return (said or "").strip().partition("\n")[0]
 
 
 def told_names(effect: Effect) -> list[str]:
-    """List the numbers it is reported in."""
+    """List the names of the reported numbers."""
     return list(effect.told(effect, np.array(effect.examples[0]), Body()))
 
 
 def as_json(effect: Effect) -> dict[str, Any]:
-    """Describe one effect for a machine."""
+    """Describe one effect as a JSON object."""
     plain = ("channel", "equation", "source", "examples", "of", "starts", "variance")
     return {
         "summary": summary(effect),

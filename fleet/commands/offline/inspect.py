@@ -1,4 +1,4 @@
-"""Tell what is in a recording, and what a twin can do with it: table, JSON, a page to print."""
+"""Describe the content of a recording and its use for a twin: table, JSON, page to print."""
 
 import argparse
 import contextlib
@@ -26,14 +26,14 @@ EXAMPLES = """
   fleet inspect flight.tlog
   fleet inspect monday/*.tlog.xz --plot monday.pdf     a page for every aircraft
   fleet inspect flight.tlog --json flight.json --plot flight.png
-  fleet inspect flight.tlog --twin                     also let a twin fly it, and count what it could do
-  fleet inspect --keys                                 what the keys of the JSON mean
+  fleet inspect flight.tlog --twin                     also replay it through a twin
+  fleet inspect --keys                                 meaning of the keys of the JSON
 """
 PLOTS = (".png", ".svg", ".pdf")
 
 
 class Heard(NamedTuple):
-    """One recording, read."""
+    """Result of reading one recording."""
 
     file: File
     surveys: dict[int, Survey]
@@ -45,13 +45,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", nargs="*", type=Path, metavar="FILE", help="recordings, also compressed")
     parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help="JSON to FILE, or instead of the table")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="a page for every aircraft: .png, .svg or .pdf")
-    parser.add_argument("--twin", action="store_true", help="let a twin fly the recording and tell how it did")
+    parser.add_argument("--twin", action="store_true", help="replay the recording through a twin and report the result")
     parser.add_argument("--offset", type=int, default=0, help="UAV id = MAVLink system id + this (0)")
     parser.add_argument("--keys", action="store_true", help="explain every key of the JSON and stop")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show every recording; exit code 1 where something was skipped, assumed or of no use, 2 for wrong use."""
+    """Show every recording; return exit code 1 if anything was skipped, assumed or unusable, 2 for invalid options."""
     if args.keys:
         print(keys())
         return 0
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def keys() -> str:
-    """Explain the JSON, key by key."""
+    """Describe the keys of the JSON."""
     lines = ['{"files": [File, ...]}']
     for part in (File, *parts_of(File)):
         lines += ["", f"{part.__name__}: {summary(part)}", *fields_of(part)]
@@ -89,7 +89,7 @@ def keys() -> str:
 
 
 def read(path: Path, offset: int = 0) -> Heard:
-    """Read one recording; whatever is wrong with it becomes a sentence."""
+    """Read one recording; report every error in it as a text."""
     surveys: dict[int, Survey] = {}
     facts: dict[int, Facts] = {}
     said: list[str] = []
@@ -120,10 +120,10 @@ def _size(path: Path) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse wrong use before anything is read.
+    """Validate the options before anything is read.
 
     Raises:
-        ValueError: when an option makes no sense; the sentence says which.
+        ValueError: when an option is invalid; the text names it.
     """
     if not args.file:
         raise ValueError("FILE: found none, expected at least one recording; name one")
@@ -134,13 +134,13 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError(f"--plot: found {args.plot.name!r}, expected a name in {' '.join(PLOTS)}; change the suffix")
     for option, name in (("--plot", args.plot), ("--json", args.json)):
         if name and not Path(name).absolute().parent.is_dir():
-            raise ValueError(f"{option}: found no folder {str(Path(name).parent)!r}, expected one; make it first")
+            raise ValueError(f"{option}: found no folder {str(Path(name).parent)!r}, expected one; create it first")
         if name and any(path.exists() and Path(name).exists() and path.samefile(name) for path in args.file):
             raise ValueError(f"{option}: found the recording {str(name)!r} itself, expected another file; rename it")
 
 
 def _twin(path: Path) -> dict[str, Any]:
-    """Let a twin fly the recording in a process of its own; return its figures by UAV id, or a sentence."""
+    """Replay the recording through a twin in a separate process; return results by UAV id, or `sentence`."""
     with _folder() as folder:
         answer = folder / "twin.json"
         code, errors = run_to_end("twin_worker.evaluation.replay", str(path), "--json", str(answer))
@@ -149,12 +149,12 @@ def _twin(path: Path) -> dict[str, Any]:
         except (OSError, ValueError):
             last = (errors.strip().splitlines() or ["no reason given"])[-1]
             return {"sentence": f"the twin ended with code {code}: {last}"}
-    return told if isinstance(told, dict) else {"sentence": "the twin's answer was no object"}
+    return told if isinstance(told, dict) else {"sentence": "the output of the twin is not a JSON object"}
 
 
 @contextlib.contextmanager
 def _folder() -> Iterator[Path]:
-    """Make a temporary folder and remove it at the end, also where Ctrl-C comes during either."""
+    """Create a temporary folder and remove it at the end, also after Ctrl-C during either."""
     with deferred():
         folder = tempfile.TemporaryDirectory()
     try:
@@ -169,5 +169,5 @@ def _write_json(told: list[File], name: str) -> None:
     if name == "-":
         sys.stdout.write(text)
     else:
-        with deferred():  # a file half written could pass for a whole one
+        with deferred():  # an incomplete file could be taken for a complete one
             Path(name).write_text(text)

@@ -1,4 +1,4 @@
-"""Repeat the paper's experiments: fly pretend aircraft, identify them or predict them, draw the figures."""
+"""Repeat the experiments of the paper: fly simulated aircraft, identify or predict them, draw the figures."""
 
 import argparse
 import contextlib
@@ -15,14 +15,14 @@ from fleet.process.logs import tell
 EXAMPLES = """
   fleet paper identify --out figures --json paper.json
   fleet paper identify --uavs 0-1 --for 180 --first pbsid
-  fleet paper identify flight.tlog.xz          on recordings instead of pretend flights
-  fleet paper predict --out figures --jobs 2   60 s ahead from every start, by the paper's way and by ours
+  fleet paper identify flight.tlog.xz          on recordings instead of simulated flights
+  fleet paper predict --out figures --jobs 2   60 s ahead from every start, with the paper's method and the twin's
 """
 _UAVS = {"identify": range(12), "predict": range(16)}
 _LEAST_S = {"identify": (70, "20 + 40 + 8 s"), "predict": (200, "120 + 60 s and some starts")}  # flown time [s]
-_STARTS, _EVERY_S = 20, 5.0  # predictions of the paper; between two of ours [s]
-_BESIDE = "paper,route_wind"  # methods beside ours
-_LOSS = 0.01  # share of frames lost on the way [-]
+_STARTS, _EVERY_S = 20, 5.0  # predictions in the paper; interval between our starts [s]
+_BESIDE = "paper,route_wind"  # methods compared with the twin's
+_LOSS = 0.01  # share of frames lost in transit [-]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,10 +30,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "experiment", choices=tuple(_UAVS), help="identify: figures 7 and 8, first step and refined; predict: figure 9"
     )
-    parser.add_argument("file", nargs="*", type=Path, metavar="FILE", help="recordings (none: fly pretend aircraft)")
+    parser.add_argument("file", nargs="*", type=Path, metavar="FILE", help="recordings (none: fly simulated aircraft)")
     parser.add_argument("--uavs", type=id_range, metavar="A-B", help="aircraft to fly (0-11; predict: 0-15)")
-    parser.add_argument("--seed", type=int, default=5, help="draws aircraft, missions, weather and noise (5)")
-    parser.add_argument("--for", dest="seconds", type=float, default=300.0, metavar="S", help="flown time (300)")
+    parser.add_argument("--seed", type=int, default=5, help="random seed of aircraft, missions, weather and noise (5)")
+    parser.add_argument("--for", dest="seconds", type=float, default=300.0, metavar="S", help="flight time (300)")
     parser.add_argument("--wind", type=float, default=3.0, metavar="M/S", help="mean wind at 100 m (3)")
     parser.add_argument("--turbulence", default="1", metavar="LEVEL", help="MIL-F-8785C: none, light … or 0..7 (1)")
     parser.add_argument(
@@ -45,19 +45,19 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fly where no recording is named, then start the experiment; its exit code is ours.
+    """Fly simulated aircraft if no recording is given, then start the experiment and return its exit code.
 
     Raises:
-        ValueError: when an option makes no sense; the sentence says which.
+        ValueError: when an option is invalid; the text names it.
     """
     least, why = _LEAST_S[args.experiment]
     if not least <= args.seconds <= 3600:
-        raise ValueError(f"for: found {args.seconds:.0f} s, expected {least}..3600 ({why} at least); change --for")
+        raise ValueError(f"--for: found {args.seconds:.0f} s, expected {least}..3600 ({why} at least); change --for")
     args.uavs = args.uavs or _UAVS[args.experiment]
     starts = int((args.seconds - 180) / _EVERY_S) * len(args.uavs)
     if args.experiment == "predict" and not args.file and starts < _STARTS:
         raise ValueError(
-            f"for: found time for {starts} starts, expected {_STARTS} as in the paper; raise --for or --uavs"
+            f"--for: found time for {starts} starts, expected {_STARTS} as in the paper; raise --for or --uavs"
         )
     stop = stop_on_signal()
     with _recordings(args, stop) as files:
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 @contextlib.contextmanager
 def _recordings(args: argparse.Namespace, stop: Event) -> Iterator[list[Path]]:
-    """Return the recordings named, or fly some into a folder that is gone afterwards."""
+    """Yield the given recordings, or fly one into a temporary folder."""
     if args.file:
         yield args.file
         return
@@ -77,7 +77,7 @@ def _recordings(args: argparse.Namespace, stop: Event) -> Iterator[list[Path]]:
 
 
 def _fly(args: argparse.Namespace, path: Path, stop: Event) -> None:
-    """Fly as fast as possible into a recording, under a progress bar."""
+    """Fly as fast as possible into a recording and show a progress bar."""
     from rich.progress import Progress
 
     from fleet.simulator.flight import drive  # loads JSBSim and the compiler: not for --help
@@ -100,7 +100,7 @@ def _fly(args: argparse.Namespace, path: Path, stop: Event) -> None:
 
 
 def _judge(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
-    """Identify by the paper's two steps, or predict by its method and ours."""
+    """Identify with the paper's two steps, or predict with its method and the twin's."""
     options = [f"--{name}={value}" for name, value in (("out", args.out), ("json", args.json)) if value]
     if args.experiment == "identify":
         command = ["twin_worker.paper_experiments", args.experiment, f"--first={args.first}"]
@@ -108,6 +108,6 @@ def _judge(args: argparse.Namespace, files: list[Path], stop: Event) -> int:
         command = ["twin_worker.evaluation", f"--methods={_BESIDE}", f"--every={_EVERY_S}", f"--jobs={args.jobs}"]
     code = run_until(stop, *command, *options, *map(str, files))
     if stop.is_set():
-        tell("paper", "stopped; what was not finished is not written")
+        tell("paper", "stopped; unfinished results are not written")
         return INTERRUPTED
     return code

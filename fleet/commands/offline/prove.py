@@ -1,4 +1,4 @@
-"""Prove the diagnosis blindly: conceal effects, seal the labels, commit the reports, open the seal, score."""
+"""Test the diagnosis blindly: conceal effects, seal the labels, commit the reports, open the labels, score."""
 
 import argparse
 import json
@@ -10,26 +10,26 @@ from fleet.process.logs import tell
 
 EXAMPLES = """
   fleet prove --flights 12                                  a demonstration of some minutes
-  fleet prove --seed 7 --flights 12 --report proof          keep recordings, reports and a page for every flight
-  fleet prove --seed 9001 --flights 140 --json proof.json   the whole examination
+  fleet prove --seed 7 --flights 12 --report proof          store recordings, reports and a page for every flight
+  fleet prove --seed 9001 --flights 140 --json proof.json   the complete test
 """
 _FEWEST, _MOST = 6, 2000
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
-    """Describe the options."""
-    parser.add_argument("--seed", type=int, default=1, help="draws aircraft, missions, weather, effects (1)")
+    """Declare the options."""
+    parser.add_argument("--seed", type=int, default=1, help="random seed of aircraft, missions, weather, effects (1)")
     parser.add_argument("--flights", type=int, default=12, metavar="N", help="flights, on two airframes (12)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write scores, marks and hashes")
-    parser.add_argument("--report", type=Path, metavar="DIR", help="keep recordings and reports, write pages into DIR")
+    parser.add_argument("--report", type=Path, metavar="DIR", help="store recordings, reports and pages in DIR")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Examine; exit code 0 when it ran, whatever the scores are.
+    """Run the blind test; return exit code 0 when it is complete, independent of the scores.
 
     Raises:
-        ValueError: when an option makes no sense; the sentence says which.
+        ValueError: when an option is invalid; the text names it.
     """
     _check(args)
     with TemporaryDirectory(prefix="parauav-proof-") as brief:
@@ -67,11 +67,11 @@ def _check(args: argparse.Namespace) -> None:
     if not _FEWEST <= args.flights <= _MOST:
         raise ValueError(f"--flights: found {args.flights}, expected {_FEWEST}..{_MOST}; change it")
     if not 0 <= args.seed < 2**31:
-        raise ValueError(f"--seed: found {args.seed}, expected a whole number from 0; change it")
+        raise ValueError(f"--seed: found {args.seed}, expected an integer from 0; change it")
     if not 1 <= args.jobs <= 64:
         raise ValueError(f"--jobs: found {args.jobs}, expected 1..64; change it")
     for option, path in (("--json", args.json), ("--report", args.report)):
         if path and not path.absolute().parent.is_dir():
-            raise ValueError(f"{option}: found no folder {str(path.parent)!r}, expected one; make it first")
+            raise ValueError(f"{option}: found no folder {str(path.parent)!r}, expected one; create it first")
     if args.report and args.report.exists() and any(args.report.iterdir()):
-        raise ValueError(f"--report: found {str(args.report)!r} not empty, expected a new folder; name another")
+        raise ValueError(f"--report: found files in {str(args.report)!r}, expected an empty folder; name another")

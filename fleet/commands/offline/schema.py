@@ -1,6 +1,6 @@
 """Print the public interface: keys, fields, units.
 
-The words come from `fleet/contract.py` itself, so they cannot disagree with what is on the wire.
+The text is read from `fleet/contract.py`, so it always matches the messages.
 """
 
 import argparse
@@ -22,7 +22,7 @@ EXAMPLES = """
 """
 
 ATTACHMENT = "16 bytes, little endian: epoch u64, writer u64; keep the highest epoch per UAV below now + 5 min"
-STAMPED = ("model", "prediction", "mismatch", "alert")  # what workers write, so what carries the attachment
+STAMPED = ("model", "prediction", "mismatch", "alert")  # topics of workers, with the attachment
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,12 +55,12 @@ def wire_key(kind: type) -> str:
 
 
 def summary(kind: type) -> str:
-    """Return the first sentence of a class."""
+    """Return the first line of the docstring of a class."""
     return (kind.__doc__ or "").strip().splitlines()[0]
 
 
 def as_json(kind: type) -> dict[str, Any]:
-    """Describe a class for a machine: how to find it, how to read it, what is in it."""
+    """Describe a class as a JSON object: key, encoding, attachment, schema."""
     payload = QUERIES.get(kind)
     (schema, *asked), components = msgspec.json.schema_components([kind, *filter(None, [payload])])
     described = {
@@ -77,7 +77,7 @@ def as_json(kind: type) -> dict[str, Any]:
 
 
 def as_text(kind: type) -> str:
-    """Describe a class for a reader: its key, its fields, then the structs and words they use."""
+    """Describe a class as text: its key, its fields, then the structs and enumerations they use."""
     lines = [f"{wire_key(kind)}   {summary(kind)}", f"  encoding    {encoding(kind)}"]
     if topic_of(kind) in STAMPED:
         lines.append(f"  attachment  {ATTACHMENT}")
@@ -96,7 +96,7 @@ def as_text(kind: type) -> str:
 
 
 def fields_of(kind: type) -> list[str]:
-    """Return one line a field: name, type, default, meaning with unit."""
+    """Return one line per field: name, type, default, meaning with unit."""
     hints, lines = get_type_hints(kind, include_extras=True), []
     for field in msgspec.structs.fields(kind):
         hint = hints[field.name]
@@ -107,13 +107,13 @@ def fields_of(kind: type) -> list[str]:
 
 
 def default_of(field: msgspec.structs.FieldInfo) -> str:
-    """Show the default as JSON would."""
+    """Format the default as JSON."""
     value = field.default_factory() if field.default is msgspec.NODEFAULT else field.default
     return msgspec.json.encode(value).decode() if value == value else "nan"
 
 
 def type_name(hint: Any) -> str:
-    """Name a type in a few letters: `int`, `Array`, `map of float`, `list of Item`, `float or null`."""
+    """Return a short name of a type: `int`, `Array`, `map of float`, `list of Item`, `float or null`."""
     origin, inner = get_origin(hint), get_args(hint)
     if hasattr(hint, "__metadata__"):
         return type_name(inner[0])
@@ -127,7 +127,7 @@ def type_name(hint: Any) -> str:
 
 
 def parts_of(kind: type) -> list[type]:
-    """List the structs and enumerations that a class is made of, each once, in order of appearance."""
+    """List the structs and enumerations used by a class, each once, in order of appearance."""
     found: list[type] = []
 
     def walk(hint: Any) -> None:
